@@ -1,0 +1,82 @@
+"""The latlong map: directions, texels and how to sample them.
+
+A map has H rows and W columns (W = 2H where the program makes it, any size where a user does). Continuous coordinates ``(row, column)``
+run over [0, H] x [0, W]; texel (i, j) covers [i, i + 1] x [j, j + 1], its centre at half-integers. Row 0 looks toward +z, the centre
+column toward +x, columns grow toward +y:
+
+    theta = pi row / H,  phi = (2 column / W - 1) pi,  d = (sin theta cos phi, sin theta sin phi, cos theta).
+"""
+
+from __future__ import annotations
+
+import math
+
+import warp as wp
+
+PI = wp.constant(wp.float32(math.pi))
+
+
+@wp.func
+def direction_from_latlong(row: wp.float32, column: wp.float32, height: wp.int32, width: wp.int32) -> wp.vec3:
+    """Unit direction of continuous map coordinates."""
+    theta = PI * row / wp.float32(height)
+    phi = (2.0 * column / wp.float32(width) - 1.0) * PI
+    sin_theta = wp.sin(theta)
+    return wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), wp.cos(theta))
+
+
+@wp.func
+def latlong_from_direction(direction: wp.vec3, height: wp.int32, width: wp.int32) -> wp.vec2:
+    """Continuous (row, column) of a direction, which need not be unit; the poles map to phi = 0, never to NaN.
+
+    theta comes from atan2(|xy|, z), not acos(z): exact near the poles and safe for a z of 1 + ulp.
+    """
+    radial = wp.sqrt(direction[0] * direction[0] + direction[1] * direction[1])
+    theta = wp.atan2(radial, direction[2])
+    phi = wp.atan2(direction[1], direction[0])
+    return wp.vec2(theta / PI * wp.float32(height), (phi / PI + 1.0) * 0.5 * wp.float32(width))
+
+
+@wp.func
+def texel_solid_angle(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
+    """Exact solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W, written as a product of sines (no cancellation)."""
+    half_step = 0.5 * PI / wp.float32(height)
+    return 2.0 * wp.sin((2.0 * wp.float32(row) + 1.0) * half_step) * wp.sin(half_step) * 2.0 * PI / wp.float32(width)
+
+
+@wp.func
+def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int32) -> wp.vec2i:
+    """Texel of an index up to one row beyond a pole or any number of columns beyond the seam; across a pole, half a turn away."""
+    r = row
+    c = column
+    if r < 0:
+        r = -1 - r
+        c += width / 2
+    elif r >= height:
+        r = 2 * height - 1 - r
+        c += width / 2
+    c = c % width
+    if c < 0:
+        c += width
+    return wp.vec2i(wp.clamp(r, 0, height - 1), c)
+
+
+@wp.func
+def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
+    """Bilinear sample, continuous across the seam and the poles (odd widths are off by half a texel across a pole)."""
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    at = latlong_from_direction(direction, height, width)
+    y = at[0] - 0.5
+    x = at[1] - 0.5
+    i = wp.int32(wp.floor(y))
+    j = wp.int32(wp.floor(x))
+    fy = y - wp.float32(i)
+    fx = x - wp.float32(j)
+    t00 = wrap_texel(i, j, height, width)
+    t01 = wrap_texel(i, j + 1, height, width)
+    t10 = wrap_texel(i + 1, j, height, width)
+    t11 = wrap_texel(i + 1, j + 1, height, width)
+    top = radiance[t00[0], t00[1]] * (1.0 - fx) + radiance[t01[0], t01[1]] * fx
+    bottom = radiance[t10[0], t10[1]] * (1.0 - fx) + radiance[t11[0], t11[1]] * fx
+    return top * (1.0 - fy) + bottom * fy

@@ -1,0 +1,129 @@
+"""Structures that stages share. Everything that may change from frame to frame lives in one of the four arrays of ``FrameBlock``.
+
+Lengths are metres in the world (marker) frame, angles radians, colours linear RGB.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+
+# Kinds of geometry, shared by proxies and instances.
+PLANE = 0
+BOX = 1
+MESH = 2
+SPHERE = 3
+TORUS = 4
+
+# Kinds of light.
+POINT = 0
+SPOT = 1
+DIRECTIONAL = 2
+
+# Material models.
+LAMBERT = 0
+PHONG = 1
+METALLIC_ROUGHNESS = 2
+MIRROR = 3
+
+
+@wp.struct
+class FrameParams:
+    """What changes per frame; kernels get an array of one."""
+
+    camera_position: wp.vec3  # world
+    world_from_camera: wp.mat33
+    focal: wp.vec2  # fx, fy in pixels
+    principal: wp.vec2  # cx, cy, pixel centres at integers
+    distortion: vec8  # OpenCV's k1 k2 p1 p2 k3 k4 k5 k6
+    exposure_scale: wp.float32
+    time: wp.float32  # seconds since the first frame
+    time_step: wp.float32  # seconds since the previous frame
+    frame_index: wp.int32
+    environment_reset: wp.int32  # 1: forget the accumulated environment
+    object_rect: wp.vec4i  # row_start, row_stop, col_start, col_stop: where virtual objects can be on screen
+    light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
+
+
+@wp.struct
+class Probe:
+    """A mirror ball."""
+
+    center: wp.vec3
+    radius: wp.float32
+    reflectance: wp.vec3
+
+
+@wp.struct
+class Light:
+    """A virtual light; fields that its kind does not use are zero."""
+
+    kind: wp.int32  # POINT, SPOT or DIRECTIONAL
+    position: wp.vec3
+    direction: wp.vec3  # unit, the way the light travels
+    intensity: wp.vec3  # color * intensity: radiant intensity (point, spot) or irradiance (directional), per channel
+    inner_angle: wp.float32  # half angles of a spot
+    outer_angle: wp.float32
+    attenuation: wp.vec3  # falloff = 1 / (x + y d + z d^2); (0, 0, 1) is the inverse square
+    radius: wp.float32  # of the emitting sphere (point, spot), metres; 0 is a point
+
+
+@wp.struct
+class Shape:
+    """A proxy or a virtual object: point_world = rotation (scale point_local) + position."""
+
+    kind: wp.int32  # PLANE, BOX, MESH, SPHERE or TORUS
+    rotation: wp.mat33
+    position: wp.vec3
+    scale: wp.float32
+    extent: wp.vec3  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
+    mesh: wp.uint64  # id of the wp.Mesh in local space, for MESH
+    first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
+    material: wp.int32  # index into the materials; -1 for proxies
+    smooth: wp.int32  # 1: interpolate vertex normals
+
+
+@wp.struct
+class Material:
+    """One material; a texture index of -1 means that the constant colour holds, else texel times colour."""
+
+    model: wp.int32  # LAMBERT, PHONG, METALLIC_ROUGHNESS or MIRROR
+    base_color: wp.vec3  # diffuse for PHONG
+    base_texture: wp.int32
+    specular: wp.vec3  # PHONG
+    specular_texture: wp.int32
+    shininess: wp.float32  # PHONG exponent
+    metallic: wp.float32
+    roughness: wp.float32  # perceptual; alpha is its square
+
+
+@wp.struct
+class Texture:
+    """Where one texture lies in the packed texels: linear RGB, row 0 is v = 1 (the image's top)."""
+
+    offset: wp.int32
+    width: wp.int32
+    height: wp.int32
+
+
+@wp.struct
+class RayScene:
+    """All that rays can meet, and what it is made of."""
+
+    objects: wp.array[Shape]
+    proxies: wp.array[Shape]
+    materials: wp.array[Material]
+    textures: wp.array[Texture]
+    texels: wp.array[wp.vec3]
+    vertex_normals: wp.array[wp.vec3]  # all meshes, one after another
+    vertex_uvs: wp.array[wp.vec2]
+
+
+@wp.struct
+class KeyLight:
+    """A dominant direction of the room's light."""
+
+    direction: wp.vec3  # unit, toward the light
+    irradiance: wp.vec3  # on a surface that faces it, from the texels that belong to it
+    dominance: wp.float32  # 0 ambient room .. 1 all light from this direction

@@ -1,0 +1,1 @@
+"""Bundled scenes: one TOML file each, with the clips and meshes that they use and the scripts that made them."""

@@ -1,0 +1,49 @@
+"""Rungs and presets: how accurately each stage works, as one frozen value."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+
+
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """The rung of every stage and the sizes that go with it. Equal values share plans and compiled kernels."""
+
+    name: str
+    """Of the preset, or ``custom``."""
+    rungs: tuple[tuple[str, str], ...]
+    """(stage, rung) pairs, sorted by stage; stages that have only one rung need not be named."""
+    environment_height: int
+    """Rows of the latlong environment; it has twice as many columns."""
+    edge_samples: int
+    """Samples per pixel along the edges of virtual objects; a square number."""
+
+    def rung(self, stage: str) -> str:
+        """Rung of ``stage``; a stage that is not named has its only rung, ``default``."""
+        return dict(self.rungs).get(stage, "default")
+
+    def with_rungs(self, **rungs: str) -> Quality:
+        """The same quality with some stages on other rungs."""
+        merged = {**dict(self.rungs), **rungs}
+        return dataclasses.replace(self, name="custom", rungs=tuple(sorted(merged.items())))
+
+
+def _preset(name: str, environment_height: int, edge_samples: int, **rungs: str) -> Quality:
+    return Quality(name, tuple(sorted(rungs.items())), environment_height, edge_samples)
+
+
+PRESETS: Mapping[str, Quality] = MappingProxyType(
+    {
+        preset.name: preset
+        for preset in (
+            _preset("paper", 64, 4, diffuse="top_mip", specular="box_mip", relight="relief"),
+            _preset("low", 32, 1, diffuse="sh2", specular="box_mip", relight="relief"),
+            _preset("medium", 64, 4, diffuse="sh2", specular="box_mip", relight="relief"),
+            _preset("high", 128, 16, diffuse="sh2", specular="box_mip", relight="relief"),
+            _preset("reference", 256, 16, diffuse="sh2", specular="box_mip", relight="relief"),
+        )
+    }
+)
+DEFAULT_PRESET = "medium"

@@ -1,0 +1,160 @@
+"""Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
+
+On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different graph.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import warp as wp
+
+from warp_ar.graph import INPUTS, Plan
+from warp_ar.stages.base import Arrays, Pass, Rows, Stage
+
+# Bands shorter than this cost more in launching than they save.
+MIN_BAND_ROWS = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class StageTiming:
+    """What one stage did in one frame."""
+
+    milliseconds: float
+    skipped: bool
+    """True: nothing that it reads had changed."""
+
+
+class Scheduler:
+    """Runs the stages of one plan on one device."""
+
+    def __init__(self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None) -> None:
+        """Allocate what the stages declared and build their passes.
+
+        Args:
+            plan: What runs.
+            arrays: Resources; the pipeline's inputs must be there already.
+            device: Warp device.
+            bands: Bands per CPU pass; None means one per core that this process may use.
+        """
+        self.plan = plan
+        self.arrays = arrays
+        self.device = device
+        self.bands = bands or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(self.bands, "warp_ar") if device.is_cpu and self.bands > 1 else None
+        self._stages: list[tuple[Stage, list[Pass]]] = []
+        self._seen: dict[str, tuple[int, ...]] = {}
+        self._graphs: dict[tuple[str, ...], Any] = {}
+        with wp.ScopedDevice(device):
+            for kind, wiring in plan.stages:
+                stage = kind(plan.request, wiring)
+                for name, spec in stage.arrays().items():
+                    arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
+                self._stages.append((stage, stage.build(arrays, device)))
+
+    def close(self) -> None:
+        """Stop the worker threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def forget(self) -> None:
+        """Make every stage run again in the next frame."""
+        self._seen.clear()
+
+    def run(self) -> Mapping[str, StageTiming]:
+        """Run the stages whose inputs changed since they last ran; returns the time of each."""
+        if self.device.is_cpu:
+            return self._run_eager()
+        return self._run_captured()
+
+    def _due(self, stage: Stage) -> tuple[int, ...] | None:
+        """Versions of what ``stage`` reads, or None if it has already seen them."""
+        versions = tuple(self.arrays.version(name) for name in stage.wiring.reads)
+        return None if self._seen.get(stage.name) == versions else versions
+
+    def _publish(self, stage: Stage) -> None:
+        for name in stage.wiring.writes:
+            if self.arrays.version(name) == 0 or stage.changed(name):
+                self.arrays.touch(name)
+
+    def _run_eager(self) -> dict[str, StageTiming]:
+        timings: dict[str, StageTiming] = {}
+        for stage, passes in self._stages:
+            versions = self._due(stage)
+            if versions is None:
+                timings[stage.name] = StageTiming(0.0, True)
+                continue
+            start = time.perf_counter()
+            for step in passes:
+                self._run_pass(step)
+            self._seen[stage.name] = versions
+            self._publish(stage)
+            timings[stage.name] = StageTiming((time.perf_counter() - start) * 1e3, False)
+        return timings
+
+    def _run_pass(self, step: Pass) -> None:
+        if self._pool is None or step.rows is None:
+            step.launch(None if step.extent is None else step.extent())
+            return
+        start, stop = step.extent() if step.extent is not None else (0, step.rows)
+        bands = min(self.bands, max(1, (stop - start) // MIN_BAND_ROWS))
+        edges = [start + (stop - start) * band // bands for band in range(bands + 1)]
+        # This thread takes the last band itself: one hand-over less per pass.
+        futures: list[Future[None]] = [
+            self._pool.submit(_call, step.launch, (edges[band], edges[band + 1])) for band in range(bands - 1)
+        ]
+        step.launch((edges[-2], edges[-1]))
+        for future in futures:
+            future.result()
+
+    def _run_captured(self) -> dict[str, StageTiming]:
+        due: list[tuple[Stage, list[Pass]]] = []
+        timings: dict[str, StageTiming] = {}
+        for stage, passes in self._stages:
+            versions = self._due(stage)
+            if versions is None:
+                timings[stage.name] = StageTiming(0.0, True)
+                continue
+            due.append((stage, passes))
+            self._seen[stage.name] = versions
+            self._publish(stage)
+        key = tuple(stage.name for stage, _ in due)
+        if not key:
+            return timings
+        start = time.perf_counter()
+        graph = self._graphs.get(key)
+        if graph is None:
+            # Launched once outside the capture: that loads every module, which a capture must not do.
+            self._launch_all(due)
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._launch_all(due)
+            self._graphs[key] = capture.graph
+        else:
+            wp.capture_launch(graph)
+        share = (time.perf_counter() - start) * 1e3 / len(key)
+        timings.update({name: StageTiming(share, False) for name in key})
+        return timings
+
+    @staticmethod
+    def _launch_all(due: list[tuple[Stage, list[Pass]]]) -> None:
+        for _, passes in due:
+            for step in passes:
+                step.launch(None)
+
+
+def _call(launch: Callable[[Rows | None], None], rows: Rows) -> None:
+    launch(rows)
+
+
+def add_inputs(arrays: Arrays, inputs: Mapping[str, Any]) -> None:
+    """Add the pipeline's inputs, and the tables that stages share, to the resources."""
+    for name, array in inputs.items():
+        arrays.add(name, array)
+    for name in INPUTS:
+        if name not in arrays:
+            arrays.add(name, None)
