@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 
 
 def _devices() -> list[str]:

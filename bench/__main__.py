@@ -1,0 +1,33 @@
+"""``python -m bench`` lists the benchmarks, ``python -m bench NAME ... [--device D]`` runs them."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+from warp_ar.device import resolve_device
+
+
+def main() -> int:
+    names = sorted(path.stem.removeprefix("bench_") for path in Path(__file__).parent.glob("bench_*.py"))
+    parser = argparse.ArgumentParser(prog="python -m bench", description="Benchmarks; one JSON line per case.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="all, or some of: " + ", ".join(names))
+    parser.add_argument("--device", default="auto")
+    options = parser.parse_args()
+    if not options.names:
+        print("\n".join(names))
+        return 0
+    chosen = names if options.names == ["all"] else options.names
+    if unknown := [name for name in chosen if name not in names]:
+        print(f"bench: no benchmark {', '.join(unknown)}; there are {', '.join(names)}", file=sys.stderr)
+        return 2
+    device = str(resolve_device(options.device))
+    for name in chosen:
+        importlib.import_module(f"bench.bench_{name}").main(device)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""How benchmarks time and report: paired medians, one JSON line per case."""
+
+from __future__ import annotations
+
+import functools
+import json
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+WARM_UP = 3
+RUNS = 30
+
+
+@functools.cache
+def commit() -> str:
+    """Short hash of the checkout, with a + where it has uncommitted changes; ``unknown`` outside one."""
+    root = Path(__file__).resolve().parent
+    try:
+        out = subprocess.run(["git", "describe", "--always", "--dirty=+"], cwd=root, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return out.stdout.strip()
+
+
+def time_once(function: Callable[[], object], device: Any) -> float:
+    """Milliseconds of one call, until the device has finished."""
+    wp.synchronize_device(device)
+    start = time.perf_counter()
+    function()
+    wp.synchronize_device(device)
+    return (time.perf_counter() - start) * 1e3
+
+
+def measure(functions: Mapping[str, Callable[[], object]], device: Any, runs: int = RUNS) -> dict[str, list[float]]:
+    """Time contenders in turn, A B A B ..., after a warm-up; milliseconds of every run.
+
+    On CUDA each function is captured in a graph and the replay is timed with events, so launch overhead in Python does not count.
+    """
+    device = wp.get_device(device)
+    if device.is_cuda:
+        functions = {name: _captured(function, device) for name, function in functions.items()}
+    timer = _time_with_events if device.is_cuda else time_once
+    for _ in range(WARM_UP):
+        for function in functions.values():
+            function()
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(runs):
+        for name, function in functions.items():
+            times[name].append(timer(function, device))
+    return times
+
+
+def _captured(function: Callable[[], object], device: Any) -> Callable[[], object]:
+    function()
+    with wp.ScopedCapture(device=device) as capture:
+        function()
+    return lambda: wp.capture_launch(capture.graph)
+
+
+def _time_with_events(function: Callable[[], object], device: Any) -> float:
+    stream = wp.get_stream(device)
+    begin, end = wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
+    stream.record_event(begin)
+    function()
+    stream.record_event(end)
+    return float(wp.get_event_elapsed_time(begin, end))
+
+
+def paired_ratio(times: Mapping[str, list[float]], over: str, under: str) -> float:
+    """Median of the paired ratios ``over`` / ``under``."""
+    return statistics.median(a / b for a, b in zip(times[over], times[under], strict=True))
+
+
+@functools.cache
+def copy_bandwidth(device: str, size: int = 1 << 26) -> float:
+    """Measured bytes per second of a plain copy (read plus written) on ``device``."""
+    source, target = wp.zeros(size, dtype=wp.uint8, device=device), wp.empty(size, dtype=wp.uint8, device=device)
+    times = measure({"copy": lambda: wp.copy(target, source)}, device)["copy"]
+    return 2.0 * size / (statistics.median(times) * 1e-3)
+
+
+def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> None:
+    """Print one JSON line: the case's median and spread, and whatever ``more`` says."""
+    low, median, high = np.percentile(milliseconds, [10, 50, 90])
+    record = {
+        "case": case,
+        "median_ms": round(float(median), 5),
+        "p10_ms": round(float(low), 5),
+        "p90_ms": round(float(high), 5),
+        "runs": len(milliseconds),
+        **more,
+        "device": wp.get_device(device).name,
+        "warp": wp.__version__,
+        "commit": commit(),
+    }
+    print(json.dumps(record), flush=True)

@@ -1,0 +1,50 @@
+"""Choosing and starting the device that kernels run on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import warp as wp
+
+from warp_ar.errors import UsageError
+
+
+@contextlib.contextmanager
+def _native_stderr_silenced() -> Iterator[None]:
+    """Keep what native code prints to stderr off the terminal: without an NVIDIA driver Warp's start warns there, past its own log level."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with open(os.devnull, "wb") as sink:
+        os.dup2(sink.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+
+
+def start_warp() -> None:
+    """Initialise Warp quietly; calling it again does nothing."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    with _native_stderr_silenced():
+        wp.init()
+
+
+def resolve_device(name: str = "auto") -> Any:
+    """Warp device for ``name``: ``auto`` (CUDA where present, else CPU), ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Raises:
+        UsageError: The name is no device of this machine.
+    """
+    start_warp()
+    if name == "auto":
+        return wp.get_device("cuda:0") if wp.is_cuda_available() else wp.get_device("cpu")
+    known = [str(device) for device in wp.get_devices()]
+    wanted = "cuda:0" if name == "cuda" else name
+    if wanted not in known:
+        raise UsageError(f"device {name!r} is not here; this machine has auto, {', '.join(known)}")
+    return wp.get_device(wanted)

@@ -1,0 +1,36 @@
+"""``python -m warp_ar.explain SCENE`` prints which stages a scene calls for, and why the others are left out, without running a frame."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from warp_ar.errors import WarpArError
+from warp_ar.graph import make_plan
+from warp_ar.live import EXIT_DONE, EXIT_USAGE, Parser
+from warp_ar.pipeline import resolve_quality
+from warp_ar.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.run_log import print_plan
+from warp_ar.scene import load_scene
+from warp_ar.stages.base import Request
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    parser = Parser(prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out.")
+    parser.add_argument("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name")
+    parser.add_argument("--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})")
+    try:
+        options: argparse.Namespace = parser.parse_args(arguments)
+        scene = load_scene(options.scene)
+        size = (scene.camera.width, scene.camera.height)
+        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size)))
+    except WarpArError as error:
+        print(f"warp_ar: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

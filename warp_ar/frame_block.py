@@ -1,0 +1,60 @@
+"""What changes per frame, in one small block of memory: camera, virtual lights, virtual objects.
+
+The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being captured again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_ar.kernels.structs import FrameParams, Light, Shape
+
+_ALIGNMENT = 16
+
+
+class FrameBlock:
+    """Typed host views over one buffer, and the device arrays that alias its upload."""
+
+    def __init__(self, device: Any, lights: int, objects: int) -> None:
+        """Allocate the block.
+
+        Args:
+            device: Warp device.
+            lights: Number of virtual lights.
+            objects: Number of virtual objects.
+        """
+        layout = (("params", FrameParams, 1), ("lights", Light, lights), ("objects", Shape, objects))
+        offsets: list[int] = []
+        size = 0
+        for _, struct, count in layout:
+            offsets.append(size)
+            bytes_needed = np.dtype(struct.numpy_dtype()).itemsize * max(count, 1)
+            size += -(-bytes_needed // _ALIGNMENT) * _ALIGNMENT
+        self._device_buffer = wp.zeros(size, dtype=wp.uint8, device=device)
+        self._host_buffer = (
+            self._device_buffer if device.is_cpu else wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True)
+        )
+        host_bytes = self._host_buffer.numpy()
+        self._host: dict[str, Any] = {}
+        self._device: dict[str, Any] = {}
+        for (name, struct, count), offset in zip(layout, offsets, strict=True):
+            dtype = np.dtype(struct.numpy_dtype())
+            self._host[name] = host_bytes[offset : offset + dtype.itemsize * count].view(dtype)
+            pointer = self._device_buffer.ptr + offset if count else None
+            self._device[name] = wp.array(ptr=pointer, dtype=struct, shape=(count,), device=device)
+
+    def host(self, name: str) -> Any:
+        """Writable NumPy structured view of ``params``, ``lights`` or ``objects``."""
+        return self._host[name]
+
+    def device_array(self, name: str) -> Any:
+        """Warp array of ``params``, ``lights`` or ``objects``; filled by ``upload``."""
+        return self._device[name]
+
+    def upload(self) -> None:
+        """Copy the host's values to the device; on CPU they are the same memory."""
+        if self._device_buffer is not self._host_buffer:
+            wp.copy(self._device_buffer, self._host_buffer)

@@ -1,0 +1,201 @@
+"""The command: ``python -m warp_ar.live [SCENE]`` turns camera frames into consistently lit frames."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.run_log import RunLog, print_plan
+from warp_ar.scene import Scene, bundled_scenes
+from warp_ar.session import Session
+from warp_ar.sinks import NullSink, open_sink, write_environment
+
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+
+# A clip that shows no marker for this many frames is not going to: say so instead of running on.
+MARKER_PATIENCE = 100
+DEFAULT_OUTPUT = Path("desk.mp4")
+
+
+class RunError(WarpArError):
+    """Something failed after frames had begun to flow."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Argument parser whose errors are one line, as all errors here are."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the message as an error of usage."""
+        raise UsageError(f"{message}; see {self.prog} --help")
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.live",
+        description="Camera frames of a desk with a marker and a mirror ball in, consistently lit frames out.",
+    )
+    add = parser.add_argument
+    add("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file or a bundled scene's name (default: desk)")
+    add("--list", action="store_true", help="list the bundled scenes and stop")
+    add("--source", metavar="PATH|INDEX", help="frames from this folder, video file or capture device, not the scene's own")
+    add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
+    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
+    add("--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})")
+    add("--frames", type=int, metavar="N", help="stop after N frames")
+    add("--output", type=Path, metavar="FILE.mp4|DIR", help=f"a folder gets NNNN.png, a file H.264 (default: {DEFAULT_OUTPUT})")
+    add("--headless", action="store_true", help="no progress bar, no table; writes only what other options name")
+    add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
+    add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
+    add("--loop", action="store_true", help="start the clip again when it ends")
+    return parser
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C finish the frame in hand; a second one stops at once."""
+    requested = False
+
+    def handle(*_: object) -> None:
+        nonlocal requested
+        if requested:
+            raise KeyboardInterrupt
+        requested = True
+
+    previous = signal.signal(signal.SIGINT, handle)
+    try:
+        yield lambda: requested
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _prepare_file(path: Path) -> None:
+    """Fail now, not after an hour of frames, where a file cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror}; name a file in a folder that you may write to") from error
+
+
+def _prepare_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make the folder {path}: {error.strerror}; name a folder that you may write to") from error
+
+
+def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
+    """Complain where no frame so far showed the marker: an error for a clip, a note for a camera that may yet see it."""
+    if not log.never_posed or log.count == 0:
+        return
+    marker = scene.marker
+    wanted = f"board {marker.board!r}" if marker.board else f"id {marker.id}"
+    message = (
+        f"no marker in the first {log.count} frames: expected {marker.dictionary} {wanted}; check the scene's [marker], "
+        "that the whole marker with its white border is in view, sharp and not mirrored"
+    )
+    if not live:
+        raise RunError(message)
+    print(f"warp_ar: {message}", file=sys.stderr)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Build everything that ``options`` ask for, then let frames flow until they end."""
+    if options.list:
+        for name, path in bundled_scenes().items():
+            print(f"{name:16s} {path}")
+        return EXIT_DONE
+    if options.frames is not None and options.frames < 1:
+        raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
+    output = options.output if options.output is not None or options.headless else DEFAULT_OUTPUT
+    outputs = ["image"]
+    if options.save_environment is not None:
+        _prepare_folder(options.save_environment)
+        outputs.append("environment")
+    if options.report is not None:
+        _prepare_file(options.report)
+        outputs.append("pose")
+
+    with contextlib.ExitStack() as stack:
+        session = stack.enter_context(
+            Session(
+                options.scene,
+                source=options.source,
+                calibration=options.calibration,
+                device=options.device,
+                quality=options.quality,
+                outputs=tuple(outputs),
+                loop=options.loop,
+            )
+        )
+        source = session.source
+        sink = NullSink() if output is None else open_sink(output, fps=source.fps, size=session.pipeline.size)
+        log = RunLog(session.pipeline)
+        total = options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
+        progress = Progress(
+            TextColumn(session.scene.name),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[fps]:.1f} fps"),
+            TimeRemainingColumn(),
+            disable=options.headless,
+        )
+        bar = progress.add_task("frames", total=total, fps=0.0)
+        try:
+            with sink, _interruptible() as interrupted, progress:
+                for _, result in itertools.islice(session, options.frames):
+                    sink.write(result.image)
+                    if result.environment is not None:
+                        write_environment(options.save_environment / f"{log.count:04d}.exr", result.environment)
+                    log.add(result)
+                    progress.update(bar, advance=1, fps=log.fps)
+                    if log.count == MARKER_PATIENCE:
+                        _check_marker(log, session.scene, live=source.live)
+                    if interrupted():
+                        break
+                stopped = interrupted()
+            if log.count < MARKER_PATIENCE and not stopped:
+                _check_marker(log, session.scene, live=source.live)
+        except WarpArError as error:
+            raise RunError(f"{error} ({log.count} frames were written)") from error
+        finally:
+            if options.report is not None:
+                options.report.write_text(json.dumps(log.report(), indent=1))
+    if not options.headless:
+        print_plan(session.pipeline.plan, log)
+        Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {output}", highlight=False)
+    return EXIT_INTERRUPTED if stopped else EXIT_DONE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage or scene, 130 interrupted."""
+    try:
+        return run(make_parser().parse_args(arguments))
+    except RunError as error:
+        print(f"warp_ar: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    except WarpArError as error:
+        print(f"warp_ar: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,274 @@
+"""The library's face: a scene, a device and a quality make a pipeline; call it with frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.device import resolve_device
+from warp_ar.errors import UsageError
+from warp_ar.frame_block import FrameBlock
+from warp_ar.graph import Plan, make_plan
+from warp_ar.kernels.color import decode_table, encode_table
+from warp_ar.kernels.structs import Probe
+from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
+from warp_ar.ray_scene import HostScene
+from warp_ar.scene import Camera, Scene
+from warp_ar.scheduler import Scheduler, StageTiming
+from warp_ar.stages.base import Arrays, Request
+from warp_ar.tracking import Pose, Tracker, TrackState
+
+TRACK = "track"
+"""Name of the host's own stage in reports: the marker's pose."""
+
+DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
+"""Seconds between frames whose caller gives no time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What one frame became."""
+
+    image_array: Any
+    """The lit frame, (height, width) of three 8-bit RGB values, on the pipeline's device; valid until the next call."""
+    environment_array: Any
+    """The room's light, a latlong map of linear RGB radiance (rows, columns), or None if it was not asked for or not seen yet."""
+    pose: Pose | None
+    """From marker to camera; None while the marker is lost or when nothing needed it."""
+    state: TrackState | None
+    """Tracked, held or lost; None when nothing needed the pose."""
+    stages: Mapping[str, StageTiming]
+    """Milliseconds of every stage of the plan, and whether it was skipped."""
+
+    @functools.cached_property
+    def image(self) -> npt.NDArray[np.uint8]:
+        """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
+        return np.array(self.image_array.numpy() if isinstance(self.image_array, wp.array) else self.image_array)
+
+    @functools.cached_property
+    def environment(self) -> npt.NDArray[np.float32] | None:
+        """The room's light as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
+        return None if self.environment_array is None else np.array(self.environment_array.numpy())
+
+
+def resolve_quality(quality: str | Quality) -> Quality:
+    """Quality value for a preset's name.
+
+    Raises:
+        UsageError: No preset has that name.
+    """
+    if isinstance(quality, Quality):
+        return quality
+    if quality not in PRESETS:
+        raise UsageError(f"quality {quality!r} is no preset; expected {', '.join(PRESETS)}")
+    return PRESETS[quality]
+
+
+class Pipeline:
+    """Lights frames: call it with one frame after another of one camera.
+
+    Arrays are allocated here, never while frames run.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        device: str = "auto",
+        quality: str | Quality = DEFAULT_PRESET,
+        size: tuple[int, int] | None = None,
+        outputs: tuple[str, ...] = ("image",),
+        bands: int | None = None,
+    ) -> None:
+        """Plan, allocate and build.
+
+        Args:
+            scene: What to show.
+            device: ``auto``, ``cpu`` or ``cuda:N``.
+            quality: A preset's name or a value of one's own.
+            size: Width and height of the frames; None means the scene's. Another size must scale the scene's camera exactly.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            bands: Bands of rows per CPU pass; None means one per core.
+
+        Raises:
+            UsageError: An argument that cannot be used.
+            SceneError: The scene's camera does not fit ``size``.
+        """
+        self.device = resolve_device(device)
+        self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
+        self.scene = dataclasses.replace(scene, camera=self.camera)
+        self.size = (self.camera.width, self.camera.height)
+        self.quality = resolve_quality(quality)
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs))
+        self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
+        self._start_time: float | None = None
+        self._last_time = 0.0
+        self._index = 0
+        self._has_light = False
+        self._arrays = Arrays()
+        with wp.ScopedDevice(self.device):
+            self._add_inputs()
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands)
+
+    def __enter__(self) -> Pipeline:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the worker threads; arrays go when the last result that refers to them does."""
+        self._scheduler.close()
+
+    @property
+    def arrays(self) -> Arrays:
+        """Every named array of the pipeline, on its device."""
+        return self._arrays
+
+    def _add_inputs(self) -> None:
+        width, height = self.size
+        device = self.device
+        self._host_scene = HostScene(self.scene, device)
+        self._block = FrameBlock(device, len(self.scene.lights), len(self.scene.objects))
+        self._host_scene.ray_scene.objects = self._block.device_array("objects")
+        self._frame = wp.zeros((height, width), dtype=wp.vec3ub, device=device)
+        self._staging = None if device.is_cpu else wp.zeros((height, width), dtype=wp.vec3ub, device="cpu", pinned=True)
+        add = self._arrays.add
+        for name in ("pose", "lights", "objects", "exposure", "clock"):
+            add(name, None)
+        add("frame", self._frame)
+        add("params", self._block.device_array("params"))
+        add("light_array", self._block.device_array("lights"))
+        add("ray_scene", self._host_scene.ray_scene)
+        add("probes", wp.array(self._probe_values(), dtype=Probe, device=device))
+        add("decode", wp.array(decode_table(self.camera.transfer), dtype=wp.vec3, device=device))
+        add("encode", wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=device))
+        add("rays", wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device))
+        self._object_rows = (0, height)
+        self._light_rows = (0, height)
+        add("object_rows", lambda: self._object_rows)
+        add("light_rows", lambda: self._light_rows)
+        params = self._block.host("params")
+        params["focal"] = (self.camera.fx, self.camera.fy)
+        params["principal"] = (self.camera.cx, self.camera.cy)
+        params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
+        scale = self.scene.exposure.scale
+        params["exposure_scale"] = 1.0 if isinstance(scale, str) else scale
+        self._arrays.touch("exposure")
+
+    def _probe_values(self) -> npt.NDArray[Any]:
+        values = np.zeros(len(self.scene.probes), dtype=np.dtype(Probe.numpy_dtype()))
+        for value, probe in zip(values, self.scene.probes, strict=True):
+            value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
+        return values
+
+    def __call__(self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None) -> Result:
+        """Light one frame.
+
+        Args:
+            image: uint8 RGB, a NumPy array (height, width, 3), or a Warp array (height, width) of ``wp.vec3ub`` on the
+                pipeline's device, which is used without a copy to the host unless the marker must be found.
+            time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
+
+        Raises:
+            UsageError: The image has another size or type.
+        """
+        host_image = self._accept(image)
+        now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
+        if self._start_time is None:
+            self._start_time = self._last_time = now
+        timings: dict[str, StageTiming] = {}
+        pose: Pose | None = None
+        state: TrackState | None = None
+        if self._tracker is not None:
+            start = time.perf_counter()
+            track = self._tracker.track(host_image if host_image is not None else image.numpy(), now)
+            timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
+            pose, state = track.pose, track.state
+        lost = self._tracker is not None and pose is None
+        if not lost:
+            self._set_frame_values(pose, now)
+            self._upload(image, host_image)
+            timings.update(self._scheduler.run())
+            self._has_light = True
+        self._last_time = now
+        self._index += 1
+        # A lost marker says nothing about where things are: the frame passes as it came, the last light is kept.
+        lit = image if lost or "image" not in self._arrays else self._arrays["image"]
+        light = self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
+        return Result(lit, light, pose, state, timings)
+
+    def _accept(self, image: Any) -> npt.NDArray[np.uint8] | None:
+        width, height = self.size
+        if isinstance(image, wp.array):
+            if image.shape != (height, width) or image.dtype != wp.vec3ub or image.device != self.device:
+                raise UsageError(
+                    f"frame is a Warp array {image.shape} of {image.dtype.__name__} on {image.device}; expected ({height}, {width}) of vec3ub on {self.device}"
+                )
+            return None
+        if not isinstance(image, np.ndarray) or image.shape != (height, width, 3) or image.dtype != np.uint8:
+            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise UsageError(f"frame is {got}; expected uint8 RGB ({height}, {width}, 3)")
+        return np.ascontiguousarray(image)
+
+    def _set_frame_values(self, pose: Pose | None, now: float) -> None:
+        params = self._block.host("params")
+        touched: list[str] = ["clock"]
+        before = params.copy()
+        if pose is not None:
+            inverse = pose.inverse()
+            params["camera_position"] = inverse.translation
+            params["world_from_camera"] = inverse.rotation
+        if self._host_scene.write_lights(self._block.host("lights"), now - (self._start_time or 0.0)) or self._index == 0:
+            touched.append("lights")
+        if self._host_scene.write_objects(self._block.host("objects"), now - (self._start_time or 0.0)) or self._index == 0:
+            touched.append("objects")
+        moved = pose is not None and (params["camera_position"] != before["camera_position"]).any() | (
+            params["world_from_camera"] != before["world_from_camera"]
+        ).any()
+        if moved or self._arrays.version("pose") == 0:
+            touched.append("pose")
+        if pose is not None:
+            params["object_rect"] = self._host_scene.object_rect(pose, self.camera)
+            params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
+            self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
+            self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
+        params["time"] = now - (self._start_time or 0.0)
+        params["time_step"] = max(now - self._last_time, 0.0)
+        params["frame_index"] = self._index
+        params["environment_reset"] = int(not self._has_light)
+        self._block.upload()
+        for name in touched:
+            self._arrays.touch(name)
+
+    def _upload(self, image: Any, host_image: npt.NDArray[np.uint8] | None) -> None:
+        if host_image is None:
+            wp.copy(self._frame, image)
+        elif self._staging is None:
+            target = self._frame.numpy()
+            if self._index and np.array_equal(target, host_image):
+                return  # a still picture: nothing that reads the frame needs to run
+            np.copyto(target, host_image)
+        else:
+            np.copyto(self._staging.numpy(), host_image)
+            wp.copy(self._frame, self._staging)
+        self._arrays.touch("frame")
+
+
+def pixel_rays(camera: Camera) -> npt.NDArray[np.float32]:
+    """Normalised image coordinates (x / z, y / z) of every pixel centre with the lens distortion undone, (height, width, 2)."""
+    columns, rows = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
+    pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
+    distortion = np.asarray(camera.distortion, np.float64)
+    points = cv2.undistortPoints(pixels, camera.matrix(), distortion, criteria=stop)
+    return np.asarray(points, np.float32).reshape(camera.height, camera.width, 2)

@@ -1,0 +1,112 @@
+"""What happened while frames ran: the report and the table of stages."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+import warp as wp
+from rich.console import Console
+from rich.table import Table
+
+from warp_ar.graph import Plan
+from warp_ar.pipeline import TRACK, Pipeline, Result
+from warp_ar.stages import STAGES
+from warp_ar.tracking import Pose
+
+# Frames left out of medians: caches fill and modules load.
+WARM_UP = 3
+
+
+class RunLog:
+    """Collects poses and timings, frame by frame."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._frames: list[dict[str, Any]] = []
+        self._skipped: dict[str, int] = {}
+        self._first = 0.0
+        self._last = 0.0
+        self.never_posed = pipeline.plan.needs("pose")
+        """True while a pose was needed and none has been found."""
+
+    @property
+    def count(self) -> int:
+        """Frames so far."""
+        return len(self._frames)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second since the first frame was done; 0 before the second."""
+        return (self.count - 1) / (self._last - self._first) if self.count > 1 and self._last > self._first else 0.0
+
+    def add(self, result: Result) -> None:
+        """Note one frame's result."""
+        self._last = time.perf_counter()
+        if not self._frames:
+            self._first = self._last
+        if result.pose is not None:
+            self.never_posed = False
+        stages = {name: round(timing.milliseconds, 4) for name, timing in result.stages.items() if not timing.skipped}
+        for name, timing in result.stages.items():
+            self._skipped[name] = self._skipped.get(name, 0) + timing.skipped
+        self._frames.append({"index": self.count, "pose": _pose_record(result.pose), "stages": stages})
+
+    def median_ms(self, stage: str) -> float | None:
+        """Median milliseconds of ``stage`` over the frames in which it ran, warm-up excluded where there is enough."""
+        frames = self._frames[WARM_UP:] if self.count > 2 * WARM_UP else self._frames
+        times = [frame["stages"][stage] for frame in frames if stage in frame["stages"]]
+        return statistics.median(times) if times else None
+
+    def skipped(self, stage: str) -> int:
+        """Frames in which ``stage`` was skipped because nothing that it reads had changed."""
+        return self._skipped.get(stage, 0)
+
+    def report(self) -> dict[str, Any]:
+        """The run as plain data, ready for JSON."""
+        plan = self._pipeline.plan
+        return {
+            "device": str(self._pipeline.device),
+            "warp": wp.__version__,
+            "quality": self._pipeline.quality.name,
+            "fps": round(self.fps, 3),
+            "frames": self._frames,
+            "stages_run": stage_names(plan),
+            "stages_left_out": [{"stage": stage, "reason": reason} for stage, reason in left_out(plan)],
+        }
+
+
+def _pose_record(pose: Pose | None) -> dict[str, Any] | None:
+    return None if pose is None else {"R": pose.rotation.tolist(), "t": pose.translation.tolist()}
+
+
+def stage_names(plan: Plan) -> list[str]:
+    """Names of what runs, the host's tracking included, in order."""
+    return [TRACK] * plan.needs("pose") + [stage.name for stage, _ in plan.stages]
+
+
+def left_out(plan: Plan) -> list[tuple[str, str]]:
+    """(stage, reason) of all that does not run, the host's tracking included."""
+    tracking = [] if plan.needs("pose") else [(TRACK, "nothing reads the camera's pose")]
+    return [*tracking, *plan.left_out]
+
+
+def print_plan(plan: Plan, log: RunLog | None = None) -> None:
+    """Print the table of stages: what runs (with median times, if ``log`` has them) and what is left out and why."""
+    table = Table(title=f"{plan.request.scene.name}, quality {plan.request.quality.name}, {plan.request.size[0]}x{plan.request.size[1]}")
+    table.add_column("stage")
+    table.add_column("rung")
+    table.add_column("state")
+    table.add_column("median ms", justify="right")
+    table.add_column("what it does, or why it is left out")
+    summaries = {stage.name: stage.summary for stage in STAGES} | {TRACK: "finds the marker and the camera's pose"}
+    for name in stage_names(plan):
+        milliseconds = log.median_ms(name) if log is not None else None
+        skipped = log.skipped(name) if log is not None else 0
+        state = "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
+        time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
+        table.add_row(name, plan.request.quality.rung(name), state, time_text, summaries[name])
+    for name, reason in left_out(plan):
+        table.add_row(name, "", "left out", "", reason, style="dim")
+    Console().print(table)

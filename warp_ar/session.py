@@ -1,0 +1,83 @@
+"""A source and a pipeline that fit each other: the common case in one call."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+from warp_ar.errors import UsageError
+from warp_ar.pipeline import Pipeline, Result
+from warp_ar.quality import DEFAULT_PRESET, Quality
+from warp_ar.scene import Camera, Scene, load_scene
+from warp_ar.sources import Frame, Source, open_source
+
+
+class Session:
+    """Opens a scene's source and lights its frames one after another.
+
+    Iterating gives ``(frame, result)`` pairs. Use it in a ``with`` statement, so that devices and threads are let go.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | str | Path = "desk",
+        *,
+        source: str | int | Path | None = None,
+        calibration: str | Path | None = None,
+        device: str = "auto",
+        quality: str | Quality = DEFAULT_PRESET,
+        outputs: tuple[str, ...] = ("image",),
+        loop: bool = False,
+    ) -> None:
+        """Open everything.
+
+        Args:
+            scene: A scene, a scene file or a bundled scene's name.
+            source: Frames instead of the scene's own: a folder, a video file, or a capture device's index.
+            calibration: OpenCV calibration file instead of the scene's camera numbers.
+            device: ``auto``, ``cpu`` or ``cuda:N``.
+            quality: A preset's name or a value of one's own.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            loop: Start a clip again when it ends.
+
+        Raises:
+            SceneError: The scene or the calibration cannot be used.
+            SourceError: The source cannot be opened.
+            UsageError: Any other argument cannot be used.
+        """
+        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
+        if calibration is not None:
+            camera = Camera.load_calibration(calibration)
+            self.scene = dataclasses.replace(self.scene, camera=dataclasses.replace(camera, transfer=self.scene.camera.transfer))
+        chosen = source
+        if chosen is None:
+            spec = self.scene.source
+            if spec is None:
+                raise UsageError(f"scene {self.scene.name!r} names no source; give one with --source")
+            chosen = spec.path if spec.path is not None else spec.camera if spec.camera is not None else spec.synthetic
+        fps = self.scene.source.fps if self.scene.source is not None and source is None else None
+        self.source: Source = open_source(chosen, fps=fps, loop=loop)
+        try:
+            self.pipeline = Pipeline(
+                self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs
+            )
+        except BaseException:
+            self.source.close()
+            raise
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the source and the pipeline's threads go."""
+        self.source.close()
+        self.pipeline.close()
+
+    def __iter__(self) -> Iterator[tuple[Frame, Result]]:
+        for frame in self.source:
+            yield frame, self.pipeline(frame.image, time_seconds=frame.time)
