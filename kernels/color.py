@@ -1,0 +1,162 @@
+"""Between 8-bit camera codes and linear radiance, for a known transfer function.
+
+A transfer is ``"srgb"``, ``"linear"``, ``"gamma:<exponent>"`` or the path of a measured response: a text file of 256
+lines with three numbers, the linear red, green and blue value of each code. Linear values are camera values: 0 is
+black, 1 is clipping.
+
+Decoding is one look-up. Encoding rounds to the nearest code *in the encoded domain*, as a camera does. Between the
+codes k and k + 1 lies one threshold in linear light, and the code of x is the number of thresholds that x reaches:
+
+    t_k = T^-1((k + 1/2) / 255),   code(x) = #{k : t_k <= x}.
+
+A formula T gives t_k in closed form; a measured response is interpolated linearly between codes, so t_k is the mean
+of its neighbours. Each threshold is rounded *up* to float32: a float32 number reaches the rounded threshold exactly
+if it reaches the real one, so the codes are those of real arithmetic for every float32 input, and the largest error
+is half a code (ties go up). CPU and CUDA agree bit for bit.
+
+Counting starts from a table of ``ENCODE_KEYS`` cells over sqrt(x), which holds the number of thresholds that lie
+safely below each cell. For the transfers above no cell holds more than one threshold, so one or two comparisons
+finish the count, without a power function.
+"""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+import warp as wp
+
+from warp_ar.errors import SceneError
+
+wp.set_module_options({"enable_backward": False})
+
+ENCODE_KEYS = 1024
+"""Cells of the encoder's first look-up; up to an exponent of 3, thresholds fall into cells of their own."""
+ENCODE_LENGTH = ENCODE_KEYS + 256
+"""Entries of an encode table: first counts, then thresholds (the last one infinite)."""
+
+_KEY_SCALE = wp.constant(wp.float32(ENCODE_KEYS - 1))
+
+
+@wp.func
+def decode(table: wp.array[wp.vec3], code: wp.vec3ub) -> wp.vec3:
+    """Linear value of an 8-bit colour; ``table`` comes from ``decode_table``."""
+    return wp.vec3(table[wp.int32(code[0])][0], table[wp.int32(code[1])][1], table[wp.int32(code[2])][2])
+
+
+@wp.func
+def encode_channel(table: wp.array[wp.vec3], value: wp.float32, channel: wp.int32) -> wp.uint8:
+    """Nearest code of one linear value; below 0 and NaN give 0, above 1 and infinity give 255."""
+    if not value > 0.0:  # true for NaN as well
+        return wp.uint8(0)
+    key = wp.int32(wp.sqrt(wp.min(value, 1.0)) * _KEY_SCALE)
+    code = wp.int32(table[key][channel])
+    while value >= table[ENCODE_KEYS + code][channel] and code < 255:
+        code += 1
+    return wp.uint8(code)
+
+
+@wp.func
+def encode(table: wp.array[wp.vec3], radiance: wp.vec3) -> wp.vec3ub:
+    """Nearest 8-bit colour of a linear one; ``table`` comes from ``encode_table``."""
+    return wp.vec3ub(
+        encode_channel(table, radiance[0], 0),
+        encode_channel(table, radiance[1], 1),
+        encode_channel(table, radiance[2], 2),
+    )
+
+
+def decode_table(transfer: str | pathlib.Path) -> np.ndarray:
+    """Linear value of every code.
+
+    Args:
+        transfer: ``"srgb"``, ``"linear"``, ``"gamma:2.2"`` or the path of a measured response. A response is known
+        only up to a factor,
+            so each of its channels is divided by its own last value: clipping becomes 1.
+
+    Returns:
+        (256, 3) float32, non-decreasing from row to row, last row 1.
+
+    Raises:
+        SceneError: The name is not a transfer, or the file is not a measured response.
+    """
+    return _decode_values(transfer).astype(np.float32)
+
+
+def encode_table(transfer: str | pathlib.Path) -> np.ndarray:
+    """Table for the device function ``encode``; arguments and errors as ``decode_table``.
+
+    Returns:
+        (``ENCODE_LENGTH``, 3) float32.
+    """
+    half_codes = (np.arange(255) + 0.5) / 255.0
+    name = str(transfer)
+    if name == "linear" or name == "srgb" or name.startswith("gamma:"):
+        exact = np.repeat(_formula(name, half_codes)[:, None], 3, axis=1)
+    else:
+        values = _decode_values(transfer)
+        exact = 0.5 * (values[:-1] + values[1:])
+    thresholds = exact.astype(np.float32)
+    thresholds = np.where(thresholds < exact, np.nextafter(thresholds, np.float32(np.inf)), thresholds)
+    table = np.full((ENCODE_LENGTH, 3), np.inf, np.float32)
+    table[ENCODE_KEYS:-1] = thresholds
+    # A threshold counts for a cell only if it lies a safe step below it: no rounding of a device's sqrt can then
+    # count it too early.
+    keys = np.floor(np.sqrt(thresholds.astype(np.float64) * (1.0 + 1e-6)) * (ENCODE_KEYS - 1))
+    for channel in range(3):
+        table[:ENCODE_KEYS, channel] = np.searchsorted(keys[:, channel], np.arange(ENCODE_KEYS), side="left")
+    return table
+
+
+def _formula(name: str, encoded: np.ndarray) -> np.ndarray:
+    """Linear value of encoded values in 0..1 for the transfers that have a formula (sRGB: IEC 61966-2-1)."""
+    if name == "linear":
+        return encoded
+    if name == "srgb":
+        return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return encoded ** _gamma(name)
+
+
+def _gamma(name: str) -> float:
+    try:
+        gamma = float(name.removeprefix("gamma:"))
+    except ValueError:
+        gamma = float("nan")
+    if not 0.1 <= gamma <= 10.0:
+        raise SceneError(f"camera.transfer = {name!r}: the exponent must be a number from 0.1 to 10, as in 'gamma:2.2'")
+    return gamma
+
+
+def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
+    """(256, 3) float64 linear values of the codes."""
+    name = str(transfer)
+    if name in ("srgb", "linear") or name.startswith("gamma:"):
+        return np.repeat(_formula(name, np.arange(256) / 255.0)[:, None], 3, axis=1)
+    path = pathlib.Path(transfer)
+    if not path.is_file():
+        raise SceneError(
+            f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
+        )
+    try:
+        values = np.array(
+            [
+                [float(word) for word in line.replace(",", " ").split()]
+                for line in path.read_text().splitlines()
+                if line.strip()
+            ]
+        )
+    except ValueError as error:
+        raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None
+    if values.shape != (256, 3):
+        raise SceneError(
+            f"{path}: a measured response is 256 lines of three linear values, this has shape {values.shape}"
+        )
+    if not np.isfinite(values).all() or (values < 0.0).any():
+        raise SceneError(f"{path}: the values of a measured response must be finite and not negative")
+    falling = np.argwhere(np.diff(values, axis=0) < 0.0)
+    if len(falling):
+        line, channel = falling[0]
+        raise SceneError(f"{path}: a measured response must not fall, but line {line + 2} does so in {'RGB'[channel]}")
+    if not (values[-1] > values[0]).all():
+        raise SceneError(f"{path}: a measured response must rise from its first to its last line in every channel")
+    return values / values[-1]
