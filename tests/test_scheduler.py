@@ -1,0 +1,166 @@
+"""The scheduler, on small stages of its own: order, skipping, bands, graphs."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_ar import graph
+from warp_ar.graph import Plan, make_plan
+from warp_ar.kernels.launch import launch_rows
+from warp_ar.quality import PRESETS
+from warp_ar.scheduler import Scheduler
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+
+SIZE = 37
+
+
+@wp.kernel(enable_backward=False)
+def add_one_kernel(row_start: wp.int32, values: wp.array[wp.int32], values_out: wp.array[wp.int32]):
+    row = wp.tid() + row_start
+    values_out[row] = values[row] + 1
+
+
+class AddOne(Stage):
+    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "adds one"
+    source: ClassVar[str]
+    target: ClassVar[str]
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        if cls.target in request.scene.unwanted:
+            return LeftOut(f"the scene has no {cls.target}")
+        return Wiring((cls.source,), (cls.target,))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        return {self.target: ArraySpec((SIZE,), wp.int32)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        def launch(rows: tuple[int, int] | None) -> None:
+            launch_rows(add_one_kernel, (SIZE,), [arrays[self.source]], [arrays[self.target]], rows=rows, device=device)
+
+        return [Pass(launch, rows=SIZE)]
+
+    def changed(self, name: str) -> bool:
+        return not self.request.scene.still
+
+
+def chain(*names: str) -> tuple[type[Stage], ...]:
+    """Stages frame -> names[0] -> names[1] -> ..."""
+    sources = ("frame", *names)
+    return tuple(
+        type(f"To{target}", (AddOne,), {"name": f"make_{target}", "source": source, "target": target})
+        for source, target in zip(sources, names, strict=False)
+    )
+
+
+def plan_of(monkeypatch: pytest.MonkeyPatch, stages: tuple[type[Stage], ...], outputs: tuple[str, ...], **scene: Any) -> Plan:
+    monkeypatch.setattr(graph, "STAGES", stages)
+    values = types.SimpleNamespace(**{"unwanted": (), "still": False, **scene})
+    return make_plan(Request(values, PRESETS["medium"], (4, 4), outputs))  # type: ignore[arg-type]
+
+
+def inputs(device: str) -> Arrays:
+    arrays = Arrays()
+    for name in graph.INPUTS:
+        arrays.add(name, wp.zeros(SIZE, dtype=wp.int32, device=device) if name == "frame" else None)
+        arrays.touch(name)
+    return arrays
+
+
+def run_count(timings: Mapping[str, Any]) -> int:
+    return sum(not timing.skipped for timing in timings.values())
+
+
+def test_walks_back_from_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of(monkeypatch, (*chain("a", "b"), *chain("unused")), ("b",))
+    assert [stage.name for stage, _ in plan.stages] == ["make_a", "make_b"]
+    assert plan.left_out == (("make_unused", "nothing reads its unused"),)
+    assert plan.inputs == ("frame",)
+
+
+def test_left_out_keeps_the_reason_of_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of(monkeypatch, chain("a"), ("image",), unwanted=("a",))
+    assert plan.left_out == (("make_a", "the scene has no a"),)
+    assert plan.stages == ()
+
+
+def test_missing_producer_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="nothing in this scene produces nowhere"):
+        plan_of(monkeypatch, chain("a"), ("nowhere",))
+    with pytest.raises(ValueError, match=r"'make_b' reads a, which no earlier stage writes"):
+        plan_of(monkeypatch, chain("a", "b")[1:], ("b",))
+
+
+def test_unchanged_input_skips(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    arrays = inputs(device)
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device(device))
+    assert run_count(scheduler.run()) == 2
+    assert run_count(scheduler.run()) == 0
+    arrays["frame"].fill_(5)
+    arrays.touch("frame")
+    assert run_count(scheduler.run()) == 2
+    np.testing.assert_array_equal(arrays["b"].numpy(), 7)
+    scheduler.forget()
+    assert run_count(scheduler.run()) == 2
+    scheduler.close()
+
+
+def test_a_stage_that_reports_no_change_spares_its_readers(monkeypatch: pytest.MonkeyPatch) -> None:
+    arrays = inputs("cpu")
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",), still=True), arrays, wp.get_device("cpu"))
+    assert run_count(scheduler.run()) == 2, "the first run must reach every stage"
+    arrays.touch("frame")
+    assert run_count(scheduler.run()) == 1
+    scheduler.close()
+
+
+def test_switching_sets_of_stages_gives_the_same_answer(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """Graphs are cached by the set of stages that are due; each must act on the current contents."""
+    arrays = inputs(device)
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device(device))
+    for value in (0, 3, 3, 9, -1):
+        arrays["frame"].fill_(value)
+        arrays.touch("frame")
+        scheduler.run()
+        np.testing.assert_array_equal(arrays["b"].numpy(), value + 2)
+    scheduler.close()
+
+
+@pytest.mark.parametrize("bands", [1, 2, 3, 16])
+def test_bands_cover_every_row_once(monkeypatch: pytest.MonkeyPatch, bands: int) -> None:
+    arrays = inputs("cpu")
+    arrays["frame"].assign(np.arange(SIZE, dtype=np.int32))
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a"), ("a",)), arrays, wp.get_device("cpu"), bands=bands)
+    scheduler.run()
+    np.testing.assert_array_equal(arrays["a"].numpy(), np.arange(SIZE) + 1)
+    scheduler.close()
+
+
+def test_a_failing_band_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Failing(AddOne):
+        name, source, target = "fails", "frame", "a"
+
+        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+            def launch(rows: tuple[int, int] | None) -> None:
+                raise RuntimeError("broken band")
+
+            return [Pass(launch, rows=SIZE)]
+
+    scheduler = Scheduler(plan_of(monkeypatch, (Failing,), ("a",)), inputs("cpu"), wp.get_device("cpu"), bands=2)
+    with pytest.raises(RuntimeError, match="broken band"):
+        scheduler.run()
+    scheduler.close()
+
+
+def test_two_owners_of_one_resource_are_an_error() -> None:
+    arrays = Arrays()
+    arrays.add("x", None)
+    with pytest.raises(ValueError, match="'x' is already there"):
+        arrays.add("x", None)
