@@ -1,0 +1,402 @@
+"""What rays meet: shapes, the closest hit, any hit, and the primary rays of a frame.
+
+Spheres, boxes and planes are intersected analytically, meshes through Warp's BVH in local space. Functions that walk the scene come from
+``make_trace``, specialised to the kinds of shape that are there: a scene of spheres holds no mesh code. Ray parameters ``t`` are in
+multiples of the direction's length, which need not be 1; every test accepts 0 < t < t_max.
+
+No ray may slip through the shared edge of two triangles. Warp's own test of a triangle is watertight [WBW13], its test of a node's box is
+not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a margin around triangles, and so loses rays that run
+through edges which are box faces as well. ``warp_ar.ray_scene.make_ray_mesh`` therefore builds the BVH over boxes that are larger by
+2^-18 of the mesh's radius than their triangles. That margin covers the rounding 2 * 3 * 2^-24 * |box - origin| of a slab's two bounds, if
+the origin is near; ``intersect_mesh`` first moves it to the mesh's bounding sphere, after which |box - origin| is at most two radii.
+
+References:
+    [WBW13] Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013.
+    [Ize13] Ize, "Robust BVH Ray Traversal", JCGT 2(2), 2013.
+    [HHO19] Haines, Guenther, Akenine-Moeller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems ch. 7, 2019.
+    [WB19] Waechter, Binder, "A Fast and Robust Method for Avoiding Self-Intersection", Ray Tracing Gems ch. 6, 2019.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import warp as wp
+
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+
+wp.set_module_options({"enable_backward": False})
+
+# Half the spacing of float32 at 1: the relative error of one rounding.
+ROUNDING = wp.constant(wp.float32(2.0**-24))
+FAR = wp.constant(wp.float32(3.0e38))
+
+
+@wp.struct
+class Contact:
+    """Where a ray meets one shape."""
+
+    t: wp.float32  # FAR: not at all
+    face: wp.int32  # of a mesh
+    u: wp.float32  # barycentric weights of the face's first and second corner
+    v: wp.float32
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets the scene, in the world. Normals point out of the shape, whichever side the ray comes from."""
+
+    t: wp.float32
+    shape: wp.int32  # index of the object or proxy, -1 for none
+    point: wp.vec3
+    normal: wp.vec3  # for shading: interpolated where the shape is smooth
+    geometric_normal: wp.vec3  # of the surface that rays meet
+    uv: wp.vec2
+    error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
+
+
+@wp.func
+def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
+    """World point in the shape's coordinates."""
+    return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
+
+
+@wp.func
+def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
+    """World direction in the shape's coordinates, divided by the scale so that t keeps its meaning."""
+    return wp.transpose(shape.rotation) * direction / shape.scale
+
+
+@wp.func
+def intersect_sphere(radius: wp.float32, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """Smallest t on a sphere around the origin, FAR if none.
+
+    The discriminant is r^2 - |closest point|^2, not b^2 - ac, and the roots are q / a and c / q: neither cancels [HHO19].
+    """
+    a = wp.dot(direction, direction)
+    b = -wp.dot(origin, direction)
+    nearest = origin + (b / a) * direction
+    discriminant = radius * radius - wp.dot(nearest, nearest)
+    if discriminant < 0.0:
+        return FAR
+    distance = wp.length(origin)
+    c = (distance - radius) * (distance + radius)
+    q = b + wp.where(b < 0.0, -1.0, 1.0) * wp.sqrt(a * discriminant)
+    t0 = q / a
+    t1 = t0
+    if q != 0.0:
+        t1 = c / q
+    near = wp.min(t0, t1)
+    if near <= 0.0:
+        near = wp.max(t0, t1)
+    return wp.where(near > 0.0 and near < t_max, near, FAR)
+
+
+@wp.func
+def intersect_box(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """Smallest t on a box around the origin, FAR if none; a ray along a face counts as inside, never as 0 * inf."""
+    t_near = -FAR
+    t_far = FAR
+    for axis in range(3):
+        if direction[axis] == 0.0:
+            if wp.abs(origin[axis]) > half[axis]:
+                return FAR
+        else:
+            inverse = 1.0 / direction[axis]
+            t0 = (-half[axis] - origin[axis]) * inverse
+            t1 = (half[axis] - origin[axis]) * inverse
+            t_near = wp.max(t_near, wp.min(t0, t1))
+            t_far = wp.min(t_far, wp.max(t0, t1))
+    if t_near > t_far:
+        return FAR
+    t = wp.where(t_near > 0.0, t_near, t_far)
+    return wp.where(t > 0.0 and t < t_max, t, FAR)
+
+
+@wp.func
+def intersect_plane(half: wp.vec3, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
+    """T on the rectangle |x| <= half.x, |y| <= half.y of the plane z = 0, from either side; FAR if none."""
+    if direction[2] == 0.0:
+        return FAR
+    t = -origin[2] / direction[2]
+    x = origin[0] + t * direction[0]
+    y = origin[1] + t * direction[1]
+    return wp.where(t > 0.0 and t < t_max and wp.abs(x) <= half[0] and wp.abs(y) <= half[1], t, FAR)
+
+
+@wp.func
+def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
+    """T at which a ray enters the bounding sphere of a mesh, 0 if it starts inside, FAR if it passes by."""
+    a = wp.dot(direction, direction)
+    b = -wp.dot(origin, direction)
+    nearest = origin + (b / a) * direction
+    # A little more than the radius: covers the rounding of `nearest`, which grows with the origin's distance.
+    radius = 1.001 * wp.length(half) + 8.0 * ROUNDING * wp.length(origin)
+    discriminant = radius * radius - wp.dot(nearest, nearest)
+    if discriminant < 0.0:
+        return FAR
+    reach = wp.sqrt(a * discriminant)
+    if b + reach < 0.0:
+        return FAR
+    return wp.max((b - reach) / a, 0.0)
+
+
+@wp.func
+def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Contact:
+    """Closest face of a mesh from either side; see the module's notes on watertightness."""
+    contact = Contact()
+    contact.t = FAR
+    start = enter_mesh(shape.extent, origin, direction)
+    if start < t_max:
+        query = wp.mesh_query_ray(shape.mesh, origin + start * direction, direction, t_max - start)
+        if query.result:
+            contact.t = start + query.t
+            contact.face = query.face
+            contact.u = query.u
+            contact.v = query.v
+    return contact
+
+
+@wp.func
+def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    """Whether any face of a mesh lies before t_max."""
+    start = enter_mesh(shape.extent, origin, direction)
+    if start >= t_max:
+        return False
+    return wp.mesh_query_ray_anyhit(shape.mesh, origin + start * direction, direction, t_max - start)
+
+
+@wp.func
+def box_normal(half: wp.vec3, point: wp.vec3) -> wp.vec3:
+    """Outward normal of the face that a point on a box is nearest to."""
+    x = wp.abs(point[0]) - half[0]
+    y = wp.abs(point[1]) - half[1]
+    z = wp.abs(point[2]) - half[2]
+    if x >= y and x >= z:
+        return wp.vec3(wp.where(point[0] < 0.0, -1.0, 1.0), 0.0, 0.0)
+    if y >= z:
+        return wp.vec3(0.0, wp.where(point[1] < 0.0, -1.0, 1.0), 0.0)
+    return wp.vec3(0.0, 0.0, wp.where(point[2] < 0.0, -1.0, 1.0))
+
+
+@wp.func
+def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
+    """Texture coordinates 0..1 on each face: u and v run along the next two axes, mirrored in u on negative faces."""
+    p = wp.cw_div(point, half)
+    if normal[0] != 0.0:
+        return wp.vec2(0.5 + 0.5 * normal[0] * p[1], 0.5 + 0.5 * p[2])
+    if normal[1] != 0.0:
+        return wp.vec2(0.5 + 0.5 * normal[1] * p[2], 0.5 + 0.5 * p[0])
+    return wp.vec2(0.5 + 0.5 * normal[2] * p[0], 0.5 + 0.5 * p[1])
+
+
+@wp.func
+def sphere_uv(normal: wp.vec3) -> wp.vec2:
+    """Texture coordinates of a sphere: u runs from -x through -y, +x and +y as a latlong map's columns, v from -z to +z."""
+    phi = wp.atan2(normal[1], normal[0])
+    theta = wp.atan2(wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2])
+    return wp.vec2(0.5 + phi / (2.0 * wp.pi), 1.0 - theta / wp.pi)
+
+
+@wp.func
+def offset_origin(point: wp.vec3, geometric_normal: wp.vec3, direction: wp.vec3, error: wp.float32) -> wp.vec3:
+    """Origin of a ray that leaves a surface: moved off it along the normal, to the side that ``direction`` goes to.
+
+    A ray along the normal by ``Hit.error`` cannot meet the surface it leaves, at any scale and distance from the world's origin. [WB19]
+    count units in the last place of the point alone, and so need a fixed distance near the origin, where those vanish but the error of a
+    point that was computed relative to its shape does not; ``Hit.error`` knows the shape.
+    """
+    return point + wp.where(wp.dot(geometric_normal, direction) < 0.0, -error, error) * geometric_normal
+
+
+class Trace(NamedTuple):
+    """Functions for kernels, each taking ``(scene: RayScene, origin: vec3, direction: vec3, t_max: float32)``."""
+
+    closest_object: wp.Function
+    """Closest virtual object: ``Hit``."""
+    closest_proxy: wp.Function
+    """Closest proxy: ``Hit``."""
+    occluded_by_objects: wp.Function
+    """Whether any virtual object lies in the way: ``bool``."""
+    occluded_by_proxies: wp.Function
+    """Whether any proxy lies in the way: ``bool``."""
+    occluded: wp.Function
+    """Either of the two."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TraceConfig:
+    """Which kinds of shape exist; the others are not compiled in. Kinds are sorted and unique."""
+
+    objects: tuple[int, ...]
+    """Kinds among the virtual objects."""
+    proxies: tuple[int, ...]
+    """Kinds among the proxies."""
+
+
+@functools.cache
+def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
+    """Closest hit among shapes of the given kinds."""
+    label = "_".join(map(str, kinds))
+
+    @wp.func(name=f"closest_hit_{label}", module="unique")
+    def closest_hit(
+        shapes: wp.array[Shape],
+        vertex_normals: wp.array[wp.vec3],
+        vertex_uvs: wp.array[wp.vec2],
+        origin: wp.vec3,
+        direction: wp.vec3,
+        t_max: wp.float32,
+    ) -> Hit:
+        hit = Hit()
+        hit.shape = -1
+        hit.t = t_max
+        if wp.static(len(kinds) > 0):
+            contact = Contact()
+            for index in range(shapes.shape[0]):
+                shape = shapes[index]
+                o = to_local_point(shape, origin)
+                d = to_local_vector(shape, direction)
+                t = FAR
+                if wp.static(SPHERE in kinds):
+                    if shape.kind == SPHERE:
+                        t = intersect_sphere(shape.extent[0], o, d, hit.t)
+                if wp.static(BOX in kinds):
+                    if shape.kind == BOX:
+                        t = intersect_box(shape.extent, o, d, hit.t)
+                if wp.static(PLANE in kinds):
+                    if shape.kind == PLANE:
+                        t = intersect_plane(shape.extent, o, d, hit.t)
+                if wp.static(MESH in kinds):
+                    if shape.kind == MESH:
+                        met = intersect_mesh(shape, o, d, hit.t)
+                        t = met.t
+                        if t < hit.t:
+                            contact = met
+                if t < hit.t:
+                    hit.t = t
+                    hit.shape = index
+
+            if hit.shape >= 0:
+                shape = shapes[hit.shape]
+                p = to_local_point(shape, origin) + hit.t * to_local_vector(shape, direction)
+                geometric = wp.vec3(0.0, 0.0, 1.0)
+                normal = wp.vec3(0.0, 0.0, 1.0)
+                # Each kind puts the point back onto its surface: the error of t, large for a far origin, ends here.
+                if wp.static(SPHERE in kinds):
+                    if shape.kind == SPHERE:
+                        geometric = wp.normalize(p)
+                        p = shape.extent[0] * geometric
+                        normal = geometric
+                        hit.uv = sphere_uv(geometric)
+                if wp.static(BOX in kinds):
+                    if shape.kind == BOX:
+                        geometric = box_normal(shape.extent, p)
+                        p = wp.vec3(
+                            wp.where(geometric[0] != 0.0, geometric[0] * shape.extent[0], p[0]),
+                            wp.where(geometric[1] != 0.0, geometric[1] * shape.extent[1], p[1]),
+                            wp.where(geometric[2] != 0.0, geometric[2] * shape.extent[2], p[2]),
+                        )
+                        normal = geometric
+                        hit.uv = box_uv(shape.extent, geometric, p)
+                if wp.static(PLANE in kinds):
+                    if shape.kind == PLANE:
+                        p = wp.vec3(p[0], p[1], 0.0)
+                        hit.uv = wp.vec2(0.5 + 0.5 * p[0] / shape.extent[0], 0.5 + 0.5 * p[1] / shape.extent[1])
+                if wp.static(MESH in kinds):
+                    if shape.kind == MESH:
+                        p = wp.mesh_eval_position(shape.mesh, contact.face, contact.u, contact.v)
+                        geometric = wp.mesh_eval_face_normal(shape.mesh, contact.face)
+                        w = 1.0 - contact.u - contact.v
+                        corner = shape.first_vertex + 3 * contact.face
+                        normal = geometric
+                        if shape.smooth != 0:
+                            normal = wp.normalize(
+                                contact.u * vertex_normals[corner]
+                                + contact.v * vertex_normals[corner + 1]
+                                + w * vertex_normals[corner + 2]
+                            )
+                            # Opposed corner normals can cancel; zero is no direction.
+                            if wp.dot(normal, normal) < 0.5:
+                                normal = geometric
+                        hit.uv = (
+                            contact.u * vertex_uvs[corner] + contact.v * vertex_uvs[corner + 1] + w * vertex_uvs[corner + 2]
+                        )
+                arm = shape.rotation * (shape.scale * p)
+                hit.point = arm + shape.position
+                hit.normal = shape.rotation * normal
+                hit.geometric_normal = shape.rotation * geometric
+                # World coordinates are rounded once on the way out and twice on the way back into the shape; within the shape, rotating
+                # there and back, placing the point and testing the surface again take some 20 roundings of its size.
+                size = shape.scale * wp.length(shape.extent)
+                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
+        return hit
+
+    return closest_hit
+
+
+@functools.cache
+def _make_any(kinds: tuple[int, ...]) -> wp.Function:
+    """Whether a ray meets any of the shapes of the given kinds."""
+    label = "_".join(map(str, kinds))
+
+    @wp.func(name=f"any_hit_{label}", module="unique")
+    def any_hit(shapes: wp.array[Shape], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        if wp.static(len(kinds) > 0):
+            for index in range(shapes.shape[0]):
+                shape = shapes[index]
+                o = to_local_point(shape, origin)
+                d = to_local_vector(shape, direction)
+                if wp.static(SPHERE in kinds):
+                    if shape.kind == SPHERE:
+                        if intersect_sphere(shape.extent[0], o, d, t_max) < t_max:
+                            return True
+                if wp.static(BOX in kinds):
+                    if shape.kind == BOX:
+                        if intersect_box(shape.extent, o, d, t_max) < t_max:
+                            return True
+                if wp.static(PLANE in kinds):
+                    if shape.kind == PLANE:
+                        if intersect_plane(shape.extent, o, d, t_max) < t_max:
+                            return True
+                if wp.static(MESH in kinds):
+                    if shape.kind == MESH:
+                        if meets_mesh(shape, o, d, t_max):
+                            return True
+        return False
+
+    return any_hit
+
+
+@functools.cache
+def make_trace(config: TraceConfig) -> Trace:
+    """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
+    closest_shape_object, closest_shape_proxy = _make_closest(config.objects), _make_closest(config.proxies)
+    any_object, any_proxy = _make_any(config.objects), _make_any(config.proxies)
+
+    @wp.func(module="unique")
+    def closest_object(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
+        return closest_shape_object(scene.objects, scene.vertex_normals, scene.vertex_uvs, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def closest_proxy(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
+        return closest_shape_proxy(scene.proxies, scene.vertex_normals, scene.vertex_uvs, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def occluded_by_objects(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        return any_object(scene.objects, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        return any_proxy(scene.proxies, origin, direction, t_max)
+
+    @wp.func(module="unique")
+    def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        if any_object(scene.objects, origin, direction, t_max):
+            return True
+        return any_proxy(scene.proxies, origin, direction, t_max)
+
+    return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
