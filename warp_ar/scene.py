@@ -83,8 +83,8 @@ class Camera:
             return self
         if width < 1 or height < 1 or width * self.height != height * self.width:
             raise SceneError(
-                f"camera: calibrated for {self.width}x{self.height}, frames are {width}x{height}: another aspect ratio, "
-                "so the intrinsics cannot be scaled; record at the calibrated aspect or calibrate at this size"
+                f"camera: calibrated for {self.width}x{self.height}, frames are {width}x{height}: another aspect "
+                "ratio, so the intrinsics cannot be scaled; record at the calibrated aspect or calibrate at this size"
             )
         s = width / self.width
         return dataclasses.replace(
@@ -232,8 +232,8 @@ class Proxy:
 class Animation:
     """Motion of an object or a light; nothing moves by default.
 
-    At t seconds a body stands at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), turned by R(t), where R(t) turns
-    by ``turn`` t degrees about the fixed x, then y, then z axis.
+    At t seconds a body stands at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), turned by R(t): ``turn`` t
+    degrees about the fixed x, then y, then z axis.
     """
 
     turn: Vec3 = (0.0, 0.0, 0.0)
@@ -302,7 +302,7 @@ Material: TypeAlias = PhongMaterial | MetallicRoughnessMaterial | LambertMateria
 
 @dataclasses.dataclass(frozen=True)
 class Object:
-    """A virtual object; a point p of its shape stands at R (scale p) + at. Fields that its shape leaves unused are zero."""
+    """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
 
     shape: Literal["mesh", "sphere", "box", "torus"]
     """Spheres, boxes and tori are centred at their origin; a torus lies around its z axis."""
@@ -369,7 +369,7 @@ class Light:
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
 
-        A point light has no direction and gets -z. A spot light that passes through its own target looks along -z there.
+        A point light has no direction and gets -z. So does a spot light that passes through its target.
         """
         position, direction = np.array(self.at), np.array(self.direction or (0.0, 0.0, -1.0))
         if self.animate is not None:
@@ -555,7 +555,7 @@ class _Table:
         right = "one of " + ", ".join(f'"{option}"' for option in options)
         value = self.text(key, default, right=right)
         if value not in options:
-            self.fail(key, f"expected {right}" if len(options) < 8 else _nearest(value, options))
+            self.fail(key, f"expected {right}" if len(options) < 8 else f"unknown; {_nearest(value, options)}")
         return value
 
     def vector(
@@ -590,9 +590,12 @@ class _Table:
 
     def resolve(self, key: str, right: str) -> Path:
         value = self.text(key, right=f"the path of {right}")
-        if "\0" in value:
-            self.fail(key, f"expected the path of {right}")
-        return (self.folder / value).resolve()
+        try:
+            path = (self.folder / value).resolve()
+            path.exists()
+        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
+            self.fail(key, f"expected the path of {right}; this cannot be one")
+        return path
 
     def file(self, key: str, right: str) -> Path:
         path = self.resolve(key, right)
@@ -608,8 +611,8 @@ def _range(what: str, low: float, high: float, unit: str) -> str:
         return f"{what} from {low:g} to {high:g}{unit}"
     if low == _SMALLEST:
         return f"{what} above 0{unit}" if what.startswith("a number") else f"{what}, each above 0{unit}"
-    if low == 0.0:
-        return f"{what}, 0 or more{unit}"
+    if low > -_LARGEST:
+        return f"{what}, {low:g} or more{unit}"
     return f"{what}, finite{unit}" if what == "a number" else f"{what}, each finite{unit}"
 
 
@@ -950,7 +953,11 @@ def load_scene(path_or_name: str | Path) -> Scene:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
     """
     path = Path(path_or_name)
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # too long, or a zero byte
+        found = False
+    if not found:
         bundled = bundled_scenes()
         if str(path_or_name) not in bundled:
             hint = f"a file, or a bundled scene ({_nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
@@ -987,7 +994,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     top = _Table(label, folder, "", {key: data[key] for key in data if key not in _SECTIONS}, (*_TOP_KEYS, *_SECTIONS))
     if "schema" not in top:
         top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
-    top.integer("schema", low=SCHEMA, high=SCHEMA)
+    if top.data["schema"] is True or top.data["schema"] != SCHEMA:
+        top.fail("schema", f"this program reads schema {SCHEMA}")
     if "camera" not in data:
         raise SceneError(f"{label}: [camera] is missing: give {', '.join(_INTRINSICS[:6])}, or calibration")
 
