@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import summed_area as reference
+from warp_ar.kernels import summed_area
+
+# float32(sum) / float32(count): two roundings of an exact integer and one of the quotient, at most 255 * 3 * 2^-24.
+MEAN_ROUNDING = 255 * 3 * 2.0**-24
+
+
+@wp.kernel(enable_backward=False)
+def box_kernel(
+    table: wp.array2d[wp.uint32],
+    boxes: wp.array[wp.vec4i],
+    sums_out: wp.array[wp.uint32],
+    means_out: wp.array[wp.float32],
+):
+    i = wp.tid()
+    b = boxes[i]
+    sums_out[i] = summed_area.box_sum(table, b[0], b[1], b[2], b[3])
+    means_out[i] = summed_area.box_mean(table, b[0], b[2], b[1] - b[0])
+
+
+def make_table(frame):
+    table = wp.zeros(frame.shape[:2], wp.uint32)
+    summed_area.sum_area(wp.array(frame, dtype=wp.vec3ub), table)
+    return table
+
+
+def query(table, boxes):
+    boxes = wp.array(np.asarray(boxes, np.int32).reshape(-1, 4), dtype=wp.vec4i)
+    sums, means = wp.zeros(boxes.shape, wp.uint32), wp.zeros(boxes.shape, wp.float32)
+    wp.launch(box_kernel, boxes.shape, [table, boxes], [sums, means])
+    return sums.numpy(), means.numpy()
+
+
+def random_frame(height, width, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def white(height, width):
+    return np.full((height, width, 3), 255, np.uint8)
+
+
+def test_all_white_counts_pixels(device):
+    table = make_table(white(7, 11)).numpy()
+    np.testing.assert_array_equal(table, 255 * np.outer(np.arange(1, 8), np.arange(1, 12)))
+
+
+def test_intensity_of_grey_is_its_value(device):
+    grey = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    np.testing.assert_array_equal(make_table(grey).numpy()[0], np.arange(256).cumsum())
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 1), (63, 64), (130, 257)])
+def test_matches_twin(device, size):
+    frame = random_frame(*size)
+    np.testing.assert_array_equal(make_table(frame).numpy(), reference.sum_area(frame))
+
+
+def test_bands_give_the_same_table(device):
+    frame = wp.array(random_frame(50, 333), dtype=wp.vec3ub)
+    whole, banded = wp.zeros((50, 333), wp.uint32), wp.zeros((50, 333), wp.uint32)
+    summed_area.sum_area(frame, whole)
+    for band in ((0, 13), (13, 13), (13, 50)):
+        summed_area.sum_along_rows(frame, banded, rows=band)
+    for band in ((0, 1), (1, 200), (200, 333)):
+        summed_area.sum_along_columns(banded, columns=band)
+    np.testing.assert_array_equal(banded.numpy(), whole.numpy())
+
+
+def test_boxes_match_brute_force(device):
+    rng = np.random.default_rng(5)
+    frame = random_frame(40, 60, 1)
+    values = reference.intensity(frame)
+    row, col, size = rng.integers(0, 40, 500), rng.integers(0, 60, 500), rng.integers(1, 150, 500)
+    boxes = np.stack([row, row + size, col, col + size], -1)
+    sums, means = query(make_table(frame), boxes)
+    np.testing.assert_array_equal(
+        sums, [values[r : r + s, c : c + s].sum() for r, c, s in zip(row, col, size, strict=True)]
+    )
+    expected = [reference.box_mean(values, r, c, s) for r, c, s in zip(row, col, size, strict=True)]
+    np.testing.assert_allclose(means, expected, rtol=0, atol=MEAN_ROUNDING)
+
+
+def test_empty_and_outside_boxes_are_zero(device):
+    table = make_table(white(8, 9))
+    sums, _ = query(table, [[3, 3, 0, 9], [5, 2, 0, 9], [8, 20, 0, 9], [-5, 0, 0, 9], [0, 8, 9, 9], [0, 8, -3, 0]])
+    np.testing.assert_array_equal(sums, 0)
+
+
+@pytest.mark.parametrize(("height", "width"), [(2160, 3840), (4320, 7680)], ids=["4K", "8K"])
+@pytest.mark.parametrize("content", ["white", "top half"])
+def test_large_frames_are_exact(device, height, width, content):
+    """Sequential float32 sums are wrong by grey levels here, and plain 32-bit ones overflow at 8K."""
+    frame = white(height, width)
+    if content == "top half":
+        frame[height // 2 :] = 0
+    edge = height // 2
+    boxes = [
+        [height - 1, height, width - 1, width],  # one pixel in the far corner
+        [edge - 1, edge, width - 1, width],
+        [edge, edge + 1, 0, 1],
+        [edge - 100, edge + 100, width - 200, width],
+        [height - 4000, height + 50, width - 4000, width + 50],  # larger than a 4K frame is high
+    ]
+    table = make_table(frame)
+    sums, _ = query(table, boxes)
+    lit = height if content == "white" else edge
+    expected = [255 * (min(r1, lit) - min(max(r0, 0), lit)) * (min(c1, width) - max(c0, 0)) for r0, r1, c0, c1 in boxes]
+    np.testing.assert_array_equal(sums, np.array(expected, np.int64))
+    if content == "white":
+        # The documented limit: the sum over a whole white 8K frame does not fit, what comes is its remainder.
+        whole, _ = query(table, [[0, height, 0, width]])
+        assert int(whole[0]) == (255 * height * width) % 2**32
