@@ -1,8 +1,8 @@
 """Virtual lights: what arrives from one at a point, and whether something stands between.
 
-The scale of a light is the scene format's: a white Lambertian surface that faces a light of radiant intensity I at distance d has linear
-camera value I / (pi d^2), so the irradiance of a surface that faces it is I / d^2 (attenuation (0, 0, 1)). A directional light's intensity
-is that irradiance itself.
+The scale of a light is the scene format's: a white Lambertian surface that faces a light of radiant intensity I at
+distance d has linear camera value I / (pi d^2), so the irradiance of a surface that faces it is I / d^2 (attenuation
+(0, 0, 1)). A directional light's intensity is that irradiance itself.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace, offset_orig
 
 wp.set_module_options({"enable_backward": False})
 
-# 1 / d^2 has no limit at the light itself, real lights have: no point receives more than at this distance, or at the emitting sphere's
-# radius where that is larger. 0.1 mm keeps an intensity of 1e6 at 1e14, far inside float32.
+# 1 / d^2 has no limit at the light itself, real lights have: no point receives more than at this distance, or at the
+# emitting sphere's radius where that is larger. 0.1 mm keeps an intensity of 1e6 at 1e14, far inside float32.
 MIN_DISTANCE = wp.constant(wp.float32(1.0e-4))
 
 
@@ -34,7 +34,8 @@ class LightSample:
 def spot_falloff(light: Light, wi: wp.vec3) -> wp.float32:
     """1 inside the inner half angle, falling linearly in angle to 0 at the outer one; a step where both are equal.
 
-    The angle comes from atan2, exact at both ends where acos is not. The axis itself is always inside: a cone of 0 degrees is a line.
+    The angle comes from atan2, exact at both ends where acos is not. The axis itself is always inside: a cone of 0
+    degrees is a line.
     """
     axis = -light.direction
     angle = wp.atan2(wp.length(wp.cross(axis, wi)), wp.dot(axis, wi))
@@ -75,7 +76,8 @@ def sample_light(light: Light, point: wp.vec3) -> LightSample:
 def make_shadow(config: TraceConfig) -> wp.Function:
     """``is_lit(scene, point, geometric_normal, error, sample) -> bool`` for the kinds of shape in ``config``.
 
-    ``point``, ``geometric_normal`` and ``error`` are those of a ``Hit``. A light at distance 0 or below the offset is never hidden.
+    ``point``, ``geometric_normal`` and ``error`` are those of a ``Hit``. A light at distance 0 or below the offset is
+    never hidden.
     """
     occluded = make_trace(config).occluded
 

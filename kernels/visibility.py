@@ -1,19 +1,23 @@
 """What rays meet: shapes, the closest hit, any hit, and the primary rays of a frame.
 
-Spheres, boxes and planes are intersected analytically, meshes through Warp's BVH in local space. Functions that walk the scene come from
-``make_trace``, specialised to the kinds of shape that are there: a scene of spheres holds no mesh code. Ray parameters ``t`` are in
-multiples of the direction's length, which need not be 1; every test accepts 0 < t < t_max.
+Spheres, boxes and planes are intersected analytically, meshes through Warp's BVH in local space. Functions that walk
+the scene come from ``make_trace``, specialised to the kinds of shape that are there: a scene of spheres holds no mesh
+code. Ray parameters ``t`` are in multiples of the direction's length, which need not be 1; every test accepts 0 < t <
+t_max.
 
-No ray may slip through the shared edge of two triangles. Warp's own test of a triangle is watertight [WBW13], its test of a node's box is
-not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a margin around triangles, and so loses rays that run
-through edges which are box faces as well. ``warp_ar.ray_scene.make_ray_mesh`` therefore builds the BVH over boxes that are larger by
-2^-18 of the mesh's radius than their triangles. That margin covers the rounding 2 * 3 * 2^-24 * |box - origin| of a slab's two bounds, if
-the origin is near; ``intersect_mesh`` first moves it to the mesh's bounding sphere, after which |box - origin| is at most two radii.
+No ray may slip through the shared edge of two triangles. Warp's own test of a triangle is watertight [WBW13], its test
+of a node's box is not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a margin
+around triangles, and so loses rays that run through edges which are box faces as well.
+``warp_ar.ray_scene.make_ray_mesh`` therefore builds the BVH over boxes that are larger by 2^-18 of the mesh's radius
+than their triangles. That margin covers the rounding 2 * 3 * 2^-24 * |box - origin| of a slab's two bounds, if the
+origin is near; ``intersect_mesh`` first moves it to the mesh's bounding sphere, after which |box - origin| is at most
+two radii.
 
 References:
     [WBW13] Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT 2(1), 2013.
     [Ize13] Ize, "Robust BVH Ray Traversal", JCGT 2(2), 2013.
-    [HHO19] Haines, Guenther, Akenine-Moeller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems ch. 7, 2019.
+    [HHO19] Haines, Guenther, Akenine-Moeller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems
+    ch. 7, 2019.
     [WB19] Waechter, Binder, "A Fast and Robust Method for Avoiding Self-Intersection", Ray Tracing Gems ch. 6, 2019.
 """
 
@@ -74,7 +78,8 @@ def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
 def intersect_sphere(radius: wp.float32, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.float32:
     """Smallest t on a sphere around the origin, FAR if none.
 
-    The discriminant is r^2 - |closest point|^2, not b^2 - ac, and the roots are q / a and c / q: neither cancels [HHO19].
+    The discriminant is r^2 - |closest point|^2, not b^2 - ac, and the roots are q / a and c / q: neither cancels
+    [HHO19].
     """
     a = wp.dot(direction, direction)
     b = -wp.dot(origin, direction)
@@ -195,7 +200,7 @@ def box_uv(half: wp.vec3, normal: wp.vec3, point: wp.vec3) -> wp.vec2:
 
 @wp.func
 def sphere_uv(normal: wp.vec3) -> wp.vec2:
-    """Texture coordinates of a sphere: u runs from -x through -y, +x and +y as a latlong map's columns, v from -z to +z."""
+    """Texture coordinates of a sphere: u runs as a latlong map's columns, v from -z to +z."""
     phi = wp.atan2(normal[1], normal[0])
     theta = wp.atan2(wp.sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2])
     return wp.vec2(0.5 + phi / (2.0 * wp.pi), 1.0 - theta / wp.pi)
@@ -205,9 +210,10 @@ def sphere_uv(normal: wp.vec3) -> wp.vec2:
 def offset_origin(point: wp.vec3, geometric_normal: wp.vec3, direction: wp.vec3, error: wp.float32) -> wp.vec3:
     """Origin of a ray that leaves a surface: moved off it along the normal, to the side that ``direction`` goes to.
 
-    A ray along the normal by ``Hit.error`` cannot meet the surface it leaves, at any scale and distance from the world's origin. [WB19]
-    count units in the last place of the point alone, and so need a fixed distance near the origin, where those vanish but the error of a
-    point that was computed relative to its shape does not; ``Hit.error`` knows the shape.
+    A ray along the normal by ``Hit.error`` cannot meet the surface it leaves, at any scale and distance from the
+    world's origin. [WB19] count units in the last place of the point alone, and so need a fixed distance near the
+    origin, where those vanish but the error of a point that was computed relative to its shape does not; ``Hit.error``
+    knows the shape.
     """
     return point + wp.where(wp.dot(geometric_normal, direction) < 0.0, -error, error) * geometric_normal
 
@@ -322,15 +328,15 @@ def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
                             # Opposed corner normals can cancel; zero is no direction.
                             if wp.dot(normal, normal) < 0.5:
                                 normal = geometric
-                        hit.uv = (
-                            contact.u * vertex_uvs[corner] + contact.v * vertex_uvs[corner + 1] + w * vertex_uvs[corner + 2]
-                        )
+                        hit.uv = contact.u * vertex_uvs[corner] + contact.v * vertex_uvs[corner + 1]
+                        hit.uv += w * vertex_uvs[corner + 2]
                 arm = shape.rotation * (shape.scale * p)
                 hit.point = arm + shape.position
                 hit.normal = shape.rotation * normal
                 hit.geometric_normal = shape.rotation * geometric
-                # World coordinates are rounded once on the way out and twice on the way back into the shape; within the shape, rotating
-                # there and back, placing the point and testing the surface again take some 20 roundings of its size.
+                # World coordinates are rounded once on the way out and twice on the way back into the shape; within the
+                # shape, rotating there and back, placing the point and testing the surface again take some 20 roundings
+                # of its size.
                 size = shape.scale * wp.length(shape.extent)
                 hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
         return hit

@@ -1,0 +1,421 @@
+"""A scene as rays meet it: meshes, materials, textures and lights on a device, and what of the screen they can touch.
+
+Positions are metres in the world, angles of the device's records radians, colours linear RGB.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar import scene as scenes
+from warp_ar.errors import SceneError
+from warp_ar.geometry import Mesh, load_mesh, load_texture, rotation_matrix, silhouette_tolerance, torus_mesh
+from warp_ar.kernels import structs
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.tracking import Pose
+
+FloatArray = npt.NDArray[np.float64]
+
+Rect = tuple[int, int, int, int]
+"""Part of the screen: row_start, row_stop, column_start, column_stop; all zero where nothing of it is needed."""
+
+EMPTY: Final[Rect] = (0, 0, 0, 0)
+
+BOX_MARGIN: Final = 2.0**-18
+"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
+
+_SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
+_LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
+
+# Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
+_CONE_SIDES: Final = 8
+# From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
+_WIDE_CONE: Final = math.radians(75.0)
+# Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
+_FACES: Final = (
+    (0, 2, 6, 4),
+    (1, 3, 7, 5),
+    (0, 1, 5, 4),
+    (2, 3, 7, 6),
+    (0, 1, 3, 2),
+    (4, 5, 7, 6),
+)
+_CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def shape_kind(thing: scenes.Object | scenes.Proxy) -> int:
+    """Kind of ``structs.Shape`` that an object or proxy becomes; a torus becomes a fine mesh."""
+    return structs.MESH if thing.shape == "torus" else _SHAPES[thing.shape]
+
+
+def trace_config(scene: scenes.Scene) -> TraceConfig:
+    """Which kinds of shape the rays of ``scene`` can meet."""
+    return TraceConfig(
+        objects=tuple(sorted({shape_kind(thing) for thing in scene.objects})),
+        proxies=tuple(sorted({shape_kind(thing) for thing in scene.proxies})),
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RayMesh:
+    """A mesh that rays can meet, moved so that the centre of its bounding box is its origin."""
+
+    mesh: Any
+    """``wp.Mesh`` whose corners are not shared: corner k of face f is point 3 f + k."""
+    center: FloatArray
+    """Where its origin lies in the coordinates of the source, (3,)."""
+    half: FloatArray
+    """Half sizes of its bounding box, (3,)."""
+    normals: npt.NDArray[np.float32]
+    """Unit normal of each corner, (3 m, 3)."""
+    uvs: npt.NDArray[np.float32]
+    """Texture coordinates of each corner, (3 m, 2)."""
+
+
+def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
+    """Build the BVH of a mesh with a margin around every triangle, so that no ray slips through a shared edge.
+
+    The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
+    refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
+
+    Args:
+        mesh: The triangles.
+        device: Warp device.
+    """
+    low, high = (bound.astype(np.float64) for bound in mesh.bounds)
+    center = 0.5 * (low + high)
+    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
+    corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
+    half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
+    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
+    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
+    points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
+    indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
+    ray_mesh = wp.Mesh(points=points, indices=indices)
+    wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
+    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    return RayMesh(ray_mesh, center, half, mesh.normals[mesh.faces].reshape(-1, 3), uvs[mesh.faces].reshape(-1, 2))
+
+
+def linear_texture(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Linear RGB of an sRGB-encoded picture (IEC 61966-2-1), (h, w, 3)."""
+    code = np.arange(256) / 255.0
+    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return table[texture]
+
+
+class _Textures:
+    """Textures packed one after another; equal files are packed once."""
+
+    def __init__(self) -> None:
+        self.records: list[tuple[int, int, int]] = []
+        self.texels: list[npt.NDArray[np.float32]] = []
+        self._known: dict[tuple[Path | None, int], int] = {}
+        self._size = 0
+
+    def add(self, color: scenes.Color, mesh: Mesh | None) -> tuple[tuple[float, float, float], int]:
+        """Constant factor and texture index of a colour, multiplied by the mesh's own texture if there is one."""
+        path = color if isinstance(color, Path) else None
+        factor = (1.0, 1.0, 1.0) if isinstance(color, Path) else color
+        own = None if mesh is None else mesh.texture
+        if path is None and own is None:
+            return factor, -1
+        key = (path, id(own) if own is not None else 0)
+        if key not in self._known:
+            pictures = [linear_texture(p) for p in (None if path is None else load_texture(path), own) if p is not None]
+            height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
+            fitted = [cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in pictures]
+            self._known[key] = len(self.records)
+            self.records.append((self._size, width, height))
+            self.texels.append(functools.reduce(np.multiply, fitted).reshape(-1, 3))
+            self._size += width * height
+        return factor, self._known[key]
+
+
+class HostScene:
+    """The host's side of a scene: owns what the device's ``RayScene`` points to, and moves what is animated."""
+
+    def __init__(self, scene: scenes.Scene, device: Any) -> None:
+        """Load the scene's meshes and textures and put them on ``device``.
+
+        Raises:
+            SceneError: A mesh or texture cannot be read, or a texture is asked of a mesh without texture coordinates.
+        """
+        self.scene = scene
+        self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
+        self._corners = 0
+        textures = _Textures()
+        self._objects = self._shape_records(scene.objects, device)
+        self._proxies = self._shape_records(scene.proxies, device)
+        materials = np.zeros(len(scene.objects), _dtype(structs.Material))
+        for index, thing in enumerate(scene.objects):
+            self._fill_material(materials[index], thing, textures)
+        self._objects["material"] = np.arange(len(scene.objects))
+        # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
+        self._centers = [
+            record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
+            for record, key in zip(self._objects, map(_mesh_key, scene.objects), strict=True)
+        ]
+        self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
+        self._lit: list[FloatArray] | None = None
+        self.write_objects(np.zeros_like(self._objects), 0.0)
+        self.write_lights(np.zeros_like(self._lights), 0.0)
+
+        records = np.zeros(len(textures.records), _dtype(structs.Texture))
+        for record, (offset, width, height) in zip(records, textures.records, strict=True):
+            record["offset"], record["width"], record["height"] = offset, width, height
+        ray_scene = structs.RayScene()
+        ray_scene.objects = wp.array(self._objects, dtype=structs.Shape, device=device)
+        ray_scene.proxies = wp.array(self._proxies, dtype=structs.Shape, device=device)
+        ray_scene.materials = wp.array(materials, dtype=structs.Material, device=device)
+        ray_scene.textures = wp.array(records, dtype=structs.Texture, device=device)
+        meshes = [mesh for _, mesh, _ in self._meshes.values()]
+        ray_scene.texels = _vectors(textures.texels, 3, wp.vec3, device)
+        ray_scene.vertex_normals = _vectors([mesh.normals for mesh in meshes], 3, wp.vec3, device)
+        ray_scene.vertex_uvs = _vectors([mesh.uvs for mesh in meshes], 2, wp.vec2, device)
+        self.ray_scene = ray_scene
+
+    def _shape_records(self, things: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
+        """Records of ``structs.Shape`` with all that does not move."""
+        records = np.zeros(len(things), _dtype(structs.Shape))
+        for record, thing in zip(records, things, strict=True):
+            scale = getattr(thing, "scale", 1.0)
+            rotation = rotation_matrix(thing.rotate)
+            position = np.array(thing.at)
+            record["kind"], record["scale"], record["material"] = shape_kind(thing), scale, -1
+            key = _mesh_key(thing)
+            if key is not None:
+                _, mesh, record["first_vertex"] = self._load(key, device)
+                record["mesh"], record["extent"], record["smooth"] = mesh.mesh.id, mesh.half, 1
+                position = position + rotation @ (scale * mesh.center)
+            elif isinstance(thing, scenes.Object) and thing.shape == "sphere":
+                record["extent"] = thing.radius
+            else:
+                record["extent"][: len(thing.size)] = 0.5 * np.array(thing.size)
+            record["rotation"], record["position"] = rotation, position
+        return records
+
+    def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
+        """Mesh of a file or torus and where its corners start, made once."""
+        if key not in self._meshes:
+            mesh = load_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
+            ray_mesh = make_ray_mesh(mesh, device)
+            self._meshes[key] = (mesh, ray_mesh, self._corners)
+            self._corners += len(ray_mesh.normals)
+        return self._meshes[key]
+
+    def _fill_material(self, record: Any, thing: scenes.Object, textures: _Textures) -> None:
+        """Write the material of an object into a record of ``structs.Material``."""
+        key = _mesh_key(thing)
+        mesh = None if key is None else self._meshes[key][0]
+        material = thing.material
+        first = material.diffuse if isinstance(material, scenes.PhongMaterial) else material.base_color
+        colors = (first, material.specular) if isinstance(material, scenes.PhongMaterial) else (first,)
+        if mesh is not None and mesh.uvs is None:
+            for color in colors:
+                if isinstance(color, Path):
+                    raise SceneError(
+                        f"{thing.file}: the mesh has no texture coordinates for the texture {color}; "
+                        "unwrap it, or give the material a plain colour"
+                    )
+        record["base_color"], record["base_texture"] = textures.add(first, mesh)
+        record["specular_texture"] = -1
+        if isinstance(material, scenes.PhongMaterial):
+            record["model"], record["shininess"] = structs.PHONG, material.shininess
+            record["specular"], record["specular_texture"] = textures.add(material.specular, None)
+        elif isinstance(material, scenes.MetallicRoughnessMaterial):
+            record["model"] = structs.METALLIC_ROUGHNESS
+            record["metallic"], record["roughness"] = material.metallic, material.roughness
+        else:
+            record["model"] = structs.MIRROR if isinstance(material, scenes.MirrorMaterial) else structs.LAMBERT
+
+    def write_objects(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
+        """Write the virtual objects as they stand ``seconds`` after the first frame.
+
+        Args:
+            records_out: Records of ``structs.Shape``, one per object.
+            seconds: Time since the first frame.
+
+        Returns:
+            Whether anything is not where ``records_out`` had it.
+        """
+        for record, thing, center in zip(self._objects, self.scene.objects, self._centers, strict=True):
+            if thing.animate is not None or seconds == 0.0:
+                rotation, position = thing.pose_at(seconds)
+                record["rotation"], record["position"] = rotation, position + rotation @ center
+        return _update(records_out, self._objects)
+
+    def write_lights(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
+        """Write the virtual lights as they stand ``seconds`` after the first frame; arguments as ``write_objects``."""
+        for record, light in zip(self._lights, self.scene.lights, strict=True):
+            if light.animate is None and seconds != 0.0:
+                continue
+            self._lit = None
+            record["position"], record["direction"] = light.pose_at(seconds)
+            record["kind"] = _LIGHTS[light.kind]
+            record["intensity"] = light.intensity * np.array(light.color)
+            record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
+            record["attenuation"], record["radius"] = light.attenuation, light.radius
+        return _update(records_out, self._lights)
+
+    def object_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
+        """Where virtual objects can be on screen, one pixel of margin included.
+
+        Args:
+            pose: ``camera_from_world``.
+            camera: The camera of the frames.
+        """
+        return screen_rect([face for record in self._objects for face in _faces(record)], pose, camera)
+
+    def light_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
+        """Where virtual light or its shadows can fall on proxies on screen; arguments as ``object_rect``."""
+        if self._lit is None:
+            self._lit = [
+                lit for light in self._lights for record in self._proxies for lit in _lit_faces(light, _faces(record))
+            ]
+        return screen_rect(self._lit, pose, camera)
+
+
+def _dtype(struct: Any) -> Any:
+    return np.dtype(struct.numpy_dtype())
+
+
+def _mesh_key(thing: scenes.Object | scenes.Proxy) -> Any:
+    """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
+    if thing.shape == "mesh":
+        return thing.file
+    if isinstance(thing, scenes.Object) and thing.shape == "torus":
+        outer = thing.scale * (thing.major_radius + thing.minor_radius)
+        return thing.major_radius, thing.minor_radius, silhouette_tolerance(outer) / thing.scale
+    return None
+
+
+def _vectors(parts: Iterable[npt.NDArray[np.float32]], length: int, dtype: Any, device: Any) -> Any:
+    return wp.array(np.concatenate([np.zeros((0, length), np.float32), *parts]), dtype=dtype, device=device)
+
+
+def _update(records_out: npt.NDArray[Any], records: npt.NDArray[Any]) -> bool:
+    if records_out.tobytes() == records.tobytes():
+        return False
+    records_out[...] = records
+    return True
+
+
+def _faces(record: Any) -> list[FloatArray]:
+    """Faces of the box around a shape in the world, (4, 3) each."""
+    half = np.array(record["extent"], np.float64)
+    # Float32 records are rounded; a part in a million more keeps the box around what the device sees.
+    corners = _CORNERS * (half * (1.0 + 1e-6)) * float(record["scale"])
+    corners = corners @ np.array(record["rotation"], np.float64).T + np.array(record["position"], np.float64)
+    if record["kind"] == structs.PLANE:
+        return [corners[[0, 2, 6, 4]]]
+    return [corners[list(face)] for face in _FACES]
+
+
+def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
+    """The part of a convex polygon (n, 3) where normal . p >= offset (Sutherland, Hodgman); empty if there is none."""
+    height = polygon @ normal - offset
+    if (height >= 0.0).all():
+        return polygon
+    points: list[FloatArray] = []
+    for index in range(len(polygon)):
+        a, b = height[index - 1], height[index]
+        if (a < 0.0) != (b < 0.0):
+            points.append(polygon[index - 1] + (polygon[index] - polygon[index - 1]) * (a / (a - b)))
+        if b >= 0.0:
+            points.append(polygon[index])
+    return np.array(points).reshape(-1, 3)
+
+
+def _lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
+    """Parts of a box's faces that a light may reach.
+
+    A spot's cone is taken as the pyramid around it. For a mesh, whose surface lies inside its box, the parts of the
+    faces inside the pyramid and, if the light is in the box, the light itself span all that can be lit.
+    """
+    if light["kind"] != structs.SPOT or light["outer_angle"] >= _WIDE_CONE:
+        return faces
+    apex = np.array(light["position"], np.float64)
+    axis = np.array(light["direction"], np.float64)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    across = np.cross(axis, side)
+    # A plane that touches the cone along a line contains its apex; its normal leans by the half angle toward the axis.
+    outer = float(light["outer_angle"]) + 1e-6
+    parts = []
+    for face in faces:
+        part = face
+        for turn in np.arange(_CONE_SIDES) * (2.0 * math.pi / _CONE_SIDES):
+            outward = math.cos(turn) * side + math.sin(turn) * across
+            normal = math.sin(outer) * axis - math.cos(outer) * outward
+            part = _clip(part, normal, float(normal @ apex) - 1e-9)
+            if len(part) == 0:
+                break
+        if len(part):
+            parts.append(part)
+    if len(faces) > 1:
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        if all((apex - face.mean(axis=0)) @ (center - face.mean(axis=0)) >= 0.0 for face in faces):
+            parts.append(apex[None, :])
+    return parts
+
+
+@functools.lru_cache(maxsize=8)
+def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
+    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included."""
+    if not any(camera.distortion):
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        bounds = (x, x, y, y)
+    else:
+        from warp_ar.pipeline import pixel_rays  # here: the pipeline is built on this module
+
+        rays = pixel_rays(camera).astype(np.float64)
+        bounds = (rays[..., 0].min(0), rays[..., 0].max(0), rays[..., 1].min(1), rays[..., 1].max(1))
+    return (
+        bounds[0] - 1.0 / camera.fx,
+        bounds[1] + 1.0 / camera.fx,
+        bounds[2] - 1.0 / camera.fy,
+        bounds[3] + 1.0 / camera.fy,
+    )
+
+
+def screen_rect(polygons: Sequence[FloatArray], pose: Pose, camera: scenes.Camera) -> Rect:
+    """Smallest rectangle of pixels whose rays can meet the convex hull of some polygons, one pixel of margin included.
+
+    Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
+    are picked by their undistorted rays, not by distorting the polygons.
+
+    Args:
+        polygons: Convex polygons (n, 3) in the world.
+        pose: ``camera_from_world``.
+        camera: The camera of the frames.
+    """
+    if not polygons:
+        return EMPTY
+    points = pose.apply(np.concatenate(polygons))
+    near = 1e-6 * max(float(np.abs(points).max()), 1e-12)
+    if (points[:, 2] < near).any():
+        forward = np.array([0.0, 0.0, 1.0])
+        clipped = [_clip(pose.apply(polygon), forward, near) for polygon in polygons]
+        points = np.concatenate(clipped)
+        if len(points) == 0:
+            return EMPTY
+    projected = points[:, :2] / points[:, 2:]
+    low, high = projected.min(axis=0), projected.max(axis=0)
+    x_low, x_high, y_low, y_high = _ray_bounds(camera)
+    columns = np.flatnonzero((x_high >= low[0]) & (x_low <= high[0]))
+    rows = np.flatnonzero((y_high >= low[1]) & (y_low <= high[1]))
+    if len(columns) == 0 or len(rows) == 0:
+        return EMPTY
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
