@@ -62,21 +62,30 @@ def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int3
 
 
 @wp.func
-def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
-    """Bilinear sample, continuous across the seam and the poles (odd widths are off by half a texel across a pole)."""
+def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> wp.vec3:
+    """Linear sample along one row, at x in texel centres; a row beyond a pole is the one within, half a turn away."""
     height = radiance.shape[0]
     width = radiance.shape[1]
-    at = latlong_from_direction(direction, height, width)
+    r = row
+    at = x
+    if r < 0:
+        r = -1 - r
+        at += 0.5 * wp.float32(width)
+    elif r >= height:
+        r = 2 * height - 1 - r
+        at += 0.5 * wp.float32(width)
+    left = wp.floor(at)
+    first = wrap_texel(r, wp.int32(left), height, width)
+    second = wrap_texel(r, wp.int32(left) + 1, height, width)
+    a = radiance[first[0], first[1]]
+    return a + (at - left) * (radiance[second[0], second[1]] - a)
+
+
+@wp.func
+def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
+    """Bilinear sample, continuous across the seam and the poles for every size; a constant map gives its value to the bit."""
+    at = latlong_from_direction(direction, radiance.shape[0], radiance.shape[1])
     y = at[0] - 0.5
-    x = at[1] - 0.5
-    i = wp.int32(wp.floor(y))
-    j = wp.int32(wp.floor(x))
-    fy = y - wp.float32(i)
-    fx = x - wp.float32(j)
-    t00 = wrap_texel(i, j, height, width)
-    t01 = wrap_texel(i, j + 1, height, width)
-    t10 = wrap_texel(i + 1, j, height, width)
-    t11 = wrap_texel(i + 1, j + 1, height, width)
-    top = radiance[t00[0], t00[1]] * (1.0 - fx) + radiance[t01[0], t01[1]] * fx
-    bottom = radiance[t10[0], t10[1]] * (1.0 - fx) + radiance[t11[0], t11[1]] * fx
-    return top * (1.0 - fy) + bottom * fy
+    row = wp.floor(y)
+    top = sample_row(radiance, wp.int32(row), at[1] - 0.5)
+    return top + (y - row) * (sample_row(radiance, wp.int32(row) + 1, at[1] - 0.5) - top)
