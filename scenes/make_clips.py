@@ -10,8 +10,8 @@ no exposure is applied: a frame is clipped at 1, sRGB-encoded and rounded to 8 b
 The virtual things are never in a clip. ``--truth`` reads them from the scene file and renders the same frames with the
 objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's centre.
 
-Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame and denoises with OptiX; ``llvm_ad_rgb`` works on
-any CPU, without a denoiser (give it more samples), and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library).
+Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU in a minute or two
+per frame and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ import av
 import cv2
 import mitsuba as mi
 import numpy as np
+import pyoidn
 from make_teapot import write_ply
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -42,6 +43,9 @@ BALL, BALL_RADIUS, BALL_REFLECTANCE = (-0.12, 0.03, 0.0346), 0.035, (0.85, 0.85,
 PROXY = {"at": (0.0, 0.21, 0.0446), "size": (0.2, 0.075, 0.09), "turn": 9.0}
 """The tea tin behind the marker, which the scene files model as a box."""
 ROOM = {"x": (-1.7, 2.3), "y": (-2.6, 0.85), "z": (-0.74, 1.75)}
+
+PATH = {"type": "path", "max_depth": 8, "rr_depth": 4}
+"""Path tracing up to seven bounces: what more would add is below a grey level in a room this bright."""
 
 Dict = dict[str, Any]
 
@@ -305,7 +309,7 @@ def room(clip: str) -> Dict:
             x += w + 0.005
 
     def lamp(radiance: Any) -> Dict:
-        return {"bsdf": matte(0.0), "emitter": {"type": "area", "radiance": rgb(radiance)}}
+        return {"bsdf": matte(0.7), "emitter": {"type": "area", "radiance": rgb(radiance)}}
 
     if clip == "desk":
         shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 12.0 * view(3))
@@ -316,10 +320,10 @@ def room(clip: str) -> Dict:
         }
     elif clip == "wire":
         shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 0.35 * view(3) * (0.55, 0.75, 1.2))
-        shapes["table_lamp"] = ball(LAMP, 0.06, matte(0.0)) | lamp(290.0 * np.array([1.0, 0.86, 0.66]))
+        shapes["table_lamp"] = ball(LAMP, 0.06, {}) | lamp(290.0 * np.array([1.0, 0.86, 0.66]))
     else:
         shapes |= window("window", (-0.55, y1 - 0.01, 0.72), (0.45, 0, 0), (0, 0, 0.66), 7.0 * view(3))
-        shapes["globe"] = ball((0.2, 0.24, 0.135), 0.055, matte(0.0)) | lamp(7.0 * np.array([1.0, 0.8, 0.52]))
+        shapes["globe"] = ball((0.2, 0.24, 0.135), 0.055, {}) | lamp(7.0 * np.array([1.0, 0.8, 0.52]))
         brass = glossy((0.75, 0.55, 0.25), 0.3, 1.0)
         shapes["globe_foot"] = {"type": "cylinder", "p0": [0.2, 0.24, TABLE], "p1": [0.2, 0.24, 0.014], "radius": 0.04, "bsdf": {"type": "twosided", "bsdf": brass}}
         shapes["globe_top"] = {"type": "disk", "to_world": turned((0.2, 0.24, 0.014), 0, 0.04), "bsdf": brass}
@@ -567,17 +571,13 @@ class Renderer:
             for k, light in enumerate((virtual or {}).get("light", [])):
                 content[f"light{k}"] = virtual_light(light)
             self.scene = mi.load_dict({"type": "scene", **content})
-        self.path = {"type": "path", "max_depth": 9, "rr_depth": 6}
+        guides = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "image": PATH}
+        self.integrator = mi.load_dict(guides)
         self.lamps = mi.traverse(self.scene)
         self.base = {}
         for lamp in CLIPS[clip].levels(0.0):
             key = next(k for k in (f"{lamp}.emitter.radiance.data", f"{lamp}.emitter.radiance.value") if k in self.lamps)
             self.base[lamp] = (key, type(self.lamps[key])(self.lamps[key]))
-        self.denoiser = None
-        if mi.variant().startswith("cuda"):
-            self.denoiser = mi.OptixDenoiser([WIDTH, HEIGHT], albedo=True, normals=True)
-            self.path = {"type": "aov", "aovs": "albedo:albedo,nn:sh_normal", "image": self.path}
-        self.integrator = mi.load_dict(self.path)
 
     def light(self, t: float) -> None:
         """Set every lamp to its level at time ``t``."""
@@ -602,18 +602,15 @@ class Renderer:
             }
         )
         image = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=self.spp, seed=seed)
-        if self.denoiser is None:
-            return np.array(image)[..., :3]
-        to_sensor = sensor.world_transform().inverse() if hasattr(sensor, "world_transform") else None
-        clean = self.denoiser(image[..., :3], albedo=image[..., 3:6], normals=image[..., 6:9], to_sensor=to_sensor)
-        return np.array(clean)
+        color, albedo, normal = (np.ascontiguousarray(part) for part in np.split(np.array(image), 3, -1))
+        return pyoidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True)
 
     def environment(self, t: float, height: int = 256, rounds: int = 64) -> np.ndarray:
         """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``: the scene must be without the ball."""
         import drjit as dr
 
         self.light(t)
-        integrator = mi.load_dict({"type": "path", "max_depth": 9, "rr_depth": 6})
+        integrator = mi.load_dict(PATH)
         count = height * height * 2
         total = np.zeros((count, 3))
         sampler = mi.load_dict({"type": "independent"})
