@@ -482,7 +482,7 @@ def _nearest(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word.lower(), [name.lower() for name in known], n=1, cutoff=0.6)
     if close:
         return f'did you mean "{next(name for name in known if name.lower() == close[0])}"?'
-    return f"known: {', '.join(known)}"
+    return f"known: {', '.join(known[:20])}{', ...' if len(known) > 20 else ''}"
 
 
 class _Table:
@@ -552,10 +552,11 @@ class _Table:
 
     def choice(self, key: str, options: Iterable[str], default: str | None = None) -> str:
         options = list(options)
-        right = "one of " + ", ".join(f'"{option}"' for option in options)
+        few = len(options) < 8
+        right = "one of " + ", ".join(f'"{option}"' for option in options) if few else f'a name such as "{options[0]}"'
         value = self.text(key, default, right=right)
         if value not in options:
-            self.fail(key, f"expected {right}" if len(options) < 8 else f"unknown; {_nearest(value, options)}")
+            self.fail(key, f"expected {right}" if few else f"unknown; {_nearest(value, options)}")
         return value
 
     def vector(

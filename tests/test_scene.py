@@ -1,0 +1,725 @@
+"""Scene files: what loads, what does not and why, and that what is written loads again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import pathlib
+import tomllib
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from warp_ar import scene as sc
+from warp_ar.errors import SceneError, WarpArError
+from warp_ar.geometry import rotation_matrix
+from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene, loads_scene
+
+CAMERA = """
+schema = 1
+[camera]
+width = 640
+height = 480
+fx = 600.0
+fy = 601.0
+cx = 319.5
+cy = 239.5
+"""
+MARKER = "[marker]\nsize = 0.08\n"
+BASE = CAMERA + MARKER
+SPHERE = '[[object]]\nshape = "sphere"\nradius = 0.03\n'
+SPOT = (
+    '[[light]]\nkind = "spot"\nat = [0, 0, 1]\ntarget = [0, 0, 0]\nintensity = 1\nouter_angle = 30\ninner_angle = 20\n'
+)
+
+# Products and sums of a few float64 numbers of order one.
+ROUNDING = 1e-14
+
+
+@pytest.fixture
+def folder(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A folder with one file of each sort that scenes name; their contents are read later, not with the scene."""
+    for name in ("model.ply", "wood.png", "response.json", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "frames").mkdir()
+    return tmp_path
+
+
+# --- What loads -------------------------------------------------------------------------------------------------------
+
+
+def test_truth_scenes_load_and_survive_writing(shared: pathlib.Path) -> None:
+    files = sorted((shared / "truth").glob("*/scene_*.toml"))
+    assert files
+    for file in files:
+        scene = load_scene(file)
+        raw = tomllib.loads(file.read_text())
+        assert (scene.name, scene.path) == (raw["name"], file)
+        assert scene.source is not None
+        assert scene.source.path == (file.parent / "camera").resolve()
+        assert len(scene.proxies) == len(raw["proxy"])
+        assert [light.intensity for light in scene.lights] == [light["intensity"] for light in raw.get("light", [])]
+        assert scene.exposure.scale == raw.get("exposure", {}).get("scale", 1.0)
+        assert loads_scene(dumps_scene(scene)) == scene
+
+
+def test_least_scene_has_the_documented_defaults() -> None:
+    scene = loads_scene(CAMERA)
+    assert scene == Scene(camera=Camera(640, 480, 600.0, 601.0, 319.5, 239.5))
+    assert scene.camera.transfer == "srgb"
+    assert scene.exposure.scale == 1.0
+    assert scene.marker.white == 0.85
+    assert scene.source is None
+    assert scene.path is None
+
+
+def test_every_key_arrives(folder: pathlib.Path) -> None:
+    scene = loads_scene(
+        """
+        schema = 1
+        name = "all"
+        [camera]
+        width = 320
+        height = 240
+        fx = 300
+        fy = 301
+        cx = 160
+        cy = 120
+        distortion = [1, 2, 3, 4, 5, 6, 7, 8]
+        transfer = "response.json"
+        [source]
+        path = "frames"
+        fps = 25
+        [marker]
+        dictionary = "DICT_APRILTAG_36h11"
+        id = 586
+        size = 0.1
+        white = 0.7
+        [[probe]]
+        center = [1, 2, 3]
+        radius = 0.04
+        reflectance = 0.5
+        [[probe]]
+        center = [4, 5, 6]
+        radius = 0.05
+        reflectance = [0.1, 0.2, 0.3]
+        [[proxy]]
+        shape = "mesh"
+        file = "model.ply"
+        [[object]]
+        shape = "torus"
+        major_radius = 0.2
+        minor_radius = 0.1
+        animate = { turn = [0, 0, 90], pivot = [1, 0, 0], sway = [0, 0, 0.1], period = 2 }
+        [object.material]
+        model = "phong"
+        diffuse = "wood.png"
+        specular = [0.1, 0.2, 0.3]
+        shininess = 8
+        [[light]]
+        kind = "point"
+        at = [0, 0, 1]
+        color = [1, 2, 3]
+        intensity = 4
+        attenuation = [1, 0.5, 0.25]
+        radius = 0.02
+        [[light]]
+        kind = "directional"
+        direction = [0, 0, -2]
+        intensity = 3
+        [exposure]
+        scale = "auto"
+        """,
+        folder / "all.toml",
+    )
+    root = folder.resolve()
+    assert scene == Scene(
+        name="all",
+        camera=Camera(320, 240, 300, 301, 160, 120, (1, 2, 3, 4, 5, 6, 7, 8), root / "response.json"),
+        source=sc.SourceSpec(path=root / "frames", fps=25.0),
+        marker=sc.Marker("DICT_APRILTAG_36h11", 586, 0.1, 0.7),
+        probes=(sc.Probe((1, 2, 3), 0.04, (0.5, 0.5, 0.5)), sc.Probe((4, 5, 6), 0.05, (0.1, 0.2, 0.3))),
+        proxies=(sc.Proxy("mesh", file=root / "model.ply"),),
+        objects=(
+            sc.Object(
+                "torus",
+                major_radius=0.2,
+                minor_radius=0.1,
+                material=sc.PhongMaterial(root / "wood.png", (0.1, 0.2, 0.3), 8.0),
+                animate=sc.Animation((0, 0, 90), (1, 0, 0), (0, 0, 0.1), 2.0),
+            ),
+        ),
+        lights=(
+            sc.Light("point", 4.0, (1, 2, 3), (0, 0, 1), attenuation=(1, 0.5, 0.25), radius=0.02),
+            sc.Light("directional", 3.0, direction=(0, 0, -2)),
+        ),
+        exposure=sc.Exposure("auto"),
+    )
+
+
+def test_single_probe_may_be_a_plain_table() -> None:
+    assert loads_scene(BASE + "[probe]\ncenter = [0, 0, 1]\nradius = 0.03").probes == (sc.Probe((0, 0, 1), 0.03),)
+
+
+@pytest.mark.parametrize(
+    ("text", "board", "markers", "size"),
+    [
+        ("charuco 5x7 0.04 0.03", sc.CharucoBoard(5, 7, 0.04, 0.03), 17, (0.2, 0.28)),
+        ("grid 4x3 0.04 0.01", sc.GridBoard(4, 3, 0.04, 0.01), 12, (0.19, 0.14)),
+    ],
+)
+def test_boards(text: str, board: sc.Board, markers: int, size: tuple[float, float]) -> None:
+    marker = loads_scene(CAMERA + f'[marker]\nboard = "{text}"').marker
+    assert marker.board == board
+    assert str(board) == text
+    assert board.marker_count == markers
+    assert board.size == pytest.approx(size)
+
+
+def test_charuco_marker_count_is_opencvs() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    for columns, rows in [(5, 7), (4, 4), (3, 2), (3, 3)]:
+        board = cv2.aruco.CharucoBoard((columns, rows), 0.04, 0.03, dictionary)
+        assert sc.CharucoBoard(columns, rows, 0.04, 0.03).marker_count == len(board.getIds())
+
+
+def test_bundled_scenes_are_found_by_name(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "__init__.py").write_text("")
+    (tmp_path / "desk.toml").write_text(CAMERA)
+    monkeypatch.setattr("importlib.resources.files", lambda package: tmp_path)
+    assert bundled_scenes() == {"desk": tmp_path / "desk.toml"}
+    scene = load_scene("desk")
+    assert (scene.name, scene.path) == ("desk", tmp_path / "desk.toml")
+    with pytest.raises(SceneError, match=r'desc: no such scene; .*did you mean "desk"'):
+        load_scene("desc")
+
+
+def test_bundled_scenes_lie_in_the_package() -> None:
+    for name, path in bundled_scenes().items():
+        assert path.is_file()
+        assert path.stem == name
+
+
+# --- The camera -------------------------------------------------------------------------------------------------------
+
+
+def test_camera_matrix() -> None:
+    expected = [[600.0, 0.0, 319.5], [0.0, 601.0, 239.5], [0.0, 0.0, 1.0]]
+    np.testing.assert_array_equal(loads_scene(CAMERA).camera.matrix(), expected)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (320, 240), (1280, 960), (4, 3), (960, 720)])
+def test_scaled_camera_sees_the_same_directions(size: tuple[int, int]) -> None:
+    camera = Camera(640, 480, 600.0, 601.0, 317.0, 243.0)
+    scaled = camera.scaled_to(*size)
+    # The outer corner of the picture is half a pixel before the first pixel's centre, at every size.
+    for x, y in ((0, 0), (1, 1), (0.3, 0.8)):
+        a, b = (
+            ((x * one.width - 0.5 - one.cx) / one.fx, (y * one.height - 0.5 - one.cy) / one.fy)
+            for one in (camera, scaled)
+        )
+        assert b == pytest.approx(a, abs=ROUNDING)
+    assert (scaled.width, scaled.height) == size
+
+
+@pytest.mark.parametrize("size", [(640, 481), (1920, 1080), (0, 0), (480, 640)])
+def test_another_aspect_cannot_be_scaled(size: tuple[int, int]) -> None:
+    with pytest.raises(SceneError, match=f"calibrated for 640x480, frames are {size[0]}x{size[1]}.*aspect"):
+        loads_scene(CAMERA).camera.scaled_to(*size)
+
+
+def test_calibration_of_the_real_clip(shared: pathlib.Path) -> None:
+    camera = Camera.load_calibration(shared / "real/aruco_clip/intrinsics.yml")
+    distortion = (0.0995485, -0.206384, 0.00754589, 0.00336531, 0.0)
+    assert camera == Camera(640, 480, 628.158, 628.156, 324.099, 260.908, distortion)
+
+
+@pytest.mark.parametrize("suffix", [".yml", ".json", ".xml"])
+def test_calibration_written_by_opencv(folder: pathlib.Path, suffix: str) -> None:
+    camera = Camera(800, 600, 700.0, 701.0, 400.5, 299.25, (0.1, -0.2, 0.001, 0.002, 0.3, 0.01, 0.02, 0.03), "linear")
+    path = folder / f"camera{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 800)
+    storage.write("image_height", 600)
+    storage.write("camera_matrix", camera.matrix())
+    storage.write("distortion_coefficients", np.array([*camera.distortion, 0, 0, 0, 0, 0, 0]).reshape(-1, 1))
+    storage.release()
+    scene = loads_scene(
+        f'schema = 1\n[camera]\ncalibration = "camera{suffix}"\ntransfer = "linear"', folder / "scene.toml"
+    )
+    assert scene.camera == camera
+    assert loads_scene(dumps_scene(scene)) == scene
+
+
+def test_calibration_as_ros_and_scripts_write_it(folder: pathlib.Path) -> None:
+    ros = folder / "ros.yaml"
+    ros.write_text(
+        "image_width: 640\nimage_height: 480\ncamera_name: front\n"
+        "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [600, 0, 320, 0, 601.5, 240, 0, 0, 1]\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, 0, 0, 0, 0]\n"
+    )
+    assert Camera.load_calibration(ros) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.1, 0.0, 0.0, 0.0, 0.0))
+    script = folder / "script.json"
+    script.write_text(
+        json.dumps(
+            {"mtx": [[600, 0, 320], [0, 601.5, 240], [0, 0, 1]], "dist": [[0, 0, 0, 0]], "image_size": [640, 480]}
+        )
+    )
+    assert Camera.load_calibration(script) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.0,) * 4)
+
+
+GOOD_CALIBRATION: dict[str, Any] = {
+    "image_width": 640,
+    "image_height": 480,
+    "camera_matrix": [600, 0, 320, 0, 600, 240, 0, 0, 1],
+    "distortion_coefficients": [0, 0, 0, 0, 0],
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image_width": None}, "image_width"),
+        ({"image_width": 0}, "image_width"),
+        ({"camera_matrix": None}, "camera_matrix is missing: expected a 3x3 matrix"),
+        ({"camera_matrix": [1, 2, 3]}, "3x3"),
+        ({"camera_matrix": [-600, 0, 320, 0, 600, 240, 0, 0, 1]}, "above 0"),
+        ({"camera_matrix": [600, 3, 320, 0, 600, 240, 0, 0, 1]}, "without skew"),
+        ({"camera_matrix": [600, 0, 320, 0, 600, 240, 0, 0, 2]}, "without skew"),
+        ({"distortion_coefficients": [0, 0, 0]}, "4, 5 or 8"),
+        ({"distortion_coefficients": [0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]}, "4, 5 or 8"),
+    ],
+)
+def test_calibration_errors(folder: pathlib.Path, change: dict[str, Any], message: str) -> None:
+    path = folder / "camera.json"
+    data = {key: value for key, value in (GOOD_CALIBRATION | change).items() if value is not None}
+    path.write_text(json.dumps(data))
+    with pytest.raises(SceneError, match=message) as caught:
+        Camera.load_calibration(path)
+    assert_helpful(caught.value, path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "hello world", "{", "<a>", "%YAML:1.0\ncamera_matrix: !!opencv-matrix\n  rows: x"]
+)
+@pytest.mark.parametrize("suffix", [".yml", ".json", ".xml", ".txt"])
+def test_calibration_that_is_none(folder: pathlib.Path, text: str, suffix: str) -> None:
+    path = folder / f"camera{suffix}"
+    path.write_text(text)
+    with pytest.raises(SceneError) as caught:
+        Camera.load_calibration(path)
+    assert_helpful(caught.value, path)
+
+
+# --- Motion -----------------------------------------------------------------------------------------------------------
+
+
+def test_objects_stand_still_without_animation() -> None:
+    thing = sc.Object("sphere", radius=1.0, at=(1, 2, 3), rotate=(10, 20, 30))
+    for seconds in (0.0, 7.5):
+        rotation, position = thing.pose_at(seconds)
+        np.testing.assert_array_equal(rotation, rotation_matrix((10, 20, 30)))
+        np.testing.assert_array_equal(position, (1, 2, 3))
+
+
+def test_object_turns_in_place_and_about_a_pivot() -> None:
+    spin = sc.Animation(turn=(0, 0, 90))
+    rotation, position = sc.Object("box", at=(1, 0, 5), rotate=(90, 0, 0), animate=spin).pose_at(1.0)
+    np.testing.assert_allclose(rotation, rotation_matrix((0, 0, 90)) @ rotation_matrix((90, 0, 0)), atol=ROUNDING)
+    np.testing.assert_allclose(position, (1, 0, 5), atol=ROUNDING)
+    orbit = dataclasses.replace(spin, pivot=(0.0, 0.0, 0.0))
+    np.testing.assert_allclose(sc.Object("box", at=(1, 0, 5), animate=orbit).pose_at(1.0)[1], (0, 1, 5), atol=ROUNDING)
+
+
+def test_sway_is_a_sine() -> None:
+    sway = sc.Animation(sway=(0, 0, 0.2), period=3.0)
+    for seconds in (0.0, 0.75, 1.5, 2.25, 3.0, 3000.75):
+        height = sc.Object("box", at=(1, 2, 3), animate=sway).pose_at(seconds)[1][2]
+        assert height == pytest.approx(3.0 + 0.2 * math.sin(2 * math.pi * (seconds % 3.0) / 3.0), abs=1e-12)
+
+
+def test_lights_point_at_their_target_or_turn_their_direction() -> None:
+    orbit = sc.Animation(turn=(0, 0, 90), pivot=(0, 0, 0))
+    position, direction = sc.Light("spot", 1.0, at=(1, 0, 1), target=(0, 0, 0), animate=orbit).pose_at(1.0)
+    np.testing.assert_allclose(position, (0, 1, 1), atol=ROUNDING)
+    np.testing.assert_allclose(direction, np.array([0, -1, -1]) / math.sqrt(2), atol=ROUNDING)
+    position, direction = sc.Light("spot", 1.0, at=(1, 0, 1), direction=(3, 0, 0), animate=orbit).pose_at(1.0)
+    np.testing.assert_allclose(direction, (0, 1, 0), atol=ROUNDING)
+
+
+@pytest.mark.parametrize("length", [1e-17, 1.0, 1e17])
+def test_directions_come_out_unit_at_any_length(length: float) -> None:
+    _, direction = sc.Light("directional", 1.0, direction=(0, -length, -length)).pose_at(0.0)
+    np.testing.assert_allclose(direction, np.array([0, -1, -1]) / math.sqrt(2), atol=ROUNDING)
+
+
+def test_light_on_its_target_still_has_a_direction() -> None:
+    _, direction = sc.Light("spot", 1.0, at=(1, 2, 3), target=(1, 2, 3)).pose_at(0.0)
+    np.testing.assert_array_equal(direction, (0, 0, -1))
+
+
+# --- Errors -----------------------------------------------------------------------------------------------------------
+
+
+def assert_helpful(error: BaseException, path: pathlib.Path) -> None:
+    """One line that begins with the file."""
+    assert isinstance(error, WarpArError)
+    assert isinstance(error, ValueError)
+    message = str(error)
+    assert message.startswith(f"{path}: ")
+    assert len(message.splitlines()) == 1
+    assert len(message) < 600
+
+
+def light(**changes: str) -> str:
+    """A spot light with some of its lines changed; None takes one away."""
+    lines = {line.split(" = ")[0]: line for line in SPOT.splitlines()}
+    lines |= {key: f"{key} = {value}" for key, value in changes.items() if value}
+    return BASE + "\n".join(line for key, line in lines.items() if changes.get(key) != "")
+
+
+ERRORS = [
+    # Not TOML, or not a scene.
+    ("schema = ", r"not valid TOML"),
+    ("[[" * 5000, r"not valid TOML"),
+    ("schema = " + "1" * 5000, r"not valid TOML"),
+    ("", r"schema is missing: expected schema = 1"),
+    (CAMERA.replace("schema = 1", "schema = 2"), r"schema = 2: this program reads schema 1"),
+    (CAMERA.replace("schema = 1", "schema = true"), r"schema = true: this program reads schema 1"),
+    ("schema = 1", r"\[camera\] is missing"),
+    ("schema = 1\ncamera = 3", r"camera = 3: expected a table with width"),
+    ("schema = 1\nname = 3\n", r"name = 3|camera"),
+    # Unknown keys and sections.
+    (BASE + "[lite]\nx = 1", r'lite: unknown key; did you mean "light"\?'),
+    (BASE + "[[objects]]\nx = 1", r'objects: unknown key; did you mean "object"\?'),
+    (BASE + "[zzz]\nx = 1", r"zzz: unknown key; known: schema, name, camera"),
+    (CAMERA + "widht = 3", r'camera\.widht: unknown key; did you mean "width"\?'),
+    (BASE + SPHERE.replace("radius", "radious"), r'object\[0\]\.radious: unknown key; did you mean "radius"\?'),
+    (BASE + SPHERE + '"a\\nb" = 1', r'object\[0\]\."a\\nb": unknown key'),
+    (BASE + SPHERE + 'material = { model = "lambert", basecolor = [1, 1, 1] }', r'did you mean "base_color"\?'),
+    (BASE + SPHERE + "animate = { trun = [0, 0, 1] }", r'object\[0\]\.animate\.trun: .*did you mean "turn"\?'),
+    (BASE + "[light]\nkind = 'point'", r"light: there may be several: write \[\[light\]\]"),
+    # The camera.
+    ("schema = 1\n[camera]\ntransfer = 'srgb'", r"camera\.width is missing: give width, height, .*or calibration"),
+    (CAMERA.replace("width = 640", "width = 640.5"), r"camera\.width = 640\.5: expected a whole number from 1"),
+    (CAMERA.replace("width = 640", "width = true"), r"camera\.width = true: expected a whole number"),
+    (CAMERA.replace("fx = 600.0", "fx = 0"), r"camera\.fx = 0: expected a number above 0 \(pixels\)"),
+    (CAMERA.replace("fx = 600.0", ""), r"camera\.fx is missing: expected a number above 0 \(pixels\)"),
+    (CAMERA.replace("fx = 600.0", "fx = nan"), r"camera\.fx = NaN"),
+    (CAMERA.replace("cx = 319.5", "cx = inf"), r"camera\.cx = Infinity: expected a number, finite"),
+    (CAMERA.replace("cx = 319.5", "cx = '3'"), r'camera\.cx = "3": expected a number'),
+    (
+        CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 400),
+        r"camera\.cx = .*\.\.\. \(482 characters\): expected a number",
+    ),
+    (CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 8000), r"camera\.cx = a number of thousands of digits: "),
+    (CAMERA + "distortion = [0, 0, 0]", r"camera\.distortion = \[0, 0, 0\]: expected a list of 4 or 5 or 8 numbers"),
+    (CAMERA + "distortion = [0, 0, 0, nan]", r"camera\.distortion = \[0, 0, 0, NaN\]"),
+    (CAMERA + "transfer = 'sRGBB'", r'camera\.transfer = "sRGBB": expected "srgb", "linear".*no such file: .*sRGBB'),
+    (CAMERA + "transfer = 'gamma:x'", r'camera\.transfer = "gamma:x": expected a gamma from 0\.1 to 10'),
+    (CAMERA + "transfer = 'gamma:0'", r"expected a gamma from 0\.1 to 10"),
+    (CAMERA + "calibration = 'notes.txt'", r"camera\.width = 640: not used beside calibration"),
+    ("schema = 1\n[camera]\ncalibration = 'none.yml'", r"camera\.calibration = .*no such file: .*none\.yml"),
+    # The source.
+    (BASE + "[source]\nfps = 3", r"source\.path is missing: expected exactly one of path, camera and synthetic"),
+    (BASE + "[source]\npath = 'frames'\ncamera = 0", r"source\.camera = 0: path is given too"),
+    (BASE + "[source]\npath = 'fames'", r'source\.path = "fames": no such file or folder: .*/fames'),
+    (BASE + "[source]\npath = '" + "x" * 5000 + "'", r"source\.path = .*cannot be one"),
+    (BASE + '[source]\npath = "a\\u0000b"', r"source\.path = .*cannot be one"),
+    (BASE + "[source]\ncamera = -1", r"source\.camera = -1: expected a whole number from 0"),
+    (BASE + "[source]\ncamera = 0\nfps = 0", r"source\.fps = 0: expected a number from 0\.001 to"),
+    (BASE + "[source]\nsynthetic = ''", r'source\.synthetic = "": expected the name'),
+    # The marker.
+    (CAMERA + SPHERE, r"\[marker\] is missing: \[object\] has its place in the marker's frame"),
+    (CAMERA + "[marker]\nid = 0", r"marker\.size is missing: expected a number above 0 \(metres\)"),
+    (BASE + "dictionary = 'DICT_4X4_5O'", r'marker\.dictionary = "DICT_4X4_5O": unknown; did you mean "DICT_4X4_50"\?'),
+    (BASE + "id = 50", r"marker\.id = 50: expected a whole number from 0 to 49"),
+    (BASE + "dictionary = 'DICT_APRILTAG_16h5'\nid = 30", r"marker\.id = 30: expected a whole number from 0 to 29"),
+    (BASE + "white = 1.5", r"marker\.white = 1\.5: expected a number from 0\.01 to 1"),
+    (BASE + "board = 'grid 4x3 0.04 0.01'", r"marker\.size = 0\.08: not used beside board"),
+    (CAMERA + "[marker]\nboard = 'chess 4x3 1 1'", r'marker\.board = "chess 4x3 1 1": expected "charuco COLUMNSxROWS'),
+    (CAMERA + "[marker]\nboard = 'grid 4 3 1 1'", r"marker\.board = .*expected"),
+    (CAMERA + "[marker]\nboard = 'grid 4x3 a b'", r"lengths must be above 0 and finite"),
+    (CAMERA + "[marker]\nboard = 'grid 0x3 1 1'", r"at least 1x1"),
+    (CAMERA + "[marker]\nboard = 'charuco 1x3 1 0.5'", r"at least 2x2"),
+    (CAMERA + "[marker]\nboard = 'charuco 5x7 0.03 0.04'", r"a marker must be smaller than its square"),
+    (CAMERA + "[marker]\nboard = 'grid 8x8 0.03 0.04'", r"needs 64 markers; DICT_4X4_50 has 50"),
+    # The probe.
+    (BASE + "[probe]\nradius = 1", r"probe\.center is missing: expected a list of 3 numbers"),
+    (BASE + "[probe]\ncenter = [0, 0]\nradius = 1", r"probe\.center = \[0, 0\]: expected a list of 3 numbers"),
+    (
+        BASE + "[[probe]]\ncenter = [0, 0, 0]\nradius = 0",
+        r"probe\[0\]\.radius = 0: expected a number above 0 \(metres\)",
+    ),
+    (BASE + "[probe]\ncenter = [0, 0, 0]\nradius = 1\nreflectance = 0", r"probe\.reflectance = 0: .*from 0\.01 to 1"),
+    (BASE + "[probe]\ncenter = [0, 0, 0]\nradius = 1\nreflectance = [1, 1, 2]", r"probe\.reflectance = \[1, 1, 2\]"),
+    # Proxies.
+    (BASE + "[[proxy]]\nat = [0, 0, 0]", r'proxy\[0\]\.shape is missing: expected one of "plane", "box", "mesh"'),
+    (BASE + "[[proxy]]\nshape = 'sphere'", r'proxy\[0\]\.shape = "sphere": expected one of "plane", "box", "mesh"'),
+    (BASE + "[[proxy]]\nshape = 'plane'\nsize = [1, 2, 3]", r"proxy\[0\]\.size = .*: expected a list of 2 numbers"),
+    (BASE + "[[proxy]]\nshape = 'box'\nsize = [1, 2, 0]", r"proxy\[0\]\.size = .*: .*each above 0 \(metres\)"),
+    (BASE + "[[proxy]]\nshape = 'mesh'\nfile = 'x.ply'", r'proxy\[0\]\.file = "x\.ply": no such file: .*/x\.ply'),
+    (BASE + "[[proxy]]\nshape = 'mesh'\nfile = 'notes.txt'", r"unknown mesh format; use one of \.ply, \.obj"),
+    (BASE + "[[proxy]]\nshape = 'box'\nfile = 'model.ply'", r'not used with shape = "box"; its own keys are size'),
+    # Objects.
+    (BASE + SPHERE.replace("0.03", "-1"), r"object\[0\]\.radius = -1: expected a number above 0 \(metres\)"),
+    (BASE + SPHERE + "size = [1, 1, 1]", r'object\[0\]\.size = .*not used with shape = "sphere"'),
+    (BASE + SPHERE + SPHERE + "scale = 0", r"object\[1\]\.scale = 0: expected a number above 0"),
+    (BASE + SPHERE + "rotate = [0, 0, inf]", r"object\[0\]\.rotate = .*each finite \(degrees\)"),
+    (
+        BASE + "[[object]]\nshape = 'torus'\nmajor_radius = 1\nminor_radius = 1",
+        r"minor_radius = 1: must be below major_",
+    ),
+    (BASE + "[[object]]\nshape = 'mesh'", r"object\[0\]\.file is missing: expected the path of a mesh"),
+    (BASE + "[[object]]\nshape = 'mesh'\nfile = 'frames'", r"no such file: .*/frames"),
+    (BASE + SPHERE + "animate = 3", r"object\[0\]\.animate = 3: expected a table with turn, pivot, sway, period"),
+    (BASE + SPHERE + "animate = { period = 3 }", r"animate\.period = 3: .*give sway too"),
+    (BASE + SPHERE + "animate = { pivot = [0, 0, 0] }", r"animate\.pivot = .*give turn too"),
+    (BASE + SPHERE + "animate = { sway = [0, 0, 1], period = 0 }", r"period = 0: expected a number, 0\.001 or more"),
+    # Materials.
+    (BASE + SPHERE + "material = 3", r"object\[0\]\.material = 3: expected a table"),
+    (BASE + SPHERE + "[object.material]", r"object\[0\]\.material\.model is missing: expected one of \"phong\""),
+    (
+        BASE + SPHERE + "[object.material]\nmodel = 'lambert'\nroughness = 1",
+        r'roughness = 1: not used with model = "lam',
+    ),
+    (BASE + SPHERE + "[object.material]\nmodel = 'metallic_roughness'\nroughness = 1.1", r"roughness = 1\.1: .*0 to 1"),
+    (BASE + SPHERE + "[object.material]\nmodel = 'metallic_roughness'\nmetallic = -0.1", r"metallic = -0\.1: .*0 to 1"),
+    (
+        BASE + SPHERE + "[object.material]\nmodel = 'phong'\nshininess = -1",
+        r"shininess = -1: expected a number, 0 or more",
+    ),
+    (BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = [1, 1, 2]", r"base_color = .*from 0 to 1"),
+    (
+        BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = 0.5",
+        r"base_color = 0\.5: expected a list of 3",
+    ),
+    (BASE + SPHERE + "[object.material]\nmodel = 'mirror'\nbase_color = 'w.png'", r'"w\.png": no such file: .*/w\.png'),
+    # Lights.
+    (light(kind="'area'"), r'light\[0\]\.kind = "area": expected one of "point", "spot", "directional"'),
+    (light(kind="'point'"), r'light\[0\]\.target = .*not used with kind = "point"'),
+    (light(intensity=""), r"light\[0\]\.intensity is missing: expected a number, 0 or more"),
+    (light(intensity="-1"), r"light\[0\]\.intensity = -1: expected a number, 0 or more"),
+    (light(color="[1, 1, -1]"), r"light\[0\]\.color = .*0 or more"),
+    (light(target=""), r"light\[0\]\.target is missing: a spot light needs a target"),
+    (light(direction="[0, 0, 1]"), r"light\[0\]\.direction = .*target is given too"),
+    (light(target="", direction="[0, 0, 0]"), r"light\[0\]\.direction = .*has no length"),
+    (light(target="[0, 0, 1]"), r"light\[0\]\.target = .*is where the light itself is"),
+    (light(inner_angle="31"), r"light\[0\]\.inner_angle = 31: must not be above outer_angle \(30\)"),
+    (light(outer_angle="91"), r"light\[0\]\.outer_angle = 91: expected a number from 0 to 90 \(degrees\)"),
+    (light(outer_angle=""), r"light\[0\]\.outer_angle is missing: expected a number from 0 to 90"),
+    (light(attenuation="[0, 0, 0]"), r"light\[0\]\.attenuation = .*is zero everywhere"),
+    (light(attenuation="[0, 0, -1]"), r"light\[0\]\.attenuation = .*0 or more"),
+    (light(radius="-1"), r"light\[0\]\.radius = -1: expected a number, 0 or more \(metres\)"),
+    (BASE + "[[light]]\nkind = 'directional'\nintensity = 1", r"light\[0\]\.direction is missing"),
+    # Exposure.
+    (BASE + "[exposure]\nscale = -1", r"exposure\.scale = -1: expected a number, 0 or more"),
+    (BASE + "[exposure]\nscale = 'of'", r'exposure\.scale = "of": expected a number, 0 or more, or "auto"'),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), ERRORS)
+def test_errors_name_file_key_and_value(folder: pathlib.Path, text: str, message: str) -> None:
+    path = folder / "scene.toml"
+    with pytest.raises(SceneError, match=message) as caught:
+        loads_scene(text, path)
+    assert_helpful(caught.value, path)
+
+
+def test_scenes_that_are_no_files(folder: pathlib.Path) -> None:
+    for name in (folder, folder / "none.toml", "x" * 5000, "a\0b", ""):
+        with pytest.raises(SceneError, match="no such scene; expected a"):
+            load_scene(name)
+    latin = folder / "latin.toml"
+    latin.write_bytes(b'schema = 1\nname = "\xe9"')
+    with pytest.raises(SceneError, match="not a text file in UTF-8") as caught:
+        load_scene(latin)
+    assert_helpful(caught.value, latin)
+
+
+@pytest.mark.parametrize("text", [light(inner_angle="90", outer_angle="90"), light(inner_angle="0", outer_angle="0")])
+def test_cones_at_their_limits_are_legal(text: str) -> None:
+    assert len(loads_scene(text).lights) == 1
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from(["mesh", "sphere", "spot", "phong", "frames", "model.ply", "auto", "grid 4x3 0.04 0.01"]),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+SECTIONS = ["[camera]", "[source]", "[marker]", "[probe]", "[[proxy]]", "[[object]]", "[[light]]", "[exposure]"]
+KINDS = (sc.Camera, sc.SourceSpec, sc.Marker, sc.Probe, sc.Proxy, sc.Object, sc.Light, sc.PhongMaterial)
+ALL_KEYS = sorted(
+    {field.name for kind in KINDS for field in dataclasses.fields(kind)} | {"model", "calibration", "scale"}
+)
+
+
+def toml(value: Any) -> str:
+    """Any value as TOML; None becomes an empty table."""
+    if value is None:
+        return "{}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{toml(key)} = {toml(entry)}" for key, entry in value.items()) + "}"
+    return repr(value)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    section=st.sampled_from(SECTIONS),
+    entries=st.dictionaries(st.sampled_from(ALL_KEYS), VALUES, max_size=6),
+)
+def test_garbage_is_refused_politely(folder: pathlib.Path, section: str, entries: dict[str, Any]) -> None:
+    path = folder / "scene.toml"
+    base = {"[camera]": "schema = 1\n", "[marker]": CAMERA}.get(section, BASE)
+    text = base + section + "\n" + "\n".join(f"{key} = {toml(value)}" for key, value in entries.items())
+    try:
+        scene = loads_scene(text, path)
+    except SceneError as error:
+        assert_helpful(error, path)
+    else:
+        assert loads_scene(dumps_scene(scene)) == scene
+
+
+# --- Writing ----------------------------------------------------------------------------------------------------------
+
+FINITE = st.floats(-1e18, 1e18)
+POSITIVE = st.floats(1e-18, 1e18)
+UNIT = st.floats(0.0, 1.0)
+NONNEGATIVE = st.floats(0.0, 1e18)
+VEC3 = st.tuples(FINITE, FINITE, FINITE)
+PLACES = {"at": VEC3, "rotate": VEC3}
+
+
+def color(file: pathlib.Path) -> st.SearchStrategy[Any]:
+    return st.tuples(UNIT, UNIT, UNIT) | st.just(file)
+
+
+def animations() -> st.SearchStrategy[sc.Animation | None]:
+    return st.none() | st.builds(sc.Animation, VEC3, st.none() | VEC3, VEC3, st.floats(1e-3, 1e18))
+
+
+def scenes(root: pathlib.Path) -> st.SearchStrategy[Scene]:
+    mesh, picture = root / "model.ply", root / "wood.png"
+    tint = color(picture)
+    materials = st.one_of(
+        st.builds(sc.PhongMaterial, tint, tint, NONNEGATIVE),
+        st.builds(sc.MetallicRoughnessMaterial, tint, UNIT, UNIT),
+        st.builds(sc.LambertMaterial, tint),
+        st.builds(sc.MirrorMaterial, tint),
+    )
+    thing: dict[str, Any] = {**PLACES, "scale": POSITIVE, "material": materials, "animate": animations()}
+    objects = st.one_of(
+        st.builds(sc.Object, st.just("mesh"), file=st.just(mesh), **thing),
+        st.builds(sc.Object, st.just("sphere"), radius=POSITIVE, **thing),
+        st.builds(sc.Object, st.just("box"), size=st.tuples(POSITIVE, POSITIVE, POSITIVE), **thing),
+        st.builds(
+            sc.Object, st.just("torus"), major_radius=st.floats(1.0, 1e18), minor_radius=st.floats(1e-18, 0.9), **thing
+        ),
+    )
+    proxies = st.one_of(
+        st.builds(sc.Proxy, st.just("plane"), size=st.tuples(POSITIVE, POSITIVE), **PLACES),
+        st.builds(sc.Proxy, st.just("box"), size=st.tuples(POSITIVE, POSITIVE, POSITIVE), **PLACES),
+        st.builds(sc.Proxy, st.just("mesh"), file=st.just(mesh), **PLACES),
+    )
+    shine: dict[str, Any] = {
+        "intensity": NONNEGATIVE,
+        "color": st.tuples(NONNEGATIVE, NONNEGATIVE, NONNEGATIVE),
+        "animate": animations(),
+    }
+    near = {"attenuation": st.tuples(NONNEGATIVE, NONNEGATIVE, POSITIVE), "radius": NONNEGATIVE}
+    cone = {"inner_angle": st.floats(0, 20), "outer_angle": st.floats(20, 90)}
+    directions = st.tuples(FINITE, FINITE, POSITIVE)
+    lights = st.one_of(
+        st.builds(sc.Light, st.just("point"), at=VEC3, **shine, **near),
+        st.builds(sc.Light, st.just("spot"), at=VEC3, direction=directions, **shine, **near, **cone),
+        st.builds(sc.Light, st.just("spot"), at=st.just((0.0, 0.0, 0.0)), target=directions, **shine, **near, **cone),
+        st.builds(sc.Light, st.just("directional"), direction=directions, **shine),
+    )
+    white = st.floats(0.01, 1.0)
+    dictionaries = st.sampled_from(["DICT_4X4_50", "DICT_APRILTAG_36h11"])
+    few, many = st.integers(1, 7), st.integers(2, 10)
+    boards = st.one_of(
+        st.builds(sc.GridBoard, few, few, POSITIVE, POSITIVE),
+        st.builds(sc.CharucoBoard, many, many, st.floats(1.0, 1e18), st.floats(1e-18, 0.9)),
+    )
+    markers = st.one_of(
+        st.builds(sc.Marker, dictionaries, st.integers(0, 49), POSITIVE, white),
+        st.builds(sc.Marker, white=white, board=boards),
+    )
+    fps = st.none() | st.floats(1e-3, 1e5)
+    sources = st.one_of(
+        st.none(),
+        st.builds(sc.SourceSpec, path=st.just(root / "frames"), fps=fps),
+        st.builds(sc.SourceSpec, camera=st.integers(0, 9), fps=fps),
+        st.builds(sc.SourceSpec, synthetic=st.text(min_size=1).filter(encodable), fps=fps),
+    )
+    share = st.floats(0.01, 1.0)
+    cameras = st.builds(
+        Camera,
+        st.integers(1, 65536),
+        st.integers(1, 65536),
+        POSITIVE,
+        POSITIVE,
+        FINITE,
+        FINITE,
+        st.sampled_from([4, 5, 8]).flatmap(lambda n: st.tuples(*[FINITE] * n)),
+        st.sampled_from(["srgb", "linear", "gamma:2.2", root / "response.json"]),
+    )
+    return st.builds(
+        Scene,
+        camera=cameras,
+        name=st.text(min_size=1).filter(encodable),
+        source=sources,
+        marker=markers,
+        probes=st.lists(st.builds(sc.Probe, VEC3, POSITIVE, st.tuples(share, share, share)), max_size=2).map(tuple),
+        proxies=st.lists(proxies, max_size=2).map(tuple),
+        objects=st.lists(objects, max_size=3).map(tuple),
+        lights=st.lists(lights, max_size=3).map(tuple),
+        exposure=st.builds(sc.Exposure, NONNEGATIVE | st.just("auto")),
+    )
+
+
+def encodable(text: str) -> bool:
+    """Whether a file can hold the text: half a surrogate pair cannot be written as UTF-8."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in text)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_what_is_written_loads_as_it_was(folder: pathlib.Path, data: st.DataObject) -> None:
+    scene = data.draw(scenes(folder.resolve()))
+    text = dumps_scene(scene)
+    text.encode("utf-8")
+    assert loads_scene(text) == scene
+    assert loads_scene(dumps_scene(scene, folder), folder / "other.toml") == scene
+
+
+def test_paths_inside_the_folder_are_written_relative(folder: pathlib.Path) -> None:
+    scene = loads_scene(BASE + "[[object]]\nshape = 'mesh'\nfile = 'model.ply'", folder / "scene.toml")
+    assert 'file = "model.ply"' in dumps_scene(scene, folder)
+    assert f'file = "{(folder / "model.ply").resolve().as_posix()}"' in dumps_scene(scene, folder / "frames")
+
+
+def test_scenes_are_values(folder: pathlib.Path) -> None:
+    make: Callable[[], Scene] = lambda: loads_scene(BASE + SPHERE + SPOT, folder / "scene.toml")  # noqa: E731
+    assert make() == make()
+    assert hash(make()) == hash(make())
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        make().name = "other"  # type: ignore[misc]
