@@ -406,3 +406,96 @@ def make_trace(config: TraceConfig) -> Trace:
         return any_proxy(scene.proxies, origin, direction, t_max)
 
     return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
+
+
+@wp.func
+def inside_rect(row: wp.int32, column: wp.int32, rect: wp.vec4i) -> wp.bool:
+    """Whether a pixel lies in a rectangle (row_start, row_stop, column_start, column_stop)."""
+    return row >= rect[0] and row < rect[1] and column >= rect[2] and column < rect[3]
+
+
+@functools.cache
+def make_primary(config: TraceConfig) -> wp.Function:
+    """``closest_visible(scene, origin, direction) -> Hit``: the closest object that no proxy hides; shape -1 if none."""
+    trace = make_trace(config)
+    closest_object, occluded_by_proxies = trace.closest_object, trace.occluded_by_proxies
+
+    @wp.func(module="unique")
+    def closest_visible(scene: RayScene, origin: wp.vec3, direction: wp.vec3) -> Hit:
+        hit = closest_object(scene, origin, direction, FAR)
+        if wp.static(len(config.proxies) > 0):
+            if hit.shape >= 0:
+                # Where object and proxy touch, the object is seen: both depths carry a few roundings.
+                if occluded_by_proxies(scene, origin, direction, hit.t * (1.0 - 16.0 * ROUNDING)):
+                    hit.shape = -1
+        return hit
+
+    return closest_visible
+
+
+@functools.cache
+def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
+    """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
+    closest_visible = make_primary(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def trace_pixels_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        # Out:
+        hit_object_out: wp.array2d[wp.int32],
+        hit_depth_out: wp.array2d[wp.float32],
+        hits_out: wp.array2d[Hit],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        found = wp.int32(-1)
+        depth = wp.float32(wp.inf)
+        if inside_rect(i, j, params[0].object_rect):
+            ray = rays[i, j]
+            direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+            hit = closest_visible(scene, params[0].camera_position, direction)
+            if hit.shape >= 0:
+                found = hit.shape
+                depth = hit.t
+                hits_out[i, j] = hit
+        hit_object_out[i, j] = found
+        hit_depth_out[i, j] = depth
+
+    return trace_pixels_kernel
+
+
+def trace_pixels(
+    config: TraceConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    hit_object_out: wp.array2d[wp.int32],
+    hit_depth_out: wp.array2d[wp.float32],
+    hits_out: wp.array2d[Hit],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Trace a ray through the centre of every pixel of ``params.object_rect``.
+
+    Args:
+        config: Kinds of shape in ``scene``.
+        params: Frame values: camera and object_rect.
+        rays: (H, W) undistorted x / z and y / z of each pixel centre.
+        scene: What rays meet.
+        hit_object_out: (H, W) index of the visible object; -1 where there is none, and outside the rectangle.
+        hit_depth_out: (H, W) depth along the camera's z axis in metres, infinity where there is none.
+        hits_out: (H, W) the hits; defined only where there is an object.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_trace_pixels_kernel(config),
+        rays.shape,
+        [params, rays, scene],
+        [hit_object_out, hit_depth_out, hits_out],
+        rows=rows,
+        device=rays.device,
+    )
