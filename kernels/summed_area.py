@@ -96,7 +96,7 @@ def sum_along_columns_kernel(
     # Out:
     table_out: wp.array2d[wp.uint32],
 ):
-    """One thread per block of columns; a block's rows are added as wholes, so the previous row is still in the cache."""
+    """One thread per block of columns; it adds whole rows, so the previous one is in the cache."""
     start = column_start + wp.tid() * block
     stop = wp.min(start + block, column_stop)
     for i in range(1, table_out.shape[0]):

@@ -1,0 +1,304 @@
+"""Virtual light on the physical desk: linear radiance that a virtual light adds to each pixel of the camera's frame.
+
+Every pixel's ray meets the nearest proxy. A light of irradiance E_v (facing it) arrives there along wi, unless a
+virtual object or a proxy stands between, and adds
+
+    added = sum over lights of  Kd / pi * E_v * visible * response.
+
+What Kd and the response are makes the rungs, with N.L = max(normal . wi, 0):
+
+``flat``: what plain alpha blending of a lit proxy does. Kd is a grey constant, response = N.L.
+
+``paper``: [DH04] section 4.2 to the letter. The *additive factor* is N.L, the *multiplicative factor* m the frame's
+intensity, alpha the dot product of the virtual light's direction and the brightest physical direction. The text asks
+for m at alpha = 1, for the additive factor at 0 and for the inverse of m at -1; the printed shader's lerp, (1 -
+alpha) N.L + alpha m, gives 2 N.L - m at -1: weight two for the flat term and a light twice as bright, which the text
+does not mean. The text's three cases are met, continuously, by weighting with |alpha|:
+
+    response = (1 - |alpha|) N.L + |alpha| (m if alpha > 0 else 1 - m).                                            (1)
+
+``relief``: (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark desk and
+shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes the pixel's
+luminance over that of its surroundings (a box of the frame's summed-area table) and multiplies N.L. A desk without
+structure has m = 1, and gives what ``flat`` gives, for every alpha. The inverse: a bump that tilts the surface by a
+small angle along the physical light changes its shading to 1 + e; seen from the opposite side it is 1 - e = 2 - m, to
+first order, which also keeps the mean over the surroundings. With it (1) is
+
+    response = N.L (1 + alpha (m - 1)),                                                                            (2)
+
+linear in alpha, so nothing jumps where alpha changes sign. Kd is the surroundings' luminance in the pixel's hue: the
+desk's reflectance if white paper were just below clipping.
+
+``reflectance``: Kd is the desk's own reflectance, from what the camera sees and what the room sends there,
+
+    rho = pi L / E_room(normal),                                                                                    (3)
+
+which is (exactly) right for a Lambertian desk, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane where
+the room is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower bound. Shading by
+relief is in rho as well, as if it were paint. Moderate deviations e from the surroundings are taken for relief
+(beyond ``RELIEF_LIMIT`` they are paint: print, other things), as far as the room's light has a direction, and are
+turned to the virtual light:
+
+    response = N.L (1 + alpha e) / (1 + e),   e = dominance * biweight(m - 1) * (m - 1).                           (4)
+
+Where the room is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key light's
+dominance.
+
+References:
+    [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.shadow import make_shadow, sample_light
+from warp_ar.kernels.structs import FrameParams, KeyLight, Light, RayScene
+from warp_ar.kernels.summed_area import box_mean
+from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
+
+wp.set_module_options({"enable_backward": False})
+
+RUNGS = ("flat", "paper", "relief", "reflectance")
+"""Cheapest first."""
+
+DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
+"""Of a desk that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
+PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
+"""Irradiance at which the prior counts as much as the frame: that of a white desk at half a code of 255."""
+RELIEF_LIMIT = wp.constant(wp.float32(0.6))
+"""Relative deviation from the surroundings from which structure is paint, not relief."""
+MAX_RELIEF = wp.constant(wp.float32(4.0))
+"""Largest m: a glint of the desk is no reason to add more than four times the light."""
+SURROUNDINGS = 1.0 / 8.0
+"""Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a lamp's falloff."""
+_HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
+_INV_PI = wp.constant(wp.float32(1.0 / math.pi))
+
+
+@dataclasses.dataclass(frozen=True)
+class RelightConfig:
+    """What is compiled into the kernel."""
+
+    rung: Literal["flat", "paper", "relief", "reflectance"]
+    """How the desk responds."""
+    trace: TraceConfig
+    """Kinds of shape in the scene."""
+    irradiance: Literal["sh", "map"] = "sh"
+    """Form of the room's irradiance, for ``reflectance``."""
+
+    def __post_init__(self) -> None:
+        if self.rung not in RUNGS:
+            raise ValueError(f"rung: {self.rung!r} is none of {', '.join(RUNGS)}")
+
+
+@wp.func
+def luminance(color: wp.vec3) -> wp.float32:
+    """Rec. 709 luminance of a linear colour."""
+    return 0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]
+
+
+@wp.func
+def printed_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Equation (1)."""
+    weight = wp.min(wp.abs(alpha), 1.0)
+    multiplicative = wp.where(alpha > 0.0, intensity, 1.0 - intensity)
+    return (1.0 - weight) * n_dot_l + weight * multiplicative
+
+
+@wp.func
+def relief_factor(m: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Factor on N.L in equation (2)."""
+    return wp.max(1.0 + wp.clamp(alpha, -1.0, 1.0) * (wp.min(m, MAX_RELIEF) - 1.0), 0.0)
+
+
+@wp.func
+def turned_relief(m: wp.float32, alpha: wp.float32, dominance: wp.float32) -> wp.float32:
+    """Factor on N.L in equation (4)."""
+    deviation = wp.clamp((m - 1.0) / RELIEF_LIMIT, -1.0, 1.0)
+    window = 1.0 - deviation * deviation
+    e = dominance * window * window * deviation * RELIEF_LIMIT
+    return (1.0 + alpha * e) / (1.0 + e)
+
+
+@wp.func
+def reflectance_of(radiance: wp.float32, irradiance: wp.float32) -> wp.float32:
+    """Equation (3) with its prior, one channel; within 0..1 for whatever comes in."""
+    rho = (wp.pi * radiance + PRIOR_WEIGHT * DEFAULT_REFLECTANCE) / (wp.max(irradiance, 0.0) + PRIOR_WEIGHT)
+    if not rho > 0.0:  # NaN as well
+        return 0.0
+    return wp.min(rho, 1.0)
+
+
+@wp.func
+def surrounding_luminance(
+    table: wp.array2d[wp.uint32], decode_table: wp.array[wp.vec3], row: wp.int32, col: wp.int32, size: wp.int32
+) -> wp.float32:
+    """Linear luminance of the mean code around a pixel; never 0. A mean of codes is not swayed by a few highlights."""
+    code = box_mean(table, row, col, size)
+    low = wp.min(wp.int32(code), 254)
+    fraction = code - wp.float32(low)
+    linear = (1.0 - fraction) * luminance(decode_table[low]) + fraction * luminance(decode_table[low + 1])
+    return wp.max(linear, 1.0e-4)
+
+
+@functools.cache
+def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+    is_lit = make_shadow(config.trace)
+    rung = config.rung
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def relight_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        table: wp.array2d[wp.uint32],
+        scene: RayScene,
+        lights: wp.array[Light],
+        key_lights: wp.array[KeyLight],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        box: wp.int32,
+        # Out:
+        physical_added_out: wp.array2d[wp.vec3],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        black = wp.vec3(0.0, 0.0, 0.0)
+        physical_added_out[i, j] = black
+        rect = params[0].light_rect
+        if i < rect[0] or i >= rect[1] or j < rect[2] or j >= rect[3]:
+            return
+        ray = rays[i, j]
+        direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+        # A face that is seen from behind is not the surface that the camera sees.
+        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+            return
+
+        # What the desk is, found only once some light falls here.
+        known = bool(False)
+        radiance = wp.vec3()
+        kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        m = float(1.0)
+        key = wp.vec3()
+        dominance = float(0.0)
+
+        added = wp.vec3()
+        for index in range(lights.shape[0]):
+            light = sample_light(lights[index], hit.point)
+            n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
+            if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
+                continue
+            if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                continue
+            response = n_dot_l
+            if wp.static(rung != "flat"):
+                if not known:
+                    known = True
+                    radiance = decode(decode_table, frame[i, j])
+                    key = key_lights[0].direction
+                    dominance = key_lights[0].dominance
+                    if wp.static(rung == "paper"):
+                        m = luminance(radiance)
+                    else:
+                        around = surrounding_luminance(table, decode_table, i, j, box)
+                        m = luminance(radiance) / around
+                        if wp.static(rung == "relief"):
+                            hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
+                            kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
+                        else:
+                            if wp.static(config.irradiance == "sh"):
+                                room = sh_irradiance(irradiance_sh, hit.normal)
+                            else:
+                                room = sample_latlong(irradiance_map, hit.normal)
+                            kd = wp.vec3(
+                                reflectance_of(radiance[0], room[0]),
+                                reflectance_of(radiance[1], room[1]),
+                                reflectance_of(radiance[2], room[2]),
+                            )
+                alpha = wp.dot(light.wi, key)
+                if wp.static(rung == "paper"):
+                    response = printed_response(n_dot_l, m, alpha * dominance)
+                elif wp.static(rung == "relief"):
+                    response = n_dot_l * relief_factor(m, alpha * dominance)
+                else:
+                    response = n_dot_l * turned_relief(m, alpha, dominance)
+            added += response * light.irradiance_normal
+        physical_added_out[i, j] = wp.cw_mul(kd, added) * _INV_PI
+
+    return relight_kernel
+
+
+def surroundings_size(height: int) -> int:
+    """Side of the box of a pixel's surroundings in a frame of ``height`` rows, odd."""
+    return 2 * round(0.5 * SURROUNDINGS * height) + 1
+
+
+def relight(
+    config: RelightConfig,
+    params: wp.array,
+    rays: wp.array,
+    frame: wp.array,
+    decode_table: wp.array,
+    table: wp.array | None,
+    scene: RayScene,
+    lights: wp.array,
+    key_lights: wp.array | None,
+    irradiance: wp.array | None,
+    physical_added_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write the radiance that virtual lights add to the desk; zero outside ``params[0].light_rect``.
+
+    Args:
+        config: Rung and kinds of shape.
+        params: (1,) FrameParams.
+        rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
+        frame: (H, W) vec3ub, the camera's frame, RGB.
+        decode_table: (256,) vec3 of ``color.decode_table``.
+        table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        key_lights: (k,) KeyLight, brightest first; needed by all rungs but ``flat``.
+        irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
+            ``reflectance``.
+        physical_added_out: (H, W) vec3, linear radiance in camera values.
+        rows: Band of rows; None means all.
+    """
+    is_map = config.irradiance == "map"
+    launch_rows(
+        make_relight_kernel(config),
+        frame.shape,
+        [
+            params,
+            rays,
+            frame,
+            decode_table,
+            table,
+            scene,
+            lights,
+            key_lights,
+            None if is_map else irradiance,
+            irradiance if is_map else None,
+            surroundings_size(frame.shape[0]),
+        ],
+        [physical_added_out],
+        rows=rows,
+        device=frame.device,
+    )

@@ -1,0 +1,90 @@
+"""Virtual light on the physical desk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels import relight
+from warp_ar.ray_scene import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+
+
+class Relight(Stage):
+    """Adds what virtual lights send to the proxies, shadowed, to the desk in the frame."""
+
+    name = "relight"
+    rungs = relight.RUNGS
+    summary = "virtual light and its shadows on the physical desk"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Reads what its rung needs to know of the room and the desk."""
+        if not request.scene.lights:
+            return LeftOut("the scene has no virtual light")
+        if not request.scene.proxies:
+            return LeftOut("the scene has no proxy for virtual light to fall on")
+        rung = request.quality.rung(cls.name)
+        reads = ["pose", "lights", "objects"]
+        if rung != "flat":
+            reads += ["frame", "key_lights"]
+        if rung in ("relief", "reflectance"):
+            reads.append("summed_area")
+        if rung == "reflectance":
+            reads.append(irradiance_name(request))
+        return Wiring(tuple(reads), ("physical_added",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The added radiance."""
+        width, height = self.request.size
+        return {"physical_added": ArraySpec((height, width), wp.vec3)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over the rows that light can reach."""
+        form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
+        config = relight.RelightConfig(self.rung, trace_config(self.request.scene), form)  # type: ignore[arg-type]
+        relight.make_relight_kernel(config)
+
+        def launch(rows: Rows | None) -> None:
+            relight.relight(
+                config,
+                arrays["params"],
+                arrays["rays"],
+                arrays["frame"],
+                arrays["decode"],
+                arrays.get("summed_area"),
+                arrays["ray_scene"],
+                arrays["light_array"],
+                arrays.get("key_lights"),
+                arrays.get(irradiance_name(self.request)),
+                arrays["physical_added"],
+                rows=rows,
+            )
+
+        return [Pass(launch, rows=self.request.size[1], extent=_with_previous(arrays["light_rows"]))]
+
+
+def irradiance_name(request: Request) -> str:
+    """Resource that holds the room's irradiance at this quality."""
+    return "irradiance_sh" if request.quality.rung("diffuse") == "sh2" else "irradiance_map"
+
+
+def _with_previous(extent: Callable[[], Rows]) -> Callable[[], Rows]:
+    """Rows of this frame and of the last one, whose light must be erased."""
+    previous = (0, 0)
+
+    def both() -> Rows:
+        nonlocal previous
+        current = extent()
+        if current[1] <= current[0]:
+            union = previous
+        elif previous[1] <= previous[0]:
+            union = current
+        else:
+            union = (min(current[0], previous[0]), max(current[1], previous[1]))
+        previous = current
+        return union
+
+    return both

@@ -1,0 +1,43 @@
+"""Summed-area table of the frame's intensity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels import summed_area
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+
+
+class SummedArea(Stage):
+    """Sums the frame's intensity so that any box's mean costs four look-ups."""
+
+    name = "summed_area"
+    rungs = ("default",)
+    summary = "summed-area table of the frame: means over boxes of any size"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Wired for darkening by the paper's box, and for relief against its surroundings."""
+        scale = request.scene.exposure.scale
+        darkens = (isinstance(scale, str) or scale < 1.0) and request.quality.rung("expose") == "box"
+        relief = bool(request.scene.lights) and request.quality.rung("relight") in ("relief", "reflectance")
+        if not darkens and not relief:
+            return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
+        return Wiring(("frame",), ("summed_area",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The table."""
+        width, height = self.request.size
+        return {"summed_area": ArraySpec((height, width), wp.uint32)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Rows in bands of rows, then columns in bands of columns."""
+        width, height = self.request.size
+        frame, table = arrays["frame"], arrays["summed_area"]
+        return [
+            Pass(lambda rows: summed_area.sum_along_rows(frame, table, rows=rows), rows=height),
+            Pass(lambda columns: summed_area.sum_along_columns(table, columns=columns), rows=width),
+        ]
