@@ -46,6 +46,7 @@ _LOADER_ERRORS: Final = (
     ArithmeticError,
     OSError,
     NotImplementedError,
+    ImportError,  # an encoding or compression that needs a package which is not there
     RecursionError,
     MemoryError,
     struct.error,
