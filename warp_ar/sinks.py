@@ -22,11 +22,12 @@ from types import TracebackType
 from typing import Any, Self
 
 import av
+import av.filter
 import cv2
 import numpy as np
 import numpy.typing as npt
 import OpenEXR
-from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, Interpolation, VideoReformatter
+from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError
 
@@ -251,9 +252,11 @@ class VideoSink(_ThreadedSink):
         except OSError as error:
             raise SinkError(f"{self._path} cannot be written: {_reason(error)}") from error
         self._fps = fps
+        self._rate = fractions.Fraction(fps).limit_denominator(1001)
+        self._broken = False
         self._container: Any = None
         self._stream: Any = None
-        self._reformatter = VideoReformatter()
+        self._converter: Any = None
         self.description = f"{self._path} (H.264, {fps:g} fps)"
         super().__init__(1)
         if size is not None:
@@ -281,32 +284,32 @@ class VideoSink(_ThreadedSink):
         self._container = av.open(str(self._path), "w", options={**fragments, "flush_packets": "1"})
         self._stream = self._container.add_stream(
             "libx264",
-            rate=fractions.Fraction(self._fps).limit_denominator(1001),
+            rate=self._rate,
             options={"preset": "veryfast", "crf": str(CRF), "g": str(group)},
         )
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
         context = self._stream.codec_context
         context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        self._container.start_encoding()
+        self._converter = _rgb_to_yuv(width, height, 1 / self._rate)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        if self._broken:
+            return  # FFmpeg may crash when it goes on after a failure.
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
-            picture = self._reformatter.reformat(
-                av.VideoFrame.from_ndarray(image, format="rgb24"),
-                format="yuv420p",
-                dst_colorspace=Colorspace.ITU709,
-                dst_color_range=ColorRange.MPEG,
-                interpolation=Interpolation.BILINEAR | Interpolation.ACCURATE_RND,
-                threads=1,
-            )
-            picture.pts = index
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = index, 1 / self._rate
+            self._converter.push(picture)
+            picture = self._converter.pull()
             self._container.mux(self._stream.encode(picture))
         except (av.FFmpegError, OSError) as error:
+            self._broken = True
             raise SinkError(f"{self._path}: frame {index} cannot be written: {_reason(error)}") from error
 
     def _finish(self) -> None:
@@ -315,13 +318,35 @@ class VideoSink(_ThreadedSink):
         container, self._container = self._container, None
         try:
             try:
-                container.mux(self._stream.encode(None))
+                if not self._broken:
+                    container.mux(self._stream.encode(None))
             finally:
                 container.close()
         except (av.FFmpegError, OSError) as error:
             # After a frame that could not be written, the end cannot be either: once is enough.
             if self._error is None:
                 raise SinkError(f"{self._path} cannot be finished: {_reason(error)}") from error
+
+
+def _rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:
+    """Filter from rgb24 to yuv420p as an H.264 stream means it unless it says otherwise.
+
+    BT.709, limited range, and chroma sited at the left one of each pair of columns: the plain converter puts it between
+    the two, which players show shifted by half a pixel.
+    """
+    graph = av.filter.Graph()
+    graph.threads = 1
+    nodes = (
+        graph.add_buffer(width=width, height=height, format="rgb24", time_base=time_base),
+        graph.add(
+            "scale",
+            "out_color_matrix=bt709:out_range=tv:out_chroma_loc=left:flags=bilinear+accurate_rnd+full_chroma_inp",
+        ),
+        graph.add("format", "yuv420p"),
+        graph.add("buffersink"),
+    )
+    graph.link_nodes(*nodes).configure()
+    return graph
 
 
 class NullSink(Sink):
@@ -415,6 +440,8 @@ def _check_image(image: npt.NDArray[Any]) -> None:
 
 def _make_folder(path: pathlib.Path) -> None:
     """Make the folder and its parents, and find out whether files can be made in it."""
+    if path.exists() and not path.is_dir():
+        raise SinkError(f"{path} is a file, not a folder to write to")
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):

@@ -332,7 +332,8 @@ class VideoFile(_RecordedSource):
                 packet = next(demuxer, None)
                 if packet is None:
                     break
-                if packet.is_corrupt:
+                # A transport stream marks every gap so, and is made to go on after it.
+                if packet.is_corrupt and container.format.name != "mpegts":
                     damage = "the file is cut off or damaged there"
                     break
                 packets += packet.size > 0

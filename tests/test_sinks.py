@@ -1,0 +1,437 @@
+"""Frames out: whole files whatever happens, true colour, errors that come at the right time."""
+
+from __future__ import annotations
+
+import pathlib
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+
+import av
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from warp_ar.errors import SinkError, UsageError
+from warp_ar.sinks import (
+    FRAMES_WAITING,
+    EnvironmentSink,
+    NullSink,
+    Sink,
+    TeeSink,
+    open_sink,
+    read_environment,
+    write_environment,
+)
+from warp_ar.sources import open_source
+
+# 4:2:0 at limited range keeps 219 of 255 levels; at this quality the codec adds its own rounding.
+VIDEO_LEVELS = 3
+# Smooth colour ramps at the same quality: chroma is halved, and the codec quantises.
+RAMP_LEVELS = 6
+# Their mean error: rounding and quantisation are nearly even-handed.
+RAMP_MEAN = 0.4
+
+VIDEOS = ("clip.mp4", "clip.mkv", "clip.mov")
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before
+
+
+def flat(level: int, size: tuple[int, int] = (64, 48)) -> np.ndarray:
+    return np.full((size[1], size[0], 3), level, np.uint8)
+
+
+def patches() -> np.ndarray:
+    colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255), (255, 0, 255)]
+    colors += [(0, 0, 0), (255, 255, 255), (128, 128, 128), (200, 120, 60), (20, 40, 90), (90, 160, 70)]
+    return np.concatenate([np.full((32, 32, 3), color, np.uint8) for color in colors], axis=1)
+
+
+def levels(path: pathlib.Path) -> list[float]:
+    with open_source(path) as source:
+        return [float(frame.image.mean()) for frame in source]
+
+
+def error_of(path: pathlib.Path) -> str:
+    with pytest.raises(SinkError) as caught:
+        open_sink(path, fps=24)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# -------------------------------------------------------------------------------------------------------------- folders
+
+
+def test_folder_holds_exactly_what_was_written(tmp_path: pathlib.Path) -> None:
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (7, 9, 3), dtype=np.uint8) for _ in range(3 * FRAMES_WAITING)]
+    with open_sink(tmp_path / "a" / "b", fps=24) as sink:
+        for image in images:
+            sink.write(image)
+    names = sorted(entry.name for entry in (tmp_path / "a" / "b").iterdir())
+    assert names == [f"{index:04d}.png" for index in range(len(images))]
+    for index, image in enumerate(images):
+        read = cv2.imread(str(tmp_path / "a" / "b" / f"{index:04d}.png"))
+        assert np.array_equal(read[..., ::-1], image)
+
+
+def test_folder_leaves_other_files_alone(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0000.png").write_text("old")
+    (tmp_path / "0007.png").write_text("kept")
+    with open_sink(tmp_path, fps=24) as sink:
+        sink.write(flat(9))
+    assert cv2.imread(str(tmp_path / "0000.png")).mean() == 9
+    assert (tmp_path / "0007.png").read_text() == "kept"
+
+
+@pytest.mark.parametrize("name", ["frames", "clip.mp4"])
+def test_written_array_may_be_reused(tmp_path: pathlib.Path, name: str) -> None:
+    image = flat(0)
+    with open_sink(tmp_path / name, fps=24) as sink:
+        for level in range(0, 200, 10):
+            image[:] = level
+            sink.write(image)
+    assert levels(tmp_path / name) == pytest.approx(list(range(0, 200, 10)), abs=VIDEO_LEVELS)
+
+
+def test_png_that_cannot_be_written_is_told_once(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0001.png").mkdir()
+    sink = open_sink(tmp_path, fps=24)
+
+    def write_many() -> None:
+        for _ in range(3 + FRAMES_WAITING):
+            sink.write(flat(1))
+
+    with pytest.raises(SinkError, match=r"0001\.png cannot be written"):
+        write_many()
+    with pytest.raises(SinkError, match=r"0001\.png"):
+        sink.write(flat(1))
+    sink.close()
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_last_png_that_cannot_be_written_is_told_by_close(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0000.png").mkdir()
+    sink = open_sink(tmp_path, fps=24)
+    sink.write(flat(1))
+    with pytest.raises(SinkError, match=r"0000\.png"):
+        sink.close()
+    sink.close()
+
+
+# ---------------------------------------------------------------------------------------------------------------- video
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_video_holds_every_frame_at_its_rate(tmp_path: pathlib.Path, name: str) -> None:
+    with open_sink(tmp_path / "new" / name, fps=25, size=(64, 48)) as sink:
+        for index in range(50):
+            sink.write(flat(5 * index))
+    path = tmp_path / "new" / name
+    assert levels(path) == pytest.approx([5 * index for index in range(50)], abs=VIDEO_LEVELS)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        context = stream.codec_context
+        assert (context.name, context.pix_fmt) == ("h264", "yuv420p")
+        assert (context.colorspace, context.color_primaries, context.color_trc) == (1, 1, 1)
+        assert int(context.color_range) == 1
+        assert stream.average_rate == 25
+        assert container.duration == pytest.approx(2 * av.time_base, rel=1e-3)
+
+
+@pytest.mark.parametrize("fps", [23.976, 29.97, 12.5, 60])
+def test_rate_is_kept(tmp_path: pathlib.Path, fps: float) -> None:
+    with open_sink(tmp_path / "clip.mp4", fps=fps) as sink:
+        for _ in range(5):
+            sink.write(flat(0))
+    with open_source(tmp_path / "clip.mp4") as source:
+        assert source.fps == pytest.approx(fps, rel=1e-4)
+        assert [frame.time for frame in source] == pytest.approx([index / fps for index in range(5)], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_colours_survive(tmp_path: pathlib.Path, name: str) -> None:
+    with open_sink(tmp_path / name, fps=24) as sink:
+        for _ in range(4):
+            sink.write(patches())
+    with open_source(tmp_path / name) as source:
+        for frame in source:
+            difference = frame.image[16, 16::32].astype(int) - patches()[16, 16::32]
+            assert np.abs(difference).max() <= VIDEO_LEVELS
+
+
+def test_stored_luma_is_bt709_limited(tmp_path: pathlib.Path) -> None:
+    # A round trip would forgive a wrong matrix used twice: look at the stored values.
+    with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+        for _ in range(3):
+            sink.write(patches())
+    with av.open(str(tmp_path / "clip.mp4")) as container:
+        luma = next(container.decode(video=0)).to_ndarray()[16, 16 : 32 * 12 : 32]
+    expected = 16 + 219 / 255 * (patches()[16, 16::32] @ [0.2126, 0.7152, 0.0722])
+    assert np.abs(luma - expected).max() <= VIDEO_LEVELS
+
+
+def test_pictures_are_not_shifted(tmp_path: pathlib.Path) -> None:
+    x, y = np.meshgrid(np.arange(128), np.arange(96))
+    ramp = np.stack([2 * x, 2 * y + 30, 250 - x - y], axis=-1).astype(np.uint8)
+    with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+        for _ in range(4):
+            sink.write(ramp)
+    with open_source(tmp_path / "clip.mp4") as source:
+        # Left-sited chroma has nothing to lean on at the borders.
+        difference = np.stack([frame.image.astype(int) - ramp for frame in source])[:, 8:-8, 8:-8]
+    assert np.abs(difference).max() <= RAMP_LEVELS
+    # Chroma half a column off is a mean of 0.8.
+    assert np.abs(difference.mean(axis=(0, 1, 2))).max() < RAMP_MEAN
+
+
+@pytest.mark.parametrize("size", [(1, 1), (63, 48), (64, 47), (33, 17)])
+def test_odd_sizes_are_padded_and_say_so(tmp_path: pathlib.Path, size: tuple[int, int]) -> None:
+    width, height = size
+    image = flat(120, size)
+    image[:, -1] = 60
+    with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+        for _ in range(3):
+            sink.write(image)
+        even = (width + width % 2, height + height % 2)
+        assert f"padded to {even[0]}x{even[1]}" in sink.description
+    assert "padded" in open_sink(tmp_path / "other.mp4", fps=24, size=size).description
+    with open_source(tmp_path / "clip.mp4") as source:
+        assert source.size == even
+        decoded = next(iter(source)).image
+    assert abs(int(decoded[height // 2, even[0] - 1, 1]) - 60) <= RAMP_LEVELS + 10 * (width > 1)
+
+
+def test_even_size_has_no_note(tmp_path: pathlib.Path) -> None:
+    with open_sink(tmp_path / "clip.mp4", fps=24, size=(64, 48)) as sink:
+        assert "padded" not in sink.description
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> None:
+    rng = np.random.default_rng(0)
+    counts = []
+    with open_sink(tmp_path / name, fps=24) as sink:
+        for index in range(96):
+            sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+            if index in {60, 90}:
+                copy = tmp_path / f"copy{index}{pathlib.Path(name).suffix}"
+                shutil.copy(tmp_path / name, copy)
+                with av.open(str(copy)) as container:
+                    counts.append(sum(1 for _ in container.decode(video=0)))
+    # What is not on disk yet: half a second of fragment, the encoder's look-ahead, and the frames that wait.
+    assert counts[0] >= 60 - 40
+    assert counts[1] >= 90 - 40
+    assert len(levels(tmp_path / name)) == 96
+
+
+def test_killed_process_leaves_a_video(tmp_path: pathlib.Path) -> None:
+    script = (
+        "import os, sys, numpy as np\n"
+        "from warp_ar.sinks import open_sink\n"
+        "sink = open_sink(sys.argv[1], fps=24)\n"
+        "for index in range(120):\n"
+        "    sink.write(np.full((48, 64, 3), index, np.uint8))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    path = tmp_path / "clip.mp4"
+    root = pathlib.Path(__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", script, str(path)], cwd=root, check=False, capture_output=True)
+    assert done.returncode == -9, done.stderr
+    frames = levels(path)
+    assert len(frames) >= 120 - 40
+    assert frames == pytest.approx(list(range(len(frames))), abs=VIDEO_LEVELS)
+
+
+def test_interrupted_block_finishes_the_file(tmp_path: pathlib.Path) -> None:
+    def interrupted() -> None:
+        with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+            for index in range(7):
+                sink.write(flat(index))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert len(levels(tmp_path / "clip.mp4")) == 7
+
+
+def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
+    open_sink(tmp_path / "new.mp4", fps=24).close()
+    assert not (tmp_path / "new.mp4").exists()
+    (tmp_path / "old.mp4").write_text("old")
+    open_sink(tmp_path / "old.mp4", fps=24).close()
+    assert (tmp_path / "old.mp4").read_text() == "old"
+
+
+@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full, a disk without room")
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.mp4"])
+def test_full_disk_is_told(tmp_path: pathlib.Path, name: str) -> None:
+    (tmp_path / name).symlink_to("/dev/full")
+    sink = open_sink(tmp_path / name, fps=24)
+    rng = np.random.default_rng(0)
+
+    def fill() -> None:
+        try:
+            for _ in range(60):
+                sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        finally:
+            sink.close()
+
+    with pytest.raises(SinkError, match="No space left"):
+        fill()
+
+
+# --------------------------------------------------------------------------------------------------------------- errors
+
+
+def test_bad_paths_are_told_at_open(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.mp4").mkdir()
+    (tmp_path / "frames.v2").mkdir()
+    assert ".gif" in (message := error_of(tmp_path / "clip.gif"))
+    assert ".mp4" in message
+    assert "is a file" in error_of(tmp_path / "file")
+    assert "is a folder" in error_of(tmp_path / "folder.mp4")
+    assert "is a file, not a folder" in error_of(tmp_path / "file" / "clip.mp4")
+    assert "Not a directory" in error_of(tmp_path / "file" / "frames")
+    open_sink(tmp_path / "frames.v2", fps=24).close()
+    open_sink(f"{tmp_path}/frames.v3/", fps=24).close()
+    assert (tmp_path / "frames.v3").is_dir()
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self").exists(), reason="needs /proc, where nobody can make a file")
+def test_unwritable_places_are_told_at_open() -> None:
+    for name in ("clip.mp4", "frames"):
+        assert "cannot be written" in error_of(pathlib.Path("/proc") / name)
+
+
+@pytest.mark.parametrize("fps", [0.0, -3.0, float("nan")])
+def test_impossible_rate(tmp_path: pathlib.Path, fps: float) -> None:
+    with pytest.raises(UsageError, match="fps"):
+        open_sink(tmp_path / "clip.mp4", fps=fps)
+
+
+@pytest.mark.parametrize("name", ["frames", "clip.mp4"])
+def test_other_images_are_refused(tmp_path: pathlib.Path, name: str) -> None:
+    with open_sink(tmp_path / name, fps=24) as sink:
+        sink.write(flat(0))
+        for image in (flat(0)[..., 0], flat(0).astype(np.float32), flat(0)[:0]):
+            with pytest.raises(SinkError, match="uint8 RGB"):
+                sink.write(image)
+        with pytest.raises(SinkError, match="frame 1 is 32x48, not 64x48"):
+            sink.write(flat(0, (32, 48)))
+    with pytest.raises(SinkError, match="closed"):
+        sink.write(flat(0))
+
+
+def test_encoder_failure_is_told_at_the_next_write(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sink = open_sink(tmp_path / "clip.mp4", fps=24)
+
+    def fail(*_: object) -> None:
+        raise av.FFmpegError(28, "no more")
+
+    monkeypatch.setattr(sink, "_start", fail)
+
+    def write_many() -> None:
+        for _ in range(FRAMES_WAITING + 2):
+            sink.write(flat(0))
+
+    with pytest.raises(SinkError, match="frame 0 cannot be written: no more"):
+        write_many()
+    sink.close()
+
+
+# -------------------------------------------------------------------------------------------------------------- several
+
+
+def test_tee_writes_and_closes_all(tmp_path: pathlib.Path) -> None:
+    class Failing(NullSink):
+        def close(self) -> None:
+            raise SinkError("cannot be finished")
+
+    null = NullSink()
+    sinks: list[Sink] = [open_sink(tmp_path / "frames", fps=24), Failing(), null, open_sink(tmp_path / "a.mkv", fps=24)]
+    tee = TeeSink(*sinks)
+    for level in range(3):
+        tee.write(flat(level))
+    with pytest.raises(SinkError, match="cannot be finished"):
+        tee.close()
+    assert null.count == 3
+    assert levels(tmp_path / "frames") == [0, 1, 2]
+    assert len(levels(tmp_path / "a.mkv")) == 3
+
+
+# ---------------------------------------------------------------------------------------------------------- environment
+
+
+def radiance() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    image = rng.exponential(1.0, (8, 16, 3)).astype(np.float32)
+    image[0, 0] = (1e6, 1e-30, -0.5)
+    return image
+
+
+def test_environment_round_trip_is_exact(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "new" / "0000.exr"
+    write_environment(path, radiance())
+    assert np.array_equal(read_environment(path), radiance())
+    with OpenEXR.File(str(path)) as file:
+        assert file.header()["compression"] == OpenEXR.ZIP_COMPRESSION
+        assert file.channels()["RGB"].pixels.dtype == np.float32
+        assert np.array_equal(file.channels()["RGB"].pixels, radiance())
+
+
+def test_environment_of_a_view_is_the_view(tmp_path: pathlib.Path) -> None:
+    write_environment(tmp_path / "e.exr", radiance()[::-1, ::2])
+    assert np.array_equal(read_environment(tmp_path / "e.exr"), radiance()[::-1, ::2])
+
+
+def test_environment_from_separate_channels_and_half(tmp_path: pathlib.Path) -> None:
+    small = np.clip(radiance(), 0, 100).astype(np.float16)
+    channels = {name: np.ascontiguousarray(small[..., index]) for index, name in enumerate("RGB")}
+    channels["Z"] = channels["R"]
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "e.exr"))
+    assert np.array_equal(read_environment(tmp_path / "e.exr"), small.astype(np.float32))
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": channels["R"]}).write(str(tmp_path / "z.exr"))
+    with pytest.raises(SinkError, match="R, G and B"):
+        read_environment(tmp_path / "z.exr")
+
+
+def test_environment_errors(tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "folder.exr").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "bad.exr").write_bytes(b"no picture")
+    with pytest.raises(SinkError, match="float32"):
+        write_environment(tmp_path / "e.exr", radiance().astype(np.float64))
+    for path in (tmp_path / "folder.exr", tmp_path / "file" / "e.exr"):
+        with pytest.raises(SinkError, match="cannot be written"):
+            write_environment(path, radiance())
+    with pytest.raises(SinkError, match="there is no file"):
+        read_environment(tmp_path / "none.exr")
+    with pytest.raises(SinkError, match="cannot be read"):
+        read_environment(tmp_path / "bad.exr")
+    capfd.readouterr()
+
+
+def test_environment_sink_numbers_its_files(tmp_path: pathlib.Path) -> None:
+    with EnvironmentSink(tmp_path / "env") as sink:
+        for index in range(6):
+            sink.write(radiance() + np.float32(index))
+        with pytest.raises(SinkError, match="float32"):
+            sink.write(flat(0))
+    for index in range(6):
+        assert np.array_equal(read_environment(tmp_path / "env" / f"{index:04d}.exr"), radiance() + np.float32(index))
+
+
+def test_shared_environments_load(shared: pathlib.Path) -> None:
+    paths = sorted((shared / "hdri").glob("*.exr"))
+    assert paths
+    assert read_environment(paths[0]).shape == (512, 1024, 3)

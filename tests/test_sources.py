@@ -1,0 +1,622 @@
+"""Frames in: order, colour, damage, threads."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import struct
+import threading
+import time
+import wave
+from collections.abc import Iterator
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.video.reformatter import ColorRange, Colorspace
+
+from warp_ar.errors import SourceError, UsageError
+from warp_ar.sources import (
+    FRAMES_AHEAD,
+    CaptureDevice,
+    FrameFolder,
+    QueueSource,
+    Source,
+    Synthetic,
+    VideoFile,
+    open_source,
+)
+
+# 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
+VIDEO_LEVELS = 3
+# The card's texels are half a pixel wide and blur edges by as much; 1 is what a shift by a pixel would change.
+CARD_PIXELS = 0.2
+# Long enough for any thread to come by on a loaded machine; a test that passes never waits for it.
+PATIENCE = 20.0
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before
+
+
+def write_png(path: pathlib.Path, picture: np.ndarray) -> None:
+    path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def write_folder(folder: pathlib.Path, count: int, size: tuple[int, int] = (8, 6)) -> pathlib.Path:
+    """Frame n is filled with the value n."""
+    folder.mkdir(exist_ok=True)
+    for index in range(count):
+        write_png(folder / f"{index:04d}.png", np.full((size[1], size[0], 3), index, np.uint8))
+    return folder
+
+
+def write_video(
+    path: pathlib.Path,
+    pictures: list[np.ndarray],
+    *,
+    codec: str = "libx264",
+    fps: int = 24,
+    matrix: Colorspace = Colorspace.ITU709,
+    tagged: bool = True,
+    stamps: list[int] | None = None,
+    options: dict[str, str] | None = None,
+) -> pathlib.Path:
+    with av.open(str(path), "w", options=options or {}) as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        if codec == "libx264":
+            stream.options = {"crf": "10", "preset": "veryfast"}
+        if tagged:
+            stream.codec_context.colorspace = matrix
+        for index, picture in enumerate(pictures):
+            full = ColorRange.JPEG if codec == "mjpeg" else ColorRange.MPEG
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+                format=stream.pix_fmt, dst_colorspace=matrix, dst_color_range=full
+            )
+            if not tagged:
+                frame.colorspace = 2
+            frame.pts = stamps[index] if stamps else index
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def noise(count: int, size: tuple[int, int] = (64, 48)) -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8) for _ in range(count)]
+
+
+def patches() -> np.ndarray:
+    """Flat patches of the colours that a wrong matrix or range moves most."""
+    colors = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 0), (0, 255, 255), (255, 0, 255)]
+    colors += [(0, 0, 0), (255, 255, 255), (128, 128, 128), (200, 120, 60), (20, 40, 90), (90, 160, 70)]
+    return np.concatenate([np.full((32, 32, 3), color, np.uint8) for color in colors], axis=1)
+
+
+def patch_centers(image: np.ndarray) -> np.ndarray:
+    return image[16, 16::32].astype(int)
+
+
+def take_until_error(source: Source) -> tuple[int, str]:
+    count = 0
+    try:
+        for _ in source:
+            count += 1
+    except SourceError as error:
+        return count, str(error)
+    pytest.fail("the source ended without an error")
+
+
+def error_of(spec: str | int | pathlib.Path, **options: Any) -> str:
+    with pytest.raises(SourceError) as caught:
+        open_source(spec, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# -------------------------------------------------------------------------------------------------------------- folders
+
+
+def test_folder_yields_every_frame_in_natural_order(tmp_path: pathlib.Path) -> None:
+    for value in (10, 9, 1, 100):
+        write_png(tmp_path / f"f{value}.png", np.full((6, 8, 3), value, np.uint8))
+    (tmp_path / "notes.txt").write_text("not a frame")
+    with open_source(tmp_path, fps=10) as source:
+        frames = list(source)
+        assert (source.size, source.length, source.live, source.dropped) == ((8, 6), 4, False, 0)
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [1, 9, 10, 100]
+    assert [frame.index for frame in frames] == [0, 1, 2, 3]
+    assert [frame.time for frame in frames] == pytest.approx([0, 0.1, 0.2, 0.3])
+    assert all(frame.image.flags.c_contiguous and frame.image.dtype == np.uint8 for frame in frames)
+
+
+def test_folder_is_red_green_blue(tmp_path: pathlib.Path) -> None:
+    write_png(tmp_path / "0.png", np.full((4, 4, 3), (30, 20, 10), np.uint8))  # OpenCV's order
+    with open_source(tmp_path) as source:
+        assert next(iter(source)).image[0, 0].tolist() == [10, 20, 30]
+
+
+def test_folder_can_be_read_twice_and_left_early(tmp_path: pathlib.Path) -> None:
+    with open_source(write_folder(tmp_path, 3 * FRAMES_AHEAD)) as source:
+        for frame in source:
+            if frame.index == 1:
+                break
+        assert len(list(source)) == 3 * FRAMES_AHEAD
+    with pytest.raises(SourceError, match="closed"):
+        iter(source)
+
+
+def test_close_ends_a_reading_in_progress(tmp_path: pathlib.Path) -> None:
+    source = open_source(write_folder(tmp_path, 3))
+    frames = iter(source)
+    next(frames)
+    source.close()
+    assert list(frames) == []
+
+
+def test_loop_goes_on_counting(tmp_path: pathlib.Path) -> None:
+    with open_source(write_folder(tmp_path, 3), fps=4, loop=True) as source:
+        frames = [frame for frame, _ in zip(source, range(8), strict=False)]
+    assert [frame.index for frame in frames] == list(range(8))
+    assert [int(frame.image[0, 0, 0]) for frame in frames] == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert [frame.time for frame in frames] == pytest.approx([index / 4 for index in range(8)])
+
+
+def test_one_image_is_a_source(tmp_path: pathlib.Path) -> None:
+    write_folder(tmp_path, 2)
+    with open_source(tmp_path / "0001.png") as source:
+        assert [int(frame.image[0, 0, 0]) for frame in source] == [1]
+
+
+def test_grey_alpha_and_16_bit_become_rgb(tmp_path: pathlib.Path) -> None:
+    values = np.arange(0, 65536, dtype=np.uint16).reshape(256, 256)
+    write_png(tmp_path / "0.png", values)
+    write_png(tmp_path / "1.png", np.full((256, 256), 77, np.uint8))
+    write_png(tmp_path / "2.png", np.full((256, 256, 4), (30, 20, 10, 0), np.uint8))
+    write_png(tmp_path / "3.png", np.full((256, 256, 3), (257 * 3, 257 * 2, 257), np.uint16))
+    with open_source(tmp_path) as source:
+        deep, grey, alpha, color = (frame.image for frame in source)
+    assert all(image.shape == (256, 256, 3) for image in (deep, grey, alpha, color))
+    rounded = np.round(values.astype(np.float64) / 257)
+    assert all(np.array_equal(deep[..., channel], rounded) for channel in range(3))
+    assert (grey == 77).all()
+    assert (alpha == (10, 20, 30)).all()
+    assert (color == (1, 2, 3)).all()
+
+
+def test_float_image_is_an_error(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0.tif").write_bytes(cv2.imencode(".tif", np.full((4, 4, 3), np.nan, np.float32))[1].tobytes())
+    assert "float32" in error_of(tmp_path)
+
+
+def test_exposures_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
+    write_folder(tmp_path, 3)
+    (tmp_path / "exposures.json").write_text(json.dumps({"0000.png": 0.01, "0002.png": 0.5}))
+    with open_source(tmp_path) as source:
+        assert [frame.exposure_time for frame in source] == [0.01, None, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('{"000.png": 1}', "did you mean '0000.png'"),
+        ('{"0000.png": -1}', "positive"),
+        ('{"0000.png": "fast"}', "positive"),
+        ("[1]", "object"),
+        ("{", "cannot be read"),
+    ],
+)
+def test_bad_sidecar_is_an_error(tmp_path: pathlib.Path, text: str, told: str) -> None:
+    write_folder(tmp_path, 1)
+    (tmp_path / "exposures.json").write_text(text)
+    message = error_of(tmp_path)
+    assert told in message
+    assert "exposures.json" in message
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp"])
+@pytest.mark.parametrize("kept", [0.0, 0.2, 0.7, "tail"])
+def test_damaged_image_is_named_after_the_frames_before_it(
+    tmp_path: pathlib.Path, suffix: str, kept: float | str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    whole = cv2.imencode(suffix, noise(1)[0])[1].tobytes()
+    if kept == "tail" and suffix in {".bmp", ".tif"}:
+        kept = 0.99
+    end = len(whole) - 2 if kept == "tail" else int(len(whole) * float(kept))
+    for index in range(5):
+        (tmp_path / f"{index}{suffix}").write_bytes(whole[:end] if index == 3 else whole)
+    with open_source(tmp_path) as source:
+        count, message = take_until_error(source)
+    capfd.readouterr()  # The decoders' own complaints.
+    assert count == 3
+    assert f"3{suffix}" in message
+    assert ("(0 bytes)" in message) == (end == 0)
+
+
+def test_size_that_changes_is_named(tmp_path: pathlib.Path) -> None:
+    write_folder(tmp_path, 4)
+    write_png(tmp_path / "0002.png", np.zeros((9, 9, 3), np.uint8))
+    with open_source(tmp_path) as source:
+        count, message = take_until_error(source)
+    assert count == 2
+    assert "0002.png" in message
+    assert "9x9, not 8x6" in message
+
+
+def test_frame_that_vanishes_is_named(tmp_path: pathlib.Path) -> None:
+    with open_source(write_folder(tmp_path, 3)) as source:
+        (tmp_path / "0001.png").unlink()
+        count, message = take_until_error(source)
+    assert count == 1
+    assert "0001.png" in message
+
+
+# ---------------------------------------------------------------------------------------------------------------- paths
+
+
+def test_missing_path_names_the_nearest(tmp_path: pathlib.Path) -> None:
+    write_folder(tmp_path / "frames", 1)
+    assert f"did you mean {tmp_path / 'frames'}?" in error_of(tmp_path / "frame")
+    assert f"did you mean {tmp_path / 'frames'}?" in error_of(tmp_path / "frmes" / "0000.png")
+    assert "nothing in" in error_of(tmp_path / "zzz")
+
+
+def test_path_that_cannot_exist(tmp_path: pathlib.Path) -> None:
+    assert "too long" in error_of(tmp_path / ("x" * 5000))
+
+
+def test_empty_folder_says_what_it_needs(tmp_path: pathlib.Path) -> None:
+    assert ".png" in error_of(tmp_path)
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_rate(tmp_path: pathlib.Path, fps: float) -> None:
+    with pytest.raises(UsageError, match="fps"):
+        open_source(write_folder(tmp_path, 1), fps=fps)
+
+
+# ---------------------------------------------------------------------------------------------------------------- video
+
+
+def test_video_loses_no_frame(tmp_path: pathlib.Path) -> None:
+    levels = [np.full((48, 64, 3), 4 * index, np.uint8) for index in range(50)]
+    path = write_video(tmp_path / "clip.mp4", levels)
+    with open_source(path) as source:
+        assert (source.size, source.length, source.live) == ((64, 48), 50, False)
+        assert source.fps == pytest.approx(24)
+        frames = list(source)
+    assert [frame.index for frame in frames] == list(range(50))
+    assert [frame.time for frame in frames] == pytest.approx([index / 24 for index in range(50)], abs=1e-4)
+    means = [frame.image.mean() for frame in frames]
+    assert means == pytest.approx([4 * index for index in range(50)], abs=VIDEO_LEVELS)
+    assert all(frame.image.flags.c_contiguous for frame in frames)
+
+
+def test_video_loops_and_can_be_retimed(tmp_path: pathlib.Path) -> None:
+    path = write_video(tmp_path / "clip.mkv", [np.full((48, 64, 3), 100 * index, np.uint8) for index in range(3)])
+    with open_source(path, fps=10, loop=True) as source:
+        frames = [frame for frame, _ in zip(source, range(7), strict=False)]
+    assert [frame.time for frame in frames] == pytest.approx([index / 10 for index in range(7)])
+    assert [round(frame.image.mean() / 100) for frame in frames] == [0, 1, 2, 0, 1, 2, 0]
+
+
+def test_variable_rate_keeps_its_times(tmp_path: pathlib.Path) -> None:
+    stamps = [5, 6, 9, 10, 20]
+    path = write_video(tmp_path / "clip.mp4", noise(5), fps=10, stamps=stamps)
+    with open_source(path) as source:
+        assert [frame.time for frame in source] == pytest.approx([0, 0.1, 0.4, 0.5, 1.5], abs=1e-3)
+
+
+@pytest.mark.parametrize("matrix", [Colorspace.ITU709, Colorspace.ITU601, Colorspace.BT2020])
+def test_video_is_decoded_with_its_own_matrix(tmp_path: pathlib.Path, matrix: Colorspace) -> None:
+    path = write_video(tmp_path / "clip.mp4", [patches()] * 3, matrix=matrix)
+    with open_source(path) as source:
+        image = list(source)[-1].image
+    assert np.abs(patch_centers(image) - patch_centers(patches())).max() <= VIDEO_LEVELS
+
+
+@pytest.mark.parametrize(("rows", "matrix"), [(480, Colorspace.ITU601), (720, Colorspace.ITU709)])
+def test_video_without_a_matrix_follows_its_height(tmp_path: pathlib.Path, rows: int, matrix: Colorspace) -> None:
+    picture = np.vstack([patches(), np.zeros((rows - 32, patches().shape[1], 3), np.uint8)])
+    with open_source(write_video(tmp_path / "clip.mp4", [picture] * 2, matrix=matrix, tagged=False)) as source:
+        image = next(iter(source)).image
+    assert np.abs(patch_centers(image) - patch_centers(picture)).max() <= VIDEO_LEVELS
+
+
+def test_full_range_video(tmp_path: pathlib.Path) -> None:
+    path = write_video(tmp_path / "clip.avi", [patches()] * 2, codec="mjpeg", matrix=Colorspace.ITU601)
+    with open_source(path) as source:
+        image = next(iter(source)).image
+    # Motion JPEG at its default quality is coarse in chroma; black and white tell the range.
+    assert np.abs(patch_centers(image)[6:9] - patch_centers(patches())[6:9]).max() <= VIDEO_LEVELS
+
+
+def turn(path: pathlib.Path, matrix: tuple[int, int, int, int]) -> None:
+    """Write the upper left of an MP4's display matrix, rows first, as a phone held sideways does."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 44
+    a, b, c, d = (value << 16 for value in matrix)
+    data[at : at + 20] = struct.pack(">5i", a, b, 0, c, d)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "clockwise"), [((1, 0, 0, 1), 0), ((0, 1, -1, 0), 1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 3)]
+)
+def test_rotation_is_honoured(tmp_path: pathlib.Path, matrix: tuple[int, int, int, int], clockwise: int) -> None:
+    picture = np.zeros((32, 64, 3), np.uint8)
+    picture[:16, :32] = 250  # The upper left quarter.
+    path = write_video(tmp_path / "clip.mp4", [picture] * 3)
+    turn(path, matrix)
+    upright = np.rot90(picture, -clockwise)
+    with open_source(path) as source:
+        assert source.size == (upright.shape[1], upright.shape[0])
+        image = next(iter(source)).image
+    assert np.abs(image.astype(int) - upright).mean() < VIDEO_LEVELS
+    assert image.flags.c_contiguous
+
+
+@pytest.mark.parametrize("kept", [0.25, 0.6, 0.97])
+@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+def test_truncated_video_gives_what_is_whole_and_names_the_frame(
+    tmp_path: pathlib.Path, suffix: str, kept: float
+) -> None:
+    codec = "mpeg4" if suffix == ".avi" else "libx264"
+    options = {"movflags": "faststart"} if suffix == ".mp4" else {}
+    path = write_video(tmp_path / f"clip{suffix}", noise(30), codec=codec, options=options)
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    end = int(path.stat().st_size * kept)
+    whole = sum(pos + size <= end for pos, size in packets)
+    path.write_bytes(path.read_bytes()[:end])
+    with open_source(path) as source:
+        count, message = take_until_error(source)
+    assert f"frame {count} " in message
+    assert path.name in message
+    # A frame that refers to a later one, which is lost, may be lost with it.
+    assert max(1, whole - 3) <= count <= whole
+
+
+def test_video_cut_between_two_frames(tmp_path: pathlib.Path) -> None:
+    path = write_video(tmp_path / "clip.mp4", noise(20), codec="mpeg4", options={"movflags": "faststart"})
+    with av.open(str(path)) as container:
+        packets = [packet.pos for packet in container.demux(video=0) if packet.size]
+    path.write_bytes(path.read_bytes()[: packets[12]])
+    with open_source(path) as source:
+        assert take_until_error(source)[0] == 12
+
+
+def test_video_that_never_was_finished(tmp_path: pathlib.Path) -> None:
+    path = write_video(tmp_path / "clip.mp4", noise(20))
+    path.write_bytes(path.read_bytes()[:5000])
+    assert "cannot be read as a video" in error_of(path)
+
+
+def test_empty_and_foreign_files(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "empty.mp4").write_bytes(b"")
+    assert "0 bytes" in error_of(tmp_path / "empty.mp4")
+    (tmp_path / "text.mp4").write_text("This is not a video. " * 100)
+    assert "cannot be read as a video" in error_of(tmp_path / "text.mp4")
+    (tmp_path / "text.txt").write_text("This is not a video. " * 100)
+    assert "no video stream, only text" in error_of(tmp_path / "text.txt")
+
+
+def test_sound_alone_is_no_video(tmp_path: pathlib.Path) -> None:
+    with wave.open(str(tmp_path / "sound.wav"), "wb") as sound:
+        sound.setparams((1, 2, 8000, 0, "NONE", ""))
+        sound.writeframes(bytes(16000))
+    assert "no video stream, only audio" in error_of(tmp_path / "sound.wav")
+
+
+def test_folder_is_no_video_file(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(SourceError, match="folder"):
+        VideoFile(tmp_path)
+
+
+def test_size_that_changes_in_a_video_is_named(tmp_path: pathlib.Path) -> None:
+    # Two MPEG transport streams in a row are one; its second half has another size.
+    first = write_video(tmp_path / "a.ts", noise(6)).read_bytes()
+    second = write_video(tmp_path / "b.ts", noise(6, (96, 64))).read_bytes()
+    (tmp_path / "c.ts").write_bytes(first + second)
+    with open_source(tmp_path / "c.ts") as source:
+        count, message = take_until_error(source)
+    assert count == 6
+    assert "frame 6 is 96x64, not 64x48" in message
+
+
+def test_real_clip(shared: pathlib.Path) -> None:
+    with open_source(shared / "real" / "aruco_clip" / "video.avi") as source:
+        assert source.size == (640, 480)
+        assert sum(1 for _ in source) == source.length == 145
+
+
+# ----------------------------------------------------------------------------------------------------------------- live
+
+
+def grey(level: int, size: tuple[int, int] = (8, 6)) -> np.ndarray:
+    return np.full((size[1], size[0], 3), level, np.uint8)
+
+
+def test_queue_keeps_the_newest() -> None:
+    with QueueSource((8, 6)) as source:
+        assert source.live
+        assert source.length is None
+        for level in range(4):
+            assert source.push(grey(level), 10.0 + level)
+        frames = iter(source)
+        frame = next(frames)
+        assert (int(frame.image[0, 0, 0]), frame.index, frame.time, source.dropped) == (3, 0, 0.0, 3)
+        source.push(grey(9), 15.5)
+        frame = next(frames)
+        assert (int(frame.image[0, 0, 0]), frame.index, frame.time, source.dropped) == (9, 1, 2.5, 3)
+    assert list(source) == []
+    assert not source.push(grey(0), 20.0)
+
+
+def test_queue_waits_and_ends_across_threads() -> None:
+    source = QueueSource((8, 6))
+    seen: list[int] = []
+    reader = threading.Thread(target=lambda: seen.extend(int(frame.image[0, 0, 0]) for frame in source))
+    reader.start()
+    for level in range(200):
+        source.push(grey(level), level / 30)
+    source.close()
+    reader.join(PATIENCE)
+    assert not reader.is_alive()
+    assert seen[-1] == 199
+    assert seen == sorted(seen)
+    assert len(seen) + source.dropped == 200
+
+
+@pytest.mark.parametrize("image", [grey(0, (9, 6)), grey(0)[..., 0], grey(0).astype(np.float32)])
+def test_queue_refuses_other_images(image: np.ndarray) -> None:
+    with QueueSource((8, 6)) as source, pytest.raises(SourceError, match="not"):
+        source.push(image, 0.0)
+
+
+class FakeCapture:
+    """A camera that gives ``count`` frames and is then unplugged; waits at each one while ``gate`` is cleared."""
+
+    def __init__(self, count: int, *, opened: bool = True, change_at: int | None = None, fps: float = 60.0) -> None:
+        self.count, self.opened, self.change_at, self.fps = count, opened, change_at, fps
+        self.given = 0
+        self.released = False
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def isOpened(self) -> bool:
+        return self.opened
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.gate.wait(PATIENCE)
+        if self.given >= self.count:
+            return False, None
+        size = (10, 10) if self.given == self.change_at else (8, 6)
+        self.given += 1
+        return True, np.full((size[1], size[0], 3), (self.given - 1, 0, 200), np.uint8)
+
+    def get(self, key: int) -> float:
+        return self.fps
+
+    def set(self, key: int, value: float) -> bool:
+        self.fps = value
+        return True
+
+    def release(self) -> None:
+        self.released = True
+
+
+def test_device_drops_to_the_newest_and_reports_being_unplugged() -> None:
+    capture = FakeCapture(40)
+    with CaptureDevice(3, opener=lambda _: capture, grace=0.3) as source:
+        assert (source.size, source.fps, source.live) == ((8, 6), 60.0, True)
+        deadline = time.monotonic() + PATIENCE
+        while source.dropped < 39 and time.monotonic() < deadline:
+            time.sleep(0.001)
+        frames = iter(source)
+        image = next(frames).image
+        assert image[0, 0].tolist() == [200, 0, 39]
+        with pytest.raises(SourceError, match=r"capture device 3 gave no frame for 0.3 s.*unplugged"):
+            next(frames)
+    assert capture.released
+
+
+def test_device_survives_a_gap_shorter_than_its_grace() -> None:
+    capture = FakeCapture(1)
+    with CaptureDevice(0, opener=lambda _: capture, grace=PATIENCE) as source:
+        frames = iter(source)
+        next(frames)
+        capture.count = 2
+        assert next(frames).image[0, 0, 2] == 1
+
+
+def test_device_that_changes_size() -> None:
+    with CaptureDevice(0, opener=lambda _: FakeCapture(3, change_at=2)) as source:
+        assert "10x10, not 8x6" in take_until_error(source)[1]
+
+
+def test_device_that_does_not_open() -> None:
+    closed, silent = FakeCapture(0, opened=False), FakeCapture(0)
+    with pytest.raises(SourceError, match="cannot be opened"):
+        CaptureDevice(0, opener=lambda _: closed)
+    with pytest.raises(SourceError, match="gave no frame"):
+        CaptureDevice(0, opener=lambda _: silent, grace=0.05)
+    assert closed.released
+    assert silent.released
+
+
+def test_device_is_asked_for_its_rate() -> None:
+    with CaptureDevice(0, fps=15, opener=lambda _: FakeCapture(5)) as source:
+        assert source.fps == 15
+    with CaptureDevice(0, opener=lambda _: FakeCapture(5, fps=0.0)) as source:
+        assert source.fps > 0
+
+
+def test_absent_device_is_an_error(capfd: pytest.CaptureFixture[str]) -> None:
+    assert "capture device 97 cannot be opened" in error_of("97")
+    capfd.readouterr()  # OpenCV's own complaints.
+
+
+# ------------------------------------------------------------------------------------------------------------ synthetic
+
+
+def test_synthetic_is_the_same_every_time() -> None:
+    for name in Synthetic.NAMES:
+        with open_source(f"synthetic:{name}") as first, Synthetic(name) as second:
+            for one, two, _ in zip(first, second, range(3), strict=False):
+                assert np.array_equal(one.image, two.image)
+                assert one.image.shape == (480, 640, 3)
+                assert one.image.std() > 10
+
+
+def trace_card(source: Synthetic, index: int) -> np.ndarray:
+    """Grey levels by following 8x8 rays through each pixel to the marker's plane, in float64."""
+    width, height = source.size
+    rotation, translation = source.pose(index)
+    steps = (np.arange(8) + 0.5) / 8 - 0.5
+    x = (np.arange(width)[:, None] + steps).ravel()
+    y = (np.arange(height)[:, None] + steps).ravel()
+    pixels = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=-1)
+    rays = pixels @ np.linalg.inv(source.camera_matrix).T @ rotation
+    eye = -rotation.T @ translation
+    points = eye - rays * (eye[2] / rays[..., 2:])
+    bits = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 0, 6)
+    card = np.pad(np.pad(bits, 2, constant_values=240), 1, constant_values=120)
+    column = np.floor(points[..., 0] / source.MARKER_SIZE * 6 + 6).clip(0, 11).astype(int)
+    row = np.floor(-points[..., 1] / source.MARKER_SIZE * 6 + 6).clip(0, 11).astype(int)
+    return card[row, column].reshape(height, 8, width, 8).mean(axis=(1, 3))
+
+
+def test_synthetic_card_is_where_its_pose_says() -> None:
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    with Synthetic("card", size=(240, 180), length=3) as source:
+        for frame in source:
+            assert np.linalg.det(source.pose(frame.index)[0]) == pytest.approx(1)
+            assert detector.detectMarkers(frame.image)[1].ravel().tolist() == [0]
+            expected = trace_card(source, frame.index)
+            error = np.abs(frame.image[..., 0] - expected).mean()
+            moved = np.abs(np.diff(expected, axis=1)).mean()
+            assert error < CARD_PIXELS * moved
+
+
+def test_unknown_synthetic_names_the_nearest() -> None:
+    with pytest.raises(UsageError, match="did you mean card"):
+        open_source("synthetic:cart")
+
+
+def test_folder_is_decoded_ahead(tmp_path: pathlib.Path) -> None:
+    source = FrameFolder(write_folder(tmp_path, 3 * FRAMES_AHEAD))
+    with source:
+        frames = iter(source)
+        next(frames)
+        for index in range(FRAMES_AHEAD + 1, 3 * FRAMES_AHEAD):
+            (tmp_path / f"{index:04d}.png").unlink()
+        # Asked for one at a time: what was still to be read is gone, what was read ahead is not.
+        assert next(frames).index == 1
