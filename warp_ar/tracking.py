@@ -1,0 +1,785 @@
+"""Marker to pose: detection, refinement on every printed edge, steadying without lag, and a state that says what to
+trust.
+
+The world is the marker's frame: origin at the centre of the marker or board, x right and y up the printed page, z out
+of it, metres. A pose is ``camera_from_world``: it maps a world point X to the camera point R X + t; the camera looks
+along +z, x right, y down, and pixel centres lie at integers.
+
+Detection gives four corners, good to about 0.3 pixel: 0.25 degrees for a marker of 90 pixels. The printed pattern gives
+far more: every border between a black and a white cell is a line whose place is known. Refinement therefore slides the
+pose until those borders lie where the image has its edges [HS90], by Gauss-Newton with a redescending weight. Along the
+normal of a border the image is sampled in linear light over a window of half width h; the edge of a step from b to w
+lies, whatever its blur, where the area says:
+
+    e = (1 / (w - b)) * integral of (w - I(u)) du over [-h, h], minus h
+
+No derivative is taken, so noise averages out. What shifts all edges the same way, from black to white, is not motion: a
+clipped white, a transfer curve that is not quite known, ink that spreads. That shift is a seventh unknown.
+
+References:
+    [HS90] C. Harris and C. Stennett. RAPID, a video rate object tracker. BMVC 1990.
+    [CB14] T. Collins and A. Bartoli. Infinitesimal plane-based pose estimation. IJCV 2014: the two poses of a plane, as
+    OpenCV computes them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import re
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeGuard
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_WINDOWS = (7, 23)
+"""Widths in pixels of the two adaptive thresholds: sharp small markers, and large or blurred ones."""
+_ROOM = 0.6
+"""Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
+_TAPS = 9
+"""Samples across an edge."""
+_REACH = (4.0, 3.0, 2.5, 2.5)
+"""Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
+_LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
+"""The same where the pose is only a prediction from earlier frames."""
+_MIN_REACH = 1.0
+"""Pixels: an edge with less room than this to its neighbours is not measured; the blur of one would reach the other."""
+_DONE = 0.05
+"""Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
+a tenth of it."""
+_MIN_EDGES = 16
+"""Fewest measured edge points for a refinement: seven unknowns, and something left to vote."""
+_NOISE_FLOOR = 0.03
+"""Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
+_CORRELATED = 2.0
+"""Neighbouring edge points share pixels, so that many of them count as one."""
+_CORNER_NOISE = 0.5
+"""Pixels: standard deviation of a detected corner where edges are too small to refine."""
+_PATTERN = 0.7
+"""Least correlation of the cells' brightness with the printed pattern."""
+_SUPPORT = 0.4
+"""Least share of the printed edges that must agree with a pose: with less, chance and clutter could."""
+_ALIKE = 3.0
+"""The second pose of a plane is examined when its reprojection error is less than this many times that of the first
+..."""
+_ALIKE_PIXELS = 0.5
+"""... or less than this many pixels larger."""
+_FLIP_EVIDENCE = 12.0
+"""Log likelihood that must pile up against the current one of the two poses before the other is taken: e^12."""
+_FRAME_EVIDENCE = 4.0
+"""Most that one frame may add to it, so that one bad frame cannot flip the pose."""
+_SETTLE = 9.0
+"""Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
+_FORGET = 0.4
+"""Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
+
+
+class MarkerLike(Protocol):
+    """What tracking needs to know of a scene's marker."""
+
+    @property
+    def dictionary(self) -> str: ...  # noqa: D102
+    @property
+    def id(self) -> int: ...  # noqa: D102
+    @property
+    def size(self) -> float: ...  # noqa: D102
+    @property
+    def board(self) -> str | None: ...  # noqa: D102
+
+
+class CameraLike(Protocol):
+    """What tracking needs to know of a scene's camera."""
+
+    @property
+    def width(self) -> int: ...  # noqa: D102
+    @property
+    def height(self) -> int: ...  # noqa: D102
+    @property
+    def distortion(self) -> Sequence[float]: ...  # noqa: D102
+    def matrix(self) -> Array: ...  # noqa: D102
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """A rigid motion; as a tracked pose, ``camera_from_world``: X to R X + t."""
+
+    rotation: Array
+    """Rotation matrix R, float64 (3, 3)."""
+    translation: Array
+    """Translation t, float64 (3,), metres."""
+
+    def inverse(self) -> Pose:
+        """The motion back: from ``camera_from_world`` to ``world_from_camera``."""
+        return Pose(self.rotation.T.copy(), -self.rotation.T @ self.translation)
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 3) mapped by the motion."""
+        return points @ self.rotation.T + self.translation
+
+
+class TrackState(enum.Enum):
+    """What a track's pose rests on."""
+
+    TRACKED = "tracked"
+    """The marker was measured in this frame."""
+    HELD = "held"
+    """Not measured for a moment: the pose is extrapolated from the last measurements, with a velocity that dies
+    away."""
+    LOST = "lost"
+    """Not measured for longer than the hold time: no pose."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Track:
+    """Where the marker is in one frame."""
+
+    pose: Pose | None
+    """``camera_from_world``, or None when lost."""
+    state: TrackState
+    """What the pose rests on."""
+    quality: float
+    """0 to 1: the share of the printed edges that support the pose, lowered by its uncertainty (1 degree or 1 % of
+    distance halve it)."""
+    corners: NDArray[np.float32] | None
+    """Corners of the marker or board in the image under ``pose``, (4, 2) pixels, clockwise from the page's top left;
+    None when lost."""
+    reprojection_error: float
+    """Root mean square distance in pixels between predicted and measured edges (corners, where too small); infinite if
+    not measured."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Detection:
+    """One marker found in an image."""
+
+    id: int
+    """Number in its dictionary."""
+    corners: NDArray[np.float32]
+    """(4, 2) pixels, clockwise from the marker's own top left."""
+
+
+def find_dictionary(name: str) -> Any:
+    """OpenCV's predefined marker dictionary of that name.
+
+    Args:
+        name: such as ``"DICT_4X4_50"`` or ``"DICT_APRILTAG_36h11"``.
+
+    Raises:
+        UsageError: if OpenCV has none of that name.
+    """
+    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if not isinstance(number, int):
+        known = ", ".join(sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_")))
+        raise UsageError(f"marker dictionary: OpenCV has no {name!r}; it has {known}")
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def parse_board(board: str) -> tuple[str, int, int, float, float]:
+    """Kind, columns, rows and the two lengths in metres of ``"charuco 5x7 0.04 0.03"`` or ``"grid 4x3 0.04 0.01"``.
+
+    A ChArUco board has columns x rows squares, the length of a square and that of a marker; a grid has columns x rows
+    markers, the length of a marker and the gap between two.
+
+    Raises:
+        UsageError: if the text is neither, or its lengths are impossible.
+    """
+    match = re.fullmatch(r"\s*(charuco|grid)\s+(\d+)x(\d+)\s+(\S+)\s+(\S+)\s*", board)
+    try:
+        if match is None:
+            raise ValueError
+        kind, columns, rows = match[1], int(match[2]), int(match[3])
+        first, second = float(match[4]), float(match[5])
+    except ValueError:
+        raise UsageError(
+            f'marker board: {board!r} should read like "charuco 5x7 0.04 0.03" (squares, square and marker length in metres) '
+            'or "grid 4x3 0.04 0.01" (markers, marker length and gap in metres)'
+        ) from None
+    fits = 0 < second < first if kind == "charuco" else first > 0 and second > 0
+    if not (fits and np.isfinite([first, second]).all() and columns >= 1 and rows >= 1 and columns * rows >= 2):
+        raise UsageError(
+            f"marker board: {board!r} is impossible: lengths are positive, and a ChArUco marker is smaller than its square"
+        )
+    return kind, columns, rows, first, second
+
+
+def make_board(marker: MarkerLike) -> Any:
+    """OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, y down.
+
+    Raises:
+        UsageError: if the board's text is wrong, or its dictionary holds too few markers.
+    """
+    assert marker.board is not None
+    kind, columns, rows, first, second = parse_board(marker.board)
+    dictionary = find_dictionary(marker.dictionary)
+    needed = columns * rows // 2 if kind == "charuco" else columns * rows
+    if len(dictionary.bytesList) < needed:
+        raise UsageError(
+            f"marker board: {marker.board!r} needs {needed} markers; {marker.dictionary} has {len(dictionary.bytesList)}"
+        )
+    make = cv2.aruco.CharucoBoard if kind == "charuco" else cv2.aruco.GridBoard
+    return make((columns, rows), first, second, dictionary)
+
+
+class MarkerDetector:
+    """Finds every marker of a dictionary in a grey image, with sub-pixel corners; mirrored and inverted prints are not
+    accepted."""
+
+    def __init__(self, dictionary: str) -> None:
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = _WINDOWS
+        parameters.adaptiveThreshWinSizeStep = _WINDOWS[1] - _WINDOWS[0]
+        # Cells read from their middle, at twice OpenCV's resolution, and markers at the border taken: on a real clip of
+        # six markers and 145 frames, 119 frames show all six, where OpenCV's defaults show 95, and no other marker is
+        # seen.
+        parameters.perspectiveRemovePixelPerCell = 8
+        parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
+        parameters.minDistanceToBorder = 0
+        # Measured against path-traced poses, root mean square per coordinate: 0.65 pixel unrefined, 0.75 by contour
+        # lines, 0.28 by gradients (this one), 0.15 by AprilTag's quads once their offset of 0.45 is taken off, at ten
+        # times the cost.
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        self._parameters = parameters
+        self._detector = cv2.aruco.ArucoDetector(find_dictionary(dictionary), parameters)
+
+    def detect(self, gray: Image, smallest: float = 10.0) -> list[Detection]:
+        """Markers in a uint8 (h, w) image, in OpenCV's order.
+
+        Args:
+            gray: the image.
+            smallest: mean edge length in pixels of the smallest marker of interest; most time goes into what is
+                smaller.
+        """
+        # OpenCV counts in shares of the longer image side.
+        self._parameters.minMarkerPerimeterRate = 4 * smallest / max(gray.shape)
+        self._detector.setDetectorParameters(self._parameters)
+        corners, ids, _ = self._detector.detectMarkers(gray)
+        if ids is None:
+            return []
+        return [
+            Detection(int(i), np.asarray(c, np.float32).reshape(4, 2))
+            for i, c in zip(np.ravel(ids), corners, strict=True)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pattern:
+    """The print as geometry, in the world's frame: m edge points, c cells."""
+
+    markers: dict[int, Array]
+    """Corners (4, 3) of each marker by its id, clockwise from top left."""
+    outline: Array
+    """Corners (4, 3) of the whole."""
+    points: Array
+    """Points on the borders between black and white, (m, 3)."""
+    tangents: Array
+    """Unit direction of the border at each point, (m, 3)."""
+    normals: Array
+    """Unit direction toward white, (m, 3)."""
+    rooms: Array
+    """Distance to the nearest parallel border, (m,) metres."""
+    cells: Array
+    """Centres of cells, (c, 3)."""
+    white: Array
+    """1 where a cell is white, 0 where black, (c,)."""
+
+
+def _cell_edges(cells: NDArray[np.bool_], left: float, top: float, size: float, room: float) -> list[tuple[float, ...]]:
+    """Borders between neighbouring cells that differ, as rows of middle (x, y), tangent, normal toward white, length
+    and room."""
+    edges: list[tuple[float, ...]] = []
+    for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
+        sign = 1.0 if cells[row, column + 1] else -1.0
+        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, room))
+    for row, column in np.argwhere(cells[1:] != cells[:-1]):
+        sign = -1.0 if cells[row + 1, column] else 1.0
+        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, room))
+    return edges
+
+
+@functools.cache
+def _make_pattern(dictionary: str, id: int, size: float, board: str | None) -> _Pattern:
+    book = find_dictionary(dictionary)
+    bits = int(book.markerSize) + 2
+
+    def cells_of(number: int) -> NDArray[np.bool_]:
+        image = cv2.aruco.generateImageMarker(book, number, bits, borderBits=1)
+        return np.pad(np.asarray(image) > 127, 1, constant_values=True)
+
+    edges: list[tuple[float, ...]] = []
+    if board is None:
+        if not 0 <= id < len(book.bytesList):
+            raise UsageError(f"marker id: {dictionary} has ids 0 to {len(book.bytesList) - 1}, not {id}")
+        if not (np.isfinite(size) and size > 0):
+            raise UsageError(f"marker size: {size} should be the edge length in metres, above 0")
+        h = size / 2
+        places, width, height, margin = {id: (-h, h)}, size, size, size / bits
+    else:
+        spec = _BoardSpec(dictionary, id, size, board)
+        kind, columns, rows, first, second = parse_board(board)
+        print_ = make_board(spec)
+        length, gap = (second, (first - second) / 2) if kind == "charuco" else (first, second)
+        right, bottom = (float(v) for v in np.asarray(print_.getRightBottomCorner()).ravel()[:2])
+        width, height = right, bottom
+        places = {
+            int(number): (float(corners[0][0]) - width / 2, height / 2 - float(corners[0][1]))
+            for number, corners in zip(np.ravel(print_.getIds()), print_.getObjPoints(), strict=True)
+        }
+        size, margin = length, min(gap, length / bits)
+        if kind == "charuco":
+            # The top left square is black, in OpenCV's layout since 4.6.
+            squares = (np.add.outer(np.arange(rows), np.arange(columns)) % 2).astype(bool)
+            edges += _cell_edges(squares, -width / 2, height / 2, first, min(gap, first / 2))
+    cell = size / bits
+    centres, white = [], []
+    for number, (left, top) in places.items():
+        pattern = cells_of(number)
+        edges += _cell_edges(pattern, left - cell, top + cell, cell, min(cell, margin))
+        rows_, columns_ = np.indices((bits, bits))
+        centres.append(
+            np.stack([left + (columns_ + 0.5) * cell, top - (rows_ + 0.5) * cell, 0.0 * rows_], -1).reshape(-1, 3)
+        )
+        white.append(pattern[1:-1, 1:-1].ravel())
+    table = np.array(edges, float)
+    # Inner points of an edge only: its ends are corners, where another edge's blur is near.
+    count = int(np.clip(240 // len(table), 1, 4))
+    along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
+    table = np.repeat(table[:: max(1, len(table) // 400)], count, axis=0)
+    shift = np.tile(along, len(table) // count) * table[:, 6]
+    flat = np.zeros((len(table), 1))
+    tangents, normals = np.hstack([table[:, 2:4], flat]), np.hstack([table[:, 4:6], flat])
+    corners = {n: _square(x + size / 2, y - size / 2, size, size) for n, (x, y) in places.items()}
+    return _Pattern(
+        markers=corners,
+        outline=_square(0.0, 0.0, width, height),
+        points=np.hstack([table[:, :2], flat]) + tangents * shift[:, None],
+        tangents=tangents,
+        normals=normals,
+        rooms=table[:, 7],
+        cells=np.concatenate(centres),
+        white=np.concatenate(white).astype(float),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _BoardSpec:
+    dictionary: str
+    id: int
+    size: float
+    board: str | None
+
+
+def _square(x: float, y: float, width: float, height: float) -> Array:
+    w, h = width / 2, height / 2
+    return np.array([[x - w, y + h, 0.0], [x + w, y + h, 0.0], [x + w, y - h, 0.0], [x - w, y - h, 0.0]])
+
+
+def _rotation(vector: Array) -> Array:
+    return np.asarray(cv2.Rodrigues(np.asarray(vector, float))[0], float)
+
+
+def _log(rotation: Array) -> Array:
+    """Rotation vector of a matrix, of length 0 to pi: no sign to choose, as there would be with a quaternion."""
+    return np.asarray(cv2.Rodrigues(rotation)[0], float).ravel()
+
+
+def _difference(a: Pose, b: Pose) -> Array:
+    """(6,) rotation vector w and translation d with a = (exp(w) b.R, b.t + d)."""
+    return np.concatenate([_log(a.rotation @ b.rotation.T), a.translation - b.translation])
+
+
+def _moved(pose: Pose, step: Array) -> Pose:
+    return Pose(_rotation(step[:3]) @ pose.rotation, pose.translation + step[3:6])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """A pose measured in one frame."""
+
+    pose: Pose
+    information: Array
+    """(6, 6): inverse covariance of rotation vector and translation about the pose."""
+    error: float
+    """Root mean square residual, pixels."""
+    support: float
+    """0 to 1: share of the printed edges that agree."""
+    cost: float
+    """Robust mean squared residual, pixels squared."""
+    pattern: float
+    """Correlation of the cells' brightness with the print."""
+    edges: bool
+    """Whether it rests on edges; else on the detected corners only."""
+
+
+class Tracker:
+    """Follows one marker or board through a sequence of frames.
+
+    Args:
+        marker: what to follow.
+        camera: pinhole and distortion as OpenCV has them.
+        hold: seconds for which the pose is extrapolated after the last measurement.
+        steady: whether to steady the pose over time. The steadied pose strays from the measured one by no more than
+            about the measurement's own uncertainty: a still marker stands still, a moving one does not lag.
+        linear: (256,) linear value of each 8-bit code; the sRGB curve if left out.
+
+    Raises:
+        UsageError: if the marker does not exist.
+    """
+
+    def __init__(
+        self,
+        marker: MarkerLike,
+        camera: CameraLike,
+        *,
+        hold: float = 0.2,
+        steady: bool = True,
+        linear: NDArray[Any] | None = None,
+    ) -> None:
+        self._pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+        self._detector = MarkerDetector(marker.dictionary)
+        self._shape = (camera.height, camera.width)
+        self._matrix = np.asarray(camera.matrix(), float)
+        self._distortion = np.asarray(camera.distortion, float).ravel()
+        self._hold, self._steady = hold, steady
+        code = np.arange(256) / 255.0
+        srgb = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        self._linear = np.asarray(srgb if linear is None else linear, np.float32).reshape(256)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget every earlier frame."""
+        self._pose: Pose | None = None
+        self._velocity = np.zeros(6)
+        self._time = -np.inf
+        self._quality = 0.0
+        self._evidence = 0.0
+        self._rival = False
+
+    def track(self, image: Image, time: float) -> Track:
+        """Find the marker in the next frame.
+
+        Args:
+            image: uint8 (height, width, 3) RGB, or (height, width) grey.
+            time: seconds, growing from frame to frame.
+
+        Raises:
+            UsageError: if the image is not of the camera's size and 8-bit.
+        """
+        if image.dtype != np.uint8 or image.shape[:2] != self._shape or image.shape[2:] not in ((), (3,)):
+            h, w = self._shape
+            raise UsageError(f"image: {image.dtype} {image.shape} should be uint8 ({h}, {w}, 3), the camera's size")
+        if not 0 <= time - self._time <= self._hold:
+            self.reset()  # too long ago to say anything, or a clock that ran backwards
+        guess = self._predict(time)
+        fit = self._measure(image, guess)
+        if fit is None:
+            return self._without(guess, time)
+        pose, quality = self._steadied(fit, guess, time), self._judge(fit)
+        if self._pose is not None:
+            elapsed = max(time - self._time, 1e-3)
+            self._velocity = _difference(pose, self._pose) / elapsed
+        self._pose, self._time, self._quality = pose, time, quality
+        return Track(pose, TrackState.TRACKED, quality, self._outline(pose), fit.error)
+
+    def _without(self, guess: Pose | None, time: float) -> Track:
+        if guess is None:
+            return Track(None, TrackState.LOST, 0.0, None, np.inf)
+        quality = self._quality * (1 - (time - self._time) / self._hold) if self._hold > 0 else 0.0
+        return Track(guess, TrackState.HELD, float(np.clip(quality, 0, 1)), self._outline(guess), np.inf)
+
+    def _predict(self, time: float) -> Pose | None:
+        """The last pose moved on: the velocity halves over the hold time, so that a lost marker does not fly away."""
+        if self._pose is None:
+            return None
+        elapsed = time - self._time
+        decay = np.log(2) / max(self._hold, 1e-3)
+        guess = _moved(self._pose, self._velocity * (-np.expm1(-decay * elapsed) / decay))
+        return guess if guess.apply(self._pattern.outline)[:, 2].min() > 0 else self._pose
+
+    def _project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (n, 2) of camera points (n, 3), and their derivative (n, 2, 3) by the camera point."""
+        # With no rotation and no translation, OpenCV's derivative by translation is the one by the point.
+        zero = np.zeros(3)
+        pixels, jacobian = cv2.projectPoints(points, zero, zero, self._matrix, self._distortion)
+        return pixels.reshape(-1, 2), np.asarray(jacobian)[:, 3:6].reshape(-1, 2, 3)
+
+    def _outline(self, pose: Pose) -> NDArray[np.float32]:
+        return self._project(pose.apply(self._pattern.outline))[0].astype(np.float32)
+
+    def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
+        """The marker's pose in this image alone; ``guess`` only says where to look, and which of two like poses to
+        prefer."""
+        if guess is not None:
+            box = self._around(self._outline(guess))
+            gray = _gray(image[box])
+            found = self._detect(gray, (box[1].start, box[0].start), self._smallest(guess))
+            fit = self._fit_detections(gray, (box[1].start, box[0].start), found, guess)
+            if fit is None or not fit.edges:
+                # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
+                # there.
+                fit = self._fit_guess(gray, (box[1].start, box[0].start), guess) or fit
+            if fit is not None:
+                return fit
+        gray = _gray(image)
+        found = self._detect(gray, (0, 0))
+        self._rival = len(found) > len({d.id for d in found})
+        return self._fit_detections(gray, (0, 0), found, guess)
+
+    def _around(self, outline: NDArray[np.float32]) -> tuple[slice, slice]:
+        """Rows and columns of the image around a marker's outline, never empty."""
+        low, high = outline.min(0), outline.max(0)
+        room = _ROOM * float((high - low).max()) + 16
+        h, w = self._shape
+        (x0, y0), (x1, y1) = np.clip(low - room, 0, (w - 32, h - 32)), np.clip(high + room, 32, (w, h))
+        return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
+
+    def _smallest(self, guess: Pose) -> float:
+        """Edge length in pixels below which nothing is a marker where one is expected at ``guess``."""
+        sides = [self._project(guess.apply(c))[0] for c in self._pattern.markers.values()]
+        return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
+
+    def _detect(self, gray: Image, origin: tuple[int, int], smallest: float = 10.0) -> list[Detection]:
+        """The followed markers in a part of the image that starts at pixel ``origin`` (x, y), in pixels of the
+        whole."""
+        found = [d for d in self._detector.detect(gray, max(smallest, 10.0)) if d.id in self._pattern.markers]
+        return [Detection(d.id, d.corners + np.asarray(origin, np.float32)) for d in found]
+
+    def _fit_detections(
+        self, gray: Image, origin: tuple[int, int], found: list[Detection], guess: Pose | None
+    ) -> _Fit | None:
+        found = self._chosen(found, guess)
+        if not found:
+            return None
+        corners = np.concatenate([d.corners for d in found]).astype(float)
+        points = np.concatenate([self._pattern.markers[d.id] for d in found])
+        candidates = self._plane_poses(points, corners)
+        if not candidates:
+            return None
+        (first, error), *rest = candidates
+        fits = [self._refined(gray, origin, first, points, corners)]
+        fits += [
+            self._refined(gray, origin, p, points, corners)
+            for p, e in rest
+            if e < max(_ALIKE * error, error + _ALIKE_PIXELS)
+        ]
+        good = [fit for fit in fits if fit.pattern >= _PATTERN]
+        return self._preferred(good, guess) if good else None
+
+    def _chosen(self, found: list[Detection], guess: Pose | None) -> list[Detection]:
+        """One detection per id: the one nearest to where it is expected, else the largest."""
+        if len(found) < 2:
+            return found
+
+        def rank(d: Detection) -> float:
+            if guess is None:
+                return -abs(float(cv2.contourArea(d.corners)))
+            expected = self._project(guess.apply(self._pattern.markers[d.id]))[0]
+            return float(np.linalg.norm(d.corners - expected, axis=1).mean())
+
+        best: dict[int, Detection] = {}
+        for d in sorted(found, key=rank):
+            best.setdefault(d.id, d)
+        return list(best.values())
+
+    def _plane_poses(self, points: Array, corners: Array) -> list[tuple[Pose, float]]:
+        """Both poses of a plane [CB14] that face the camera, with reprojection errors in pixels, best first."""
+        try:
+            _, rotations, translations, _ = cv2.solvePnPGeneric(
+                points, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error:  # corners on one line
+            return []
+        poses = []
+        for r, t in zip(rotations, translations, strict=True):
+            pose = Pose(_rotation(r), np.asarray(t, float).ravel())
+            ahead = pose.apply(self._pattern.outline)[:, 2].min() > 0 if np.isfinite([r, t]).all() else False
+            if ahead and pose.rotation[:, 2] @ pose.translation < 0:  # z comes out of the page, toward the camera
+                residual = self._project(pose.apply(points))[0] - corners
+                poses.append((pose, float(np.sqrt((residual**2).sum(1).mean()))))
+        return sorted(poses, key=lambda p: p[1])
+
+    def _preferred(self, fits: list[_Fit], guess: Pose | None) -> _Fit:
+        """One of the two poses of a plane: the better in this frame, unless earlier frames speak for the other."""
+        if guess is None or len(fits) < 2:
+            self._evidence = 0.0
+            return min(fits, key=lambda f: f.cost)
+        near, far = sorted(fits, key=lambda f: float(np.linalg.norm(_difference(f.pose, guess)[:3])))
+        noise = max(min(near.cost, far.cost), _NOISE_FLOOR**2)
+        independent = 0.5 * len(self._pattern.points) / _CORRELATED
+        against = float(np.clip(independent * (near.cost - far.cost) / noise, -_FRAME_EVIDENCE, _FRAME_EVIDENCE))
+        self._evidence = max(self._evidence + against, 0.0)
+        if self._evidence < _FLIP_EVIDENCE:
+            return near
+        self._evidence = 0.0
+        return far
+
+    def _refined(self, gray: Image, origin: tuple[int, int], pose: Pose, points: Array, corners: Array) -> _Fit:
+        """The pose fitted to the edges, or to the corners where the edges are too small to be measured."""
+        fit = self._fit_edges(gray, origin, pose, _REACH)
+        if _holds(fit):
+            return fit
+        camera = pose.apply(points)
+        pixels, jacobian = self._project(camera)
+        residual = pixels - corners
+        rows = _pose_rows(jacobian, camera - pose.translation).reshape(-1, 6)
+        information = rows.T @ rows / _CORNER_NOISE**2
+        cost = float((residual**2).mean())
+        pattern = self._correlation(_linear_part(gray, self._linear), origin, pose)
+        return _Fit(pose, information, float(np.sqrt(2 * cost)), 0.5, cost, pattern, edges=False)
+
+    def _fit_guess(self, gray: Image, origin: tuple[int, int], guess: Pose) -> _Fit | None:
+        fit = self._fit_edges(gray, origin, guess, _LOST_REACH)
+        return fit if _holds(fit) else None
+
+    def _fit_edges(self, gray: Image, origin: tuple[int, int], pose: Pose, reaches: Sequence[float]) -> _Fit | None:
+        """Gauss-Newton on the printed edges from ``pose``; None where too few are seen."""
+        pattern = self._pattern
+        part = _linear_part(gray, self._linear)
+        taps = np.linspace(-1.0, 1.0, _TAPS)
+        # Trapezoid rule over [-1, 1]; each end's level is the mean of its two outermost samples.
+        weights = np.full(_TAPS, 2.0 / (_TAPS - 1))
+        weights[[0, -1]] /= 2
+        for reach in reaches:
+            camera = pose.apply(pattern.points)
+            if camera[:, 2].min() <= 1e-6:
+                return None
+            pixels, jacobian = self._project(camera)
+            along = (jacobian @ (pattern.tangents @ pose.rotation.T)[..., None])[..., 0]
+            across = (jacobian @ (pattern.normals @ pose.rotation.T)[..., None])[..., 0]
+            normal = (
+                np.stack([-along[:, 1], along[:, 0]], -1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+            )
+            width = (normal * across).sum(1)
+            normal *= np.sign(width)[:, None]
+            half = np.minimum(0.45 * np.abs(width) * pattern.rooms, reach)
+            at = (pixels - origin)[:, None, :] + (half[:, None] * taps)[..., None] * normal[:, None, :]
+            h, w = gray.shape
+            ends = at[:, [0, -1]]
+            inside = ((ends >= 0) & (ends <= (w - 1, h - 1))).all((1, 2)) & (half >= _MIN_REACH)
+            if inside.sum() < _MIN_EDGES:
+                return None
+            at32 = at.astype(np.float32)
+            values = cv2.remap(
+                part, at32[..., 0], at32[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ).astype(float)
+            black, white = 0.5 * (values[:, 0] + values[:, 1]), 0.5 * (values[:, -2] + values[:, -1])
+            contrast = white - black
+            typical = float(np.median(contrast[inside]))
+            seen = inside & (contrast > max(0.3 * typical, 1e-4))
+            if seen.sum() < _MIN_EDGES:
+                return None
+            area = (2 * white - values @ weights) / np.where(seen, contrast, 1.0)  # the weights sum to 2
+            offset = np.clip(half * (area - 1.0), -half, half)
+            rows = (normal[:, None, :] @ _pose_rows(jacobian, camera - pose.translation))[:, 0]
+            solved = _solve(rows[seen], offset[seen])
+            if solved is None:
+                return None
+            step, residual, keep, information = solved
+            pose = _moved(pose, step)
+            if reach == reaches[-1] or (reach <= reaches[1] and np.abs(rows[seen] @ step).max() < _DONE):
+                break
+        if pose.apply(pattern.outline)[:, 2].min() <= 0 or pose.rotation[:, 2] @ pose.translation >= 0:
+            return None
+        error = float(np.sqrt((keep * residual**2).sum() / keep.sum()))
+        support = float(keep.sum() / len(pattern.points))
+        cost = float(np.minimum(residual**2, 1.0).mean())
+        return _Fit(pose, information, error, support, cost, self._correlation(part, origin, pose), edges=True)
+
+    def _correlation(self, part: NDArray[np.float32], origin: tuple[int, int], pose: Pose) -> float:
+        """Correlation, -1 to 1, of the brightness at cell centres with the print; 0 where it cannot be seen."""
+        camera = pose.apply(self._pattern.cells)
+        if camera[:, 2].min() <= 1e-6:
+            return 0.0
+        at = (self._project(camera)[0] - origin).astype(np.float32)
+        h, w = part.shape
+        inside = ((at >= 0) & (at <= (w - 1, h - 1))).all(1)
+        if inside.sum() < 8:
+            return 0.0
+        values = cv2.remap(part, at[inside, 0], at[inside, 1], cv2.INTER_LINEAR).ravel().astype(float)
+        # Lamps' reflections and sparkle must not outvote the print.
+        values = np.clip(values, *np.percentile(values, (5, 95)))
+        a, b = values - values.mean(), self._pattern.white[inside] - self._pattern.white[inside].mean()
+        scale = np.sqrt((a @ a) * (b @ b))
+        return float(a @ b / scale) if scale > 1e-9 else 0.0
+
+    def _steadied(self, fit: _Fit, guess: Pose | None, time: float) -> Pose:
+        """The measured pose, averaged with the last one as far as both agree within the measurement's own noise.
+
+        With innovation x of information L, s = x'Lx / 6 is 1 on average where nothing moved. Taking the share s / (s +
+        c) of x leaves c x / (s + c): at most half of sqrt(c) standard deviations, however the camera moves.
+        """
+        if self._pose is None or guess is None or not self._steady:
+            return fit.pose
+        step = _difference(fit.pose, self._pose)
+        deviation = float(step @ fit.information @ step) / 6
+        share = max(deviation / (deviation + _SETTLE), -np.expm1(-(time - self._time) / _FORGET))
+        return _moved(self._pose, share * step)
+
+    def _judge(self, fit: _Fit) -> float:
+        """Quality from what supports the pose and how well it is determined."""
+        deviations = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fit.information)), 0.0))
+        turn = float(np.degrees(np.linalg.norm(deviations[:3])))
+        shift = float(np.linalg.norm(deviations[3:]) / np.linalg.norm(fit.pose.translation)) * 100
+        quality = min(1.0, fit.support / 0.9) / (1.0 + turn**2 + shift**2)
+        return float(np.clip(quality * (0.5 if self._rival else 1.0), 0.0, 1.0))
+
+
+def _holds(fit: _Fit | None) -> TypeGuard[_Fit]:
+    return fit is not None and fit.support >= _SUPPORT and fit.pattern >= _PATTERN
+
+
+def _gray(image: Image) -> Image:
+    gray = np.ascontiguousarray(image) if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return np.asarray(gray, np.uint8)
+
+
+def _linear_part(gray: Image, linear: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.LUT(gray, linear), np.float32)
+
+
+def _pose_rows(jacobian: Array, arm: Array) -> Array:
+    """Derivative (n, 2, 6) of pixels by a pose's rotation vector and translation; ``arm`` is R X.
+
+    exp(w) R X + t + d moves by w x RX + d, so a row j of the derivative by the point gives (RX x j, j).
+    """
+    x, y, z = arm.T[:, :, None]
+    a, b, c = np.moveaxis(jacobian, 2, 0)
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], -1)
+
+
+def _solve(rows: Array, offset: Array) -> tuple[Array, Array, Array, Array] | None:
+    """Robust least squares of ``rows @ step + shift = offset``.
+
+    Returns:
+        Pose step (6,), residuals after it, weights 0 to 1, and the information (6, 6) of the pose with the common shift
+        marginalised; None if singular.
+    """
+    design = np.hstack([rows, np.ones((len(rows), 1))])
+    # The common shift is a fraction of a pixel; without inner edges it cannot be told from distance.
+    prior = np.zeros(7)
+    prior[6] = 1.0
+    weights: Array = np.ones(len(rows))
+    solution: Array = np.zeros(7)
+    for _ in range(3):
+        weighted = design * weights[:, None]
+        normal = weighted.T @ design + np.diag(prior)
+        try:
+            solution = np.linalg.solve(normal, weighted.T @ offset)
+        except np.linalg.LinAlgError:
+            return None
+        residual = offset - design @ solution
+        spread = max(
+            1.4826 * float(np.partition(np.abs(residual), len(residual) // 2)[len(residual) // 2]), _NOISE_FLOOR
+        )
+        # Tukey's weight: an edge that is covered, or lies under a reflection, must not pull at all.
+        weights = np.square(np.maximum(1 - np.square(residual / (4.7 * spread)), 0.0))
+    normal = (design * weights[:, None]).T @ design + np.diag(prior)
+    information = (normal[:6, :6] - np.outer(normal[:6, 6], normal[6, :6]) / normal[6, 6]) / (_CORRELATED * spread**2)
+    return (solution[:6], residual, weights, information) if np.isfinite(solution).all() else None
