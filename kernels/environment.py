@@ -1,0 +1,848 @@
+"""The room's light over time, whole, and its dominant directions.
+
+**Accumulation.** Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x with confidence c:
+
+    m += a (x - m),   a = a0 c / (a0 c + (1 - a0) k),   a0 = 1 - exp(-time_step / tau):
+
+the plain exponential mean where c = k, quicker where the new view is the better one, slower where it is the worse, and nothing at c = 0. A
+texel that was never seen takes x whole. The form m + a (x - m) is exact where x = m: nothing drifts. k is drawn toward c in the same way
+and fades with ``FORGET_TIME``, so that what has not been seen for long gives way to what is.
+
+tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of the tracked pose make
+large differences of both signs in single texels; a change of the room moves a whole neighbourhood one way, and stays. So the signed mean
+of x - m is taken over cells of ``CELL_SIZE`` texels squared, and what counts is its smaller value in two successive frames of one sign: one
+corrupt frame is worth no haste, and is forgotten as fast as it came.
+
+**Filling.** What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go means of radiance
+weighted by confidence and solid angle, up again each texel is completed from its coarser level, as far as it lacks confidence. Both are
+normalised, and in forms that are exact for equal values: a constant room stays constant under any mask. Texels of a coarser level cover
+shares of finer ones by exact overlap, so every size works. Without any confidence there is no light: the map is zero.
+
+**Key lights.** With the mean radiance L0 of the map, a texel's excess max(lum L - lum L0, 0) is what makes it a light; a uniform room has none.
+Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have left over: the best of the 8 x 16 cells' directions, pulled
+to the centre of its lobe by mean shifts with ever narrower kernels (max(cos, 0), cos^2, cos^8, then the texels within ``LOBE_OUTER``), and at last to
+the centroid of what is brighter than half the lobe's peak. Starting broad keeps the centre of a window half a sky wide where it is.
+
+A direction s dominates as far as the light's flow goes its way and no rival stands elsewhere. With V = integral of L d and the scalar
+irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first order (the cosine lobe's first two
+bands, pi and 2 pi / 3), so facets toward and away from s differ by (E(s) - E(-s)) / (E(s) + E(-s)) = 2 V . s / phi: the contrast that relief
+shows. It is 0 in a uniform room and between two equal opposite lights, 1 (held there) for a sun and still for a window that is half a black
+sky; a lamp that gives a share q of the light of an otherwise uniform room has 2 q. Where two lights are of one strength, which is the
+brighter is an accident of noise, and a picture that follows it would flicker; the dominance
+
+    D_k = clamp(2 V . s_k / phi, 0, 1) * min over j of (1 - min(1, E_j / E_k) min(1, 2 (1 - s_j . s_k)))
+
+is 0 there if they are 60 degrees apart or more, and hardly less if they are neighbours, between which a change of place is small.
+
+References:
+    [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle, wrap_texel
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import FrameParams, KeyLight
+
+wp.set_module_options({"enable_backward": False})
+
+FOLLOW_TIME = wp.constant(wp.float32(0.15))
+"""Time constant of accumulation in seconds: after half a second 4 % of a small change are left."""
+HASTE = wp.constant(wp.float32(6.0))
+"""How much faster a significant change is followed."""
+FORGET_TIME = wp.constant(wp.float32(20.0))
+"""Time constant in seconds with which the confidence of what is not seen fades."""
+CELL_SIZE = 8
+"""Texels along the side of a cell in which change is measured."""
+LEAST_CHANGE = wp.constant(wp.float32(0.03))
+MOST_CHANGE = wp.constant(wp.float32(0.15))
+"""Relative change of a cell's mean at which haste begins and is full."""
+DARK = wp.constant(wp.float32(0.01))
+"""Radiance below which changes count as noise."""
+
+FULL_TRUST = wp.constant(wp.float32(0.5))
+"""Confidence above which a texel is kept as it is."""
+SUPPORT = wp.constant(wp.float32(4.0))
+"""A coarser texel is fully trusted once a quarter of it is: smaller holes are then filled from nearby only."""
+
+CHANGE_FLOOR = 0.0005
+CHANGE_SHARE = 0.01
+"""An environment has changed once some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one 8-bit step. Any
+normalised filter F of the map with weights that are not negative (a mirror's sample, a glossy lobe, irradiance / pi) is then off by at most
+``CHANGE_FLOOR + CHANGE_SHARE * F`` while its readers do not run."""
+
+KEY_LIGHT_COUNT = 4
+CELL_ROWS = wp.constant(8)
+CELL_COLUMNS = wp.constant(16)
+KEY_CELLS = wp.constant(CELL_ROWS * CELL_COLUMNS)
+LOBE_INNER = wp.constant(wp.float32(math.cos(math.radians(20.0))))
+LOBE_OUTER = wp.constant(wp.float32(math.cos(math.radians(40.0))))
+"""Cosines of the angles up to which a texel belongs to a light whole, and at all."""
+LOBE_ANGLE = wp.constant(wp.float32(math.radians(40.0)))
+SEGMENTS = wp.constant(4)
+KEY_BLOCK = 256  # as other launches: another size would compile the whole module a second time
+MAX_KEY_LIGHTS = 4
+
+mat43 = wp.types.matrix(shape=(MAX_KEY_LIGHTS, 3), dtype=wp.float32)
+
+
+@wp.func
+def luminance(radiance: wp.vec3) -> wp.float32:
+    """Rec. 709 luminance of linear RGB."""
+    return 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
+
+
+@wp.func
+def brightness(radiance: wp.vec3) -> wp.float32:
+    """Mean of the channels: where change of any colour counts alike."""
+    return (radiance[0] + radiance[1] + radiance[2]) / 3.0
+
+
+@wp.func
+def is_finite(value: wp.vec3) -> wp.bool:
+    """Whether all three are numbers."""
+    return wp.isfinite(value[0]) and wp.isfinite(value[1]) and wp.isfinite(value[2])
+
+
+@wp.func
+def smooth_ramp(low: wp.float32, high: wp.float32, x: wp.float32) -> wp.float32:
+    """0 below low, 1 above high, smooth between; 0 for NaN."""
+    t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
+    return wp.where(x > low, t * t * (3.0 - 2.0 * t), 0.0)
+
+
+@wp.func
+def usable_confidence(value: wp.vec3, confidence: wp.float32) -> wp.float32:
+    """Confidence of a texel; 0 where it or its value is not a number."""
+    if confidence > 0.0 and is_finite(value):
+        return wp.min(confidence, 1.0)
+    return 0.0
+
+
+# ---- accumulation -------------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def measure_change_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    environment: wp.array2d[wp.vec3],
+    environment_confidence: wp.array2d[wp.float32],
+    # Out:
+    change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
+):
+    band_row, cell_column = wp.tid()
+    cell_row = row_start + band_row
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    difference = wp.float32(0.0)
+    level = wp.float32(0.0)
+    for i in range(cell_row * height // change_out.shape[0], (cell_row + 1) * height // change_out.shape[0]):
+        area = texel_solid_angle(i, height, width)
+        for j in range(cell_column * width // change_out.shape[1], (cell_column + 1) * width // change_out.shape[1]):
+            x = radiance[i, j]
+            m = environment[i, j]
+            weight = area * wp.min(
+                usable_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j])
+            )
+            if weight > 0.0:
+                new = brightness(x)
+                old = brightness(m)
+                difference += weight * (new - old)
+                level += weight * (wp.max(new, old) + DARK)
+    change = wp.float32(0.0)
+    if level > 0.0:
+        change = difference / level
+    if not wp.isfinite(change):
+        change = 0.0
+    change_out[cell_row, cell_column] = wp.vec2(change, change_out[cell_row, cell_column][0])
+
+
+@wp.func
+def lasting_change(change: wp.array2d[wp.vec2], row: wp.int32, column: wp.int32) -> wp.float32:
+    """Size of a cell's change as far as two frames agree on it; rows end at the poles, columns wrap."""
+    width = change.shape[1]
+    c = change[wp.clamp(row, 0, change.shape[0] - 1), (column + width) % width]
+    if c[0] * c[1] <= 0.0:
+        return 0.0
+    return wp.min(wp.abs(c[0]), wp.abs(c[1]))
+
+
+@wp.kernel(enable_backward=False)
+def accumulate_environment_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    clipped: wp.array2d[wp.vec3],
+    change: wp.array2d[wp.vec2],
+    params: wp.array[FrameParams],
+    # Out:
+    environment_out: wp.array2d[wp.vec3],
+    confidence_out: wp.array2d[wp.float32],
+    clipped_out: wp.array2d[wp.vec3],
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    x = radiance[i, j]
+    c = usable_confidence(x, confidence[i, j])
+    m = environment_out[i, j]
+    share = clipped_out[i, j]
+    k = usable_confidence(m, confidence_out[i, j])
+    if params[0].environment_reset != 0 or k == 0.0 or not is_finite(share):
+        k = 0.0
+        m = wp.vec3(0.0, 0.0, 0.0)
+        share = wp.vec3(0.0, 0.0, 0.0)
+    time_step = params[0].time_step
+    if not (time_step > 0.0):
+        time_step = 0.0
+
+    # Cells are blended bilinearly: no edges between them.
+    y = (wp.float32(i) + 0.5) * wp.float32(change.shape[0]) / wp.float32(radiance.shape[0]) - 0.5
+    z = (wp.float32(j) + 0.5) * wp.float32(change.shape[1]) / wp.float32(radiance.shape[1]) - 0.5
+    row = wp.int32(wp.floor(y))
+    column = wp.int32(wp.floor(z))
+    fz = z - wp.floor(z)
+    above = wp.lerp(lasting_change(change, row, column), lasting_change(change, row, column + 1), fz)
+    below = wp.lerp(lasting_change(change, row + 1, column), lasting_change(change, row + 1, column + 1), fz)
+    significance = smooth_ramp(LEAST_CHANGE, MOST_CHANGE, wp.lerp(above, below, y - wp.floor(y)))
+
+    rate = 1.0 - wp.exp(-time_step / FOLLOW_TIME * (1.0 + (HASTE - 1.0) * significance))
+    a = wp.float32(0.0)
+    if c > 0.0:
+        a = 1.0
+        if k > 0.0:
+            a = rate * c / (rate * c + (1.0 - rate) * k)
+        m = m + a * (x - m)
+        share = share + a * (clipped[i, j] - share)
+    k = k * wp.exp(-time_step / FORGET_TIME)
+    environment_out[i, j] = m
+    confidence_out[i, j] = k + a * (c - k)
+    clipped_out[i, j] = share
+
+
+def change_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of the cells in which change is measured for a map of this size."""
+    return max(1, height // CELL_SIZE), max(1, width // CELL_SIZE)
+
+
+def measure_change(
+    radiance: wp.array,
+    confidence: wp.array,
+    environment: wp.array,
+    environment_confidence: wp.array,
+    change_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Signed relative change of each cell between the accumulated light and a frame's.
+
+    Args:
+        radiance: This frame's light, ``wp.vec3`` (h, w).
+        confidence: Its confidence, ``wp.float32`` (h, w).
+        environment: Accumulated light, ``wp.vec3`` (h, w).
+        environment_confidence: Its confidence, ``wp.float32`` (h, w).
+        change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
+        rows: Band of cell rows, None for all.
+    """
+    launch_rows(
+        measure_change_kernel,
+        change_out.shape,
+        [radiance, confidence, environment, environment_confidence],
+        [change_out],
+        rows=rows,
+        device=change_out.device,
+    )
+
+
+def accumulate_environment(
+    radiance: wp.array,
+    confidence: wp.array,
+    clipped: wp.array,
+    change: wp.array,
+    params: wp.array,
+    environment_out: wp.array,
+    confidence_out: wp.array,
+    clipped_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
+
+    Args:
+        radiance: This frame's light, ``wp.vec3`` (h, w).
+        confidence: Its confidence, ``wp.float32`` (h, w); 0 or NaN: not seen.
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        change: From ``measure_change``.
+        params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
+        environment_out: Accumulated light, ``wp.vec3`` (h, w).
+        confidence_out: Its confidence, ``wp.float32`` (h, w).
+        clipped_out: Its share at clipping, ``wp.vec3`` (h, w).
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        accumulate_environment_kernel,
+        environment_out.shape,
+        [radiance, confidence, clipped, change, params],
+        [environment_out, confidence_out, clipped_out],
+        rows=rows,
+        device=environment_out.device,
+    )
+
+
+# ---- filling ------------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> wp.float32:
+    """Solid angle of the rows from start to stop per unit of longitude; a product of sines: no cancellation."""
+    half = 0.5 * PI / wp.float32(height)
+    return 2.0 * wp.sin((start + stop) * half) * wp.sin((stop - start) * half)
+
+
+@wp.func
+def sample_level_row(
+    levels: wp.array[wp.vec4], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.int32, x: wp.float32
+) -> wp.vec3:
+    """Linear sample along one row of a level, across the seam and the poles; see ``latlong.sample_row``."""
+    r = row
+    at = x
+    if r < 0:
+        r = -1 - r
+        at += 0.5 * wp.float32(width)
+    elif r >= height:
+        r = 2 * height - 1 - r
+        at += 0.5 * wp.float32(width)
+    left = wp.floor(at)
+    first = wrap_texel(r, wp.int32(left), height, width)
+    second = wrap_texel(r, wp.int32(left) + 1, height, width)
+    a = levels[offset + first[0] * width + first[1]]
+    b = levels[offset + second[0] * width + second[1]]
+    t = at - left
+    return wp.vec3(a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
+
+
+@wp.kernel(enable_backward=False)
+def seed_fill_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    # Out:
+    levels_out: wp.array[wp.vec4],  # radiance and trust
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    value = radiance[i, j]
+    trust = smooth_ramp(0.0, FULL_TRUST, usable_confidence(value, confidence[i, j]))
+    if trust == 0.0:
+        value = wp.vec3(0.0, 0.0, 0.0)
+    levels_out[i * radiance.shape[1] + j] = wp.vec4(
+        wp.max(value[0], 0.0), wp.max(value[1], 0.0), wp.max(value[2], 0.0), trust
+    )
+
+
+@wp.kernel(enable_backward=False)
+def pull_level_kernel(
+    # In:
+    row_start: wp.int32,
+    fine_offset: wp.int32,
+    fine_height: wp.int32,
+    fine_width: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    top = wp.float32(i * fine_height) / wp.float32(height)
+    bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
+    left = wp.float32(j * fine_width) / wp.float32(width)
+    right = wp.float32((j + 1) * fine_width) / wp.float32(width)
+    mean = wp.vec3(0.0, 0.0, 0.0)
+    total = wp.float32(0.0)
+    area = wp.float32(0.0)
+    for r in range(wp.int32(top), wp.min(wp.int32(wp.ceil(bottom)), fine_height)):
+        band = band_solid_angle(wp.max(top, wp.float32(r)), wp.min(bottom, wp.float32(r + 1)), fine_height)
+        for c in range(wp.int32(left), wp.min(wp.int32(wp.ceil(right)), fine_width)):
+            part = band * (wp.min(right, wp.float32(c + 1)) - wp.max(left, wp.float32(c)))
+            texel = levels_out[fine_offset + r * fine_width + c]
+            area += part
+            weight = part * texel[3]
+            if weight > 0.0:
+                total += weight
+                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)
+    levels_out[offset + i * width + j] = wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
+
+
+@wp.func
+def completed(
+    levels: wp.array[wp.vec4],
+    i: wp.int32,
+    j: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+) -> wp.vec3:
+    """A texel, completed from the coarser level as far as it lacks trust."""
+    texel = levels[offset + i * width + j]
+    value = wp.vec3(texel[0], texel[1], texel[2])
+    if texel[3] < 1.0 and coarse_height > 0:
+        y = (wp.float32(i) + 0.5) * wp.float32(coarse_height) / wp.float32(height) - 0.5
+        x = (wp.float32(j) + 0.5) * wp.float32(coarse_width) / wp.float32(width) - 0.5
+        row = wp.floor(y)
+        above = sample_level_row(levels, coarse_offset, coarse_height, coarse_width, wp.int32(row), x)
+        below = sample_level_row(levels, coarse_offset, coarse_height, coarse_width, wp.int32(row) + 1, x)
+        value += (1.0 - texel[3]) * (above + (y - row) * (below - above) - value)
+    return value
+
+
+@wp.kernel(enable_backward=False)
+def push_level_kernel(
+    # In:
+    row_start: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
+    # Trust stays: nothing reads it again but this texel.
+    levels_out[offset + i * width + j] = wp.vec4(value[0], value[1], value[2], 1.0)
+
+
+@wp.kernel(enable_backward=False)
+def finish_fill_kernel(
+    # In:
+    row_start: wp.int32,
+    levels: wp.array[wp.vec4],
+    coarse_offset: wp.int32,
+    coarse_height: wp.int32,
+    coarse_width: wp.int32,
+    # Out:
+    environment_out: wp.array2d[wp.vec3],
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    environment_out[i, j] = completed(
+        levels, i, j, 0, environment_out.shape[0], environment_out.shape[1], coarse_offset, coarse_height, coarse_width
+    )
+
+
+@wp.kernel(enable_backward=False)
+def measure_difference_kernel(
+    # In:
+    row_start: wp.int32,
+    environment: wp.array2d[wp.vec3],
+    published: wp.array2d[wp.vec3],
+    floor: wp.float32,
+    share: wp.float32,
+    # Out:
+    difference_out: wp.array[wp.float32],
+):
+    i = row_start + wp.tid()
+    largest = wp.float32(0.0)
+    for j in range(environment.shape[1]):
+        new = environment[i, j]
+        old = published[i, j]
+        for channel in range(3):
+            largest = wp.max(largest, wp.abs(new[channel] - old[channel]) / (floor + share * wp.abs(old[channel])))
+    difference_out[i] = largest
+
+
+def fill_level_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
+    """Rows and columns of the fill pyramid's levels, from the map itself to a single texel."""
+    shapes = [(height, width)]
+    while shapes[-1] != (1, 1):
+        rows, columns = shapes[-1]
+        shapes.append(((rows + 1) // 2, (columns + 1) // 2))
+    return tuple(shapes)
+
+
+def fill_level_offsets(height: int, width: int) -> tuple[int, ...]:
+    """Where each level starts in the packed array, and as last number the array's length."""
+    return (0, *itertools.accumulate(rows * columns for rows, columns in fill_level_shapes(height, width)))
+
+
+def seed_fill(radiance: wp.array, confidence: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Write level 0 of the fill pyramid.
+
+    Args:
+        radiance: Light that is known in part, ``wp.vec3`` (h, w).
+        confidence: ``wp.float32`` (h, w) in 0..1.
+        levels_out: ``wp.vec4`` (``fill_level_offsets(h, w)[-1]``): radiance and trust.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        seed_fill_kernel, radiance.shape, [radiance, confidence], [levels_out], rows=rows, device=radiance.device
+    )
+
+
+def push_pull(levels_out: wp.array, height: int, width: int) -> None:
+    """Build the coarser levels of a seeded fill pyramid and complete them, all but level 0.
+
+    Args:
+        levels_out: As ``seed_fill`` left it; changed in place.
+        height: Rows of level 0.
+        width: Columns of level 0.
+    """
+    shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
+    device = levels_out.device
+    levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
+    for fine, coarse in itertools.pairwise(levels):
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+    for coarse, fine in itertools.pairwise(reversed(levels[1:])):
+        launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+
+
+def finish_fill(levels: wp.array, environment_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Complete level 0 into the map that everything reads.
+
+    Args:
+        levels: As ``push_pull`` left it.
+        environment_out: ``wp.vec3`` (h, w): finite, not negative; zero if nothing at all is known.
+        rows: Band of rows, None for all.
+    """
+    height, width = environment_out.shape
+    shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
+    coarse = (offsets[1], *shapes[1]) if len(shapes) > 1 else (0, 0, 0)
+    launch_rows(
+        finish_fill_kernel,
+        environment_out.shape,
+        [levels, *coarse],
+        [environment_out],
+        rows=rows,
+        device=environment_out.device,
+    )
+
+
+def measure_difference(
+    environment: wp.array,
+    published: wp.array,
+    difference_out: wp.array,
+    *,
+    floor: float = CHANGE_FLOOR,
+    share: float = CHANGE_SHARE,
+    rows: Rows | None = None,
+) -> None:
+    """Largest change of each row against a map that readers have seen, in units of what is tolerated.
+
+    Args:
+        environment: ``wp.vec3`` (h, w).
+        published: ``wp.vec3`` (h, w).
+        difference_out: ``wp.float32`` (h): largest |difference| / (floor + share * published); above 1 it has changed.
+        floor: Tolerated change of a black texel.
+        share: Tolerated relative change.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        measure_difference_kernel,
+        (environment.shape[0],),
+        [environment, published, floor, share],
+        [difference_out],
+        rows=rows,
+        device=environment.device,
+    )
+
+
+# ---- key lights ---------------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def sum_rows_kernel(
+    # In:
+    row_start: wp.int32,
+    environment: wp.array2d[wp.vec3],
+    # Out:
+    sums_out: wp.array[wp.vec4],  # luminance times direction, and luminance, over the row's solid angle
+):
+    i = row_start + wp.tid()
+    height = environment.shape[0]
+    width = environment.shape[1]
+    moment = wp.vec3(0.0, 0.0, 0.0)
+    total = wp.float32(0.0)
+    at = direction_from_latlong(wp.float32(i) + 0.5, 0.5, height, width)
+    cos_step = wp.cos(2.0 * PI / wp.float32(width))
+    sin_step = wp.sin(2.0 * PI / wp.float32(width))
+    for j in range(width):
+        value = luminance(environment[i, j])
+        moment += value * at
+        total += value
+        at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
+    area = texel_solid_angle(i, height, width)
+    sums_out[i] = wp.vec4(area * moment[0], area * moment[1], area * moment[2], area * total)
+
+
+@wp.func
+def sum_all(sums: wp.array[wp.vec4]) -> wp.vec4:
+    """Vector irradiance and scalar irradiance of the whole map."""
+    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for i in range(sums.shape[0]):
+        total += sums[i]
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def sum_cells_kernel(
+    # In:
+    environment: wp.array2d[wp.vec3],
+    sums: wp.array[wp.vec4],
+    # Out:
+    cells_out: wp.array[wp.vec3],  # excess luminance times direction, over the cell's solid angle
+):
+    cell = wp.tid()
+    cell_row = cell // CELL_COLUMNS
+    cell_column = cell % CELL_COLUMNS
+    height = environment.shape[0]
+    width = environment.shape[1]
+    mean = sum_all(sums)[3] / (4.0 * PI)
+    cos_step = wp.cos(2.0 * PI / wp.float32(width))
+    sin_step = wp.sin(2.0 * PI / wp.float32(width))
+    start = cell_column * width // CELL_COLUMNS
+    stop = (cell_column + 1) * width // CELL_COLUMNS
+    moment = wp.vec3(0.0, 0.0, 0.0)
+    for i in range(cell_row * height // CELL_ROWS, (cell_row + 1) * height // CELL_ROWS):
+        area = texel_solid_angle(i, height, width)
+        at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
+        for j in range(start, stop):
+            moment += area * wp.max(luminance(environment[i, j]) - mean, 0.0) * at
+            at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
+    cells_out[cell] = moment
+
+
+@wp.func
+def lobe_window(cosine: wp.float32) -> wp.float32:
+    """How far a texel at an angle with this cosine from a light belongs to it."""
+    return smooth_ramp(LOBE_OUTER, LOBE_INNER, cosine)
+
+
+@wp.func
+def left_over(direction: wp.vec3, found: mat43, count: wp.int32) -> wp.float32:
+    """Share of a texel that no light found so far has taken."""
+    share = wp.float32(1.0)
+    for k in range(count):
+        share *= 1.0 - lobe_window(wp.dot(direction, wp.vec3(found[k, 0], found[k, 1], found[k, 2])))
+    return share
+
+
+@wp.func
+def block_sum(value: wp.vec4) -> wp.vec4:
+    """Sum over the block's threads, known to all of them."""
+    total = wp.tile_sum(wp.tile(value, preserve_type=True))
+    return total[0]
+
+
+@wp.func
+def shift_on_cells(
+    cells: wp.array[wp.vec3], found: mat43, count: wp.int32, direction: wp.vec3, power: wp.int32
+) -> wp.vec3:
+    """One mean shift with the kernel max(cos, 0)^power, power 1, 2 or 8."""
+    sum = wp.vec3(0.0, 0.0, 0.0)
+    for cell in range(KEY_CELLS):
+        moment = cells[cell]
+        size = wp.length(moment)
+        if size > 0.0:
+            at = moment / size
+            cosine = wp.max(wp.dot(at, direction), 0.0)
+            weight = cosine
+            if power >= 2:
+                weight = cosine * cosine
+            if power >= 8:
+                weight = weight * weight
+                weight = weight * weight
+            sum += (weight * left_over(at, found, count)) * moment
+    if wp.length(sum) > 0.0:
+        return wp.normalize(sum)
+    return direction
+
+
+@wp.kernel(enable_backward=False)
+def find_key_lights_kernel(
+    # In:
+    environment: wp.array2d[wp.vec3],
+    sums: wp.array[wp.vec4],
+    cells: wp.array[wp.vec3],
+    # Out:
+    key_lights_out: wp.array[KeyLight],
+):
+    _block, thread = wp.tid()
+    threads = wp.block_dim()
+    height = environment.shape[0]
+    width = environment.shape[1]
+    all = sum_all(sums)
+    flow = wp.vec3(all[0], all[1], all[2])
+    mean = all[3] / (4.0 * PI)
+    cos_step = wp.cos(2.0 * PI / wp.float32(width))
+    sin_step = wp.sin(2.0 * PI / wp.float32(width))
+    found = mat43()
+    strengths = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    reds = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    greens = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    blues = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    count = key_lights_out.shape[0]
+
+    for k in range(count):
+        # The cell's direction in which a surface receives most; the first of equals, whatever the number of threads.
+        best = wp.float32(0.0)
+        best_cell = wp.float32(KEY_CELLS)
+        candidate = thread
+        while candidate < KEY_CELLS:
+            toward = direction_from_latlong(
+                wp.float32(candidate // CELL_COLUMNS) + 0.5,
+                wp.float32(candidate % CELL_COLUMNS) + 0.5,
+                CELL_ROWS,
+                CELL_COLUMNS,
+            )
+            received = wp.float32(0.0)
+            for cell in range(KEY_CELLS):
+                moment = cells[cell]
+                facing = wp.dot(moment, toward)
+                if facing > 0.0:
+                    received += facing * left_over(wp.normalize(moment), found, k)
+            if received > best:
+                best = received
+                best_cell = wp.float32(candidate)
+            candidate += threads
+        most = wp.tile_max(wp.tile(best))
+        if best < most[0]:
+            best_cell = wp.float32(KEY_CELLS)
+        first = wp.tile_min(wp.tile(best_cell))
+        direction = wp.vec3(0.0, 0.0, 1.0)
+        lit = most[0] > 0.0
+        if lit:
+            chosen = wp.int32(first[0])
+            direction = direction_from_latlong(
+                wp.float32(chosen // CELL_COLUMNS) + 0.5,
+                wp.float32(chosen % CELL_COLUMNS) + 0.5,
+                CELL_ROWS,
+                CELL_COLUMNS,
+            )
+            for step in range(6):
+                power = wp.where(step < 2, 1, wp.where(step < 4, 2, 8))
+                direction = shift_on_cells(cells, found, k, direction, power)
+
+        # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of what is brighter than half the peak;
+        # 3: what the lobe gives.
+        peak = wp.float32(0.0)
+        for step in range(4):
+            sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
+            highest = wp.float32(0.0)
+            theta = wp.atan2(wp.length(wp.vec2(direction[0], direction[1])), direction[2])
+            first_row = wp.max(wp.int32((theta - LOBE_ANGLE) / PI * wp.float32(height)), 0)
+            last_row = wp.min(wp.int32((theta + LOBE_ANGLE) / PI * wp.float32(height)), height - 1)
+            if not lit:
+                last_row = first_row - 1
+            item = thread
+            while item < (last_row - first_row + 1) * SEGMENTS:
+                i = first_row + item // SEGMENTS
+                start = item % SEGMENTS * width // SEGMENTS
+                stop = (item % SEGMENTS + 1) * width // SEGMENTS
+                area = texel_solid_angle(i, height, width)
+                at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
+                for j in range(start, stop):
+                    cosine = wp.dot(at, direction)
+                    if cosine > LOBE_OUTER:
+                        value = environment[i, j]
+                        excess = wp.max(luminance(value) - mean, 0.0)
+                        if excess > 0.0:
+                            share = lobe_window(cosine) * left_over(at, found, k)
+                            weight = area * share * excess
+                            if step == 2:
+                                weight = area * share * wp.max(excess - 0.5 * peak, 0.0)
+                            if step < 3:
+                                highest = wp.max(highest, share * excess)
+                                sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
+                            else:
+                                # Light above the room's mean, in the texel's own colour.
+                                given = (weight / luminance(value) * cosine) * value
+                                sum += wp.vec4(given[0], given[1], given[2], 0.0)
+                    at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
+                item += threads
+            total = block_sum(sum)
+            top = wp.tile_max(wp.tile(highest))
+            if step < 3:
+                peak = top[0]
+                centre = wp.vec3(total[0], total[1], total[2])
+                if wp.length(centre) > 0.0:
+                    direction = wp.normalize(centre)
+            else:
+                reds[k] = total[0]
+                greens[k] = total[1]
+                blues[k] = total[2]
+                strengths[k] = luminance(wp.vec3(total[0], total[1], total[2]))
+        for axis in range(3):
+            found[k, axis] = direction[axis]
+
+    if thread == 0:
+        taken = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        for place in range(count):
+            # Brightest first; of equals the one that was found first.
+            pick = wp.int32(-1)
+            for k in range(count):
+                if taken[k] == 0.0:
+                    if pick < 0:
+                        pick = k
+                    elif strengths[k] > strengths[pick]:
+                        pick = k
+            taken[pick] = 1.0
+            light = KeyLight()
+            light.direction = wp.vec3(found[pick, 0], found[pick, 1], found[pick, 2])
+            light.irradiance = wp.vec3(reds[pick], greens[pick], blues[pick])
+            light.dominance = 0.0
+            if strengths[pick] > 0.0:
+                alone = wp.float32(1.0)
+                for k in range(count):
+                    if k != pick:
+                        rival = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
+                        apart = wp.min(1.0, 2.0 * (1.0 - wp.dot(rival, light.direction)))
+                        alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * wp.max(apart, 0.0))
+                light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
+            key_lights_out[place] = light
+
+
+def find_key_lights(
+    environment: wp.array, sums_out: wp.array, cells_out: wp.array, key_lights_out: wp.array
+) -> None:
+    """Find the dominant directions of the room's light, brightest first.
+
+    Args:
+        environment: ``wp.vec3`` (h, w), finite and not negative.
+        sums_out: Scratch, ``wp.vec4`` (h).
+        cells_out: Scratch, ``wp.vec3`` (``CELL_ROWS * CELL_COLUMNS``).
+        key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0 and looks toward +z.
+
+    Raises:
+        ValueError: More lights were asked for than can be found.
+    """
+    if not 1 <= len(key_lights_out) <= MAX_KEY_LIGHTS:
+        raise ValueError(f"key_lights_out has {len(key_lights_out)} places; expected 1 to {MAX_KEY_LIGHTS}")
+    device = environment.device
+    launch_rows(sum_rows_kernel, (environment.shape[0],), [environment], [sums_out], rows=None, device=device)
+    wp.launch(sum_cells_kernel, dim=CELL_ROWS * CELL_COLUMNS, inputs=[environment, sums_out], outputs=[cells_out], device=device)
+    wp.launch_tiled(
+        find_key_lights_kernel,
+        dim=[1],
+        inputs=[environment, sums_out, cells_out],
+        outputs=[key_lights_out],
+        block_dim=KEY_BLOCK,
+        device=device,
+    )
