@@ -1,0 +1,73 @@
+"""Consistent light for augmented reality, in NVIDIA Warp kernels.
+
+A mirror ball beside a printed marker captures the room's light; that light shades virtual objects, and virtual lights fall on the real
+desk. ``Session`` opens a scene and lights its frames; ``Pipeline`` lights frames of one's own; the launchers of single steps are in
+``warp_ar.kernels``. Importing this package does not initialise Warp.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
+    from warp_ar.graph import Plan, make_plan
+    from warp_ar.pipeline import Pipeline, Result
+    from warp_ar.quality import PRESETS, Quality
+    from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
+    from warp_ar.session import Session
+    from warp_ar.sinks import open_sink, read_environment, write_environment
+    from warp_ar.sources import Frame, open_source
+    from warp_ar.tracking import Pose, Tracker, TrackState
+
+_HOMES = {
+    "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),
+    "graph": ("Plan", "make_plan"),
+    "pipeline": ("Pipeline", "Result"),
+    "quality": ("PRESETS", "Quality"),
+    "scene": ("Scene", "bundled_scenes", "dumps_scene", "load_scene"),
+    "session": ("Session",),
+    "sinks": ("open_sink", "read_environment", "write_environment"),
+    "sources": ("Frame", "open_source"),
+    "tracking": ("Pose", "TrackState", "Tracker"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "PRESETS",
+    "Frame",
+    "Pipeline",
+    "Plan",
+    "Pose",
+    "Quality",
+    "Result",
+    "Scene",
+    "SceneError",
+    "Session",
+    "SinkError",
+    "SourceError",
+    "TrackState",
+    "Tracker",
+    "UsageError",
+    "WarpArError",
+    "bundled_scenes",
+    "dumps_scene",
+    "load_scene",
+    "make_plan",
+    "open_sink",
+    "open_source",
+    "read_environment",
+    "write_environment",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for only when it is: a scene can be read without loading OpenCV's or Warp's libraries."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
