@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+import re
 import struct
 import zipfile
 import zlib
@@ -36,6 +37,9 @@ MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 # vertices on one line come out at 1e-16 in float64, and the thinnest sliver that float32 can hold on purpose at 1e-7.
 _ZERO_AREA: Final = 1e-12
 
+# The square of a position, and what a scene's scale may do to it, stay in single precision.
+_LARGEST: Final = 1e12
+
 # What trimesh and Pillow have been seen to raise on damaged files; its readers do not document it.
 _LOADER_ERRORS: Final = (
     ValueError,
@@ -46,6 +50,10 @@ _LOADER_ERRORS: Final = (
     ArithmeticError,
     OSError,
     NotImplementedError,
+    NameError,
+    SyntaxError,
+    EOFError,
+    BufferError,
     ImportError,  # an encoding or compression that needs a package which is not there
     RecursionError,
     MemoryError,
@@ -298,8 +306,9 @@ def load_mesh(path: str | Path) -> Mesh:
         The mesh, in the file's own axes and units.
 
     Raises:
-        SceneError: The file is missing, damaged or of another format, holds no triangle, a vertex that is not finite,
-            or a face with an index out of range.
+        SceneError: The file or a texture that it names is missing, damaged or of another format, or the mesh holds no
+            triangle, a vertex that is not finite, or a face with an index out of range. An OBJ without its MTL file is
+            a mesh without texture.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -316,6 +325,8 @@ def load_mesh(path: str | Path) -> Mesh:
     except _LOADER_ERRORS as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
+    if path.suffix.lower() == ".obj" and any(part.image is None for part in parts):
+        _check_obj_texture(path)
     if not parts:
         raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
     return _join(path, parts)
@@ -338,6 +349,8 @@ def _read_part(path: Path, scene: Any, node: str) -> _Part | None:
     geometry = scene.geometry[name]
     faces = np.asarray(getattr(geometry, "faces", ()), dtype=np.int64)
     linear = np.asarray(transform, dtype=np.float64)[:3, :3]
+    if not (np.abs(transform) < _LARGEST).all():
+        raise SceneError(f"{path}: node {node!r} has a transform that is not finite")
     determinant = np.linalg.det(linear)
     if faces.size == 0 or determinant == 0.0:
         return None
@@ -345,10 +358,13 @@ def _read_part(path: Path, scene: Any, node: str) -> _Part | None:
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = int(faces.max() if faces.max() >= len(vertices) else faces.min())
         raise SceneError(f"{path}: a face has vertex index {wrong}; there are {len(vertices)} vertices, counted from 0")
-    vertices = vertices @ linear.T + np.asarray(transform)[:3, 3]
-    if not np.isfinite(vertices.astype(np.float32)).all():
-        row = int(np.argmin(np.isfinite(vertices.astype(np.float32)).all(axis=1)))
-        raise SceneError(f"{path}: vertex {row} is {vertices[row].tolist()}; positions must be finite")
+    finite = (np.abs(vertices) < _LARGEST).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise SceneError(
+            f"{path}: vertex {row} is {vertices[row].tolist()}; positions must be finite, below {_LARGEST:g}"
+        )
+    vertices = vertices @ linear.T + np.asarray(transform, dtype=np.float64)[:3, 3]
     if determinant < 0.0:
         faces = faces[:, ::-1]
     computed = smooth_normals(vertices, faces)
@@ -365,7 +381,21 @@ def _read_part(path: Path, scene: Any, node: str) -> _Part | None:
         uvs = uvs if len(uvs) == len(vertices) and np.isfinite(uvs).all() else None
     material = getattr(geometry.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    return _Part(vertices, faces, normals, uvs, image if uvs is not None else None)
+    # Where a file has coordinates but no texture, trimesh makes a grey one up; only pictures from files have a format.
+    if uvs is None or getattr(image, "format", None) is None:
+        image = None
+    return _Part(vertices, faces, normals, uvs, image)
+
+
+def _check_obj_texture(path: Path) -> None:
+    """Say which texture of an OBJ file is missing: trimesh leaves it out without a word."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        library = next((line.split(maxsplit=1)[1].strip() for line in lines if re.match(r"mtllib\s+\S", line)), None)
+    if library is None or not (path.parent / library).is_file():
+        return
+    text = (path.parent / library).read_text(encoding="utf-8", errors="replace")
+    for name in re.findall(r"(?im)^[ \t]*map_Kd[ \t]+(\S.*?)[ \t]*$", text):
+        load_texture(path.parent / name)
 
 
 def _join(path: Path, parts: list[_Part]) -> Mesh:
