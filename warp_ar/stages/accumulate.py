@@ -1,0 +1,70 @@
+"""The light of successive frames becomes the light of the room."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import environment
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.unwrap import NO_PROBE
+
+
+class Accumulate(Stage):
+    """Running mean over time, keyed to confidence; follows real changes faster than noise."""
+
+    name: ClassVar[str] = "accumulate"
+    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Needs a mirror ball."""
+        if not request.scene.probes:
+            return LeftOut(NO_PROBE)
+        return Wiring(
+            ("probe_radiance", "probe_confidence", "probe_clipped", "clock"),
+            ("environment_radiance", "environment_confidence", "environment_clipped"),
+        )
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The accumulated maps, and the change of each cell."""
+        height = self.request.quality.environment_height
+        shape = (height, 2 * height)
+        return {
+            "environment_radiance": ArraySpec(shape, wp.vec3),
+            "environment_confidence": ArraySpec(shape, wp.float32),
+            "environment_clipped": ArraySpec(shape, wp.vec3),
+            "accumulate_change": ArraySpec(environment.change_shape(*shape), wp.vec2),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Change first, then the mean."""
+        height = self.request.quality.environment_height
+
+        def measure(rows: Rows | None) -> None:
+            environment.measure_change(
+                arrays["probe_radiance"],
+                arrays["probe_confidence"],
+                arrays["environment_radiance"],
+                arrays["environment_confidence"],
+                arrays["accumulate_change"],
+                rows=rows,
+            )
+
+        def accumulate(rows: Rows | None) -> None:
+            environment.accumulate_environment(
+                arrays["probe_radiance"],
+                arrays["probe_confidence"],
+                arrays["probe_clipped"],
+                arrays["accumulate_change"],
+                arrays["params"],
+                arrays["environment_radiance"],
+                arrays["environment_confidence"],
+                arrays["environment_clipped"],
+                rows=rows,
+            )
+
+        return [Pass(measure), Pass(accumulate, rows=height)]

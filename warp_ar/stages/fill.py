@@ -1,0 +1,75 @@
+"""What no ball shows is filled in from what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import environment
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.unwrap import NO_PROBE
+
+
+class Fill(Stage):
+    """The complete map that everything downstream reads."""
+
+    name: ClassVar[str] = "fill"
+    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "completes the blind cone and hidden parts from confident neighbours"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Needs a mirror ball."""
+        if not request.scene.probes:
+            return LeftOut(NO_PROBE)
+        return Wiring(("environment_radiance", "environment_confidence"), ("environment",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The map, the fill pyramid, and what readers have seen."""
+        height = self.request.quality.environment_height
+        shape = (height, 2 * height)
+        return {
+            "environment": ArraySpec(shape, wp.vec3),
+            "fill_levels": ArraySpec((environment.fill_level_offsets(*shape)[-1],), wp.vec4),
+            "fill_published": ArraySpec(shape, wp.vec3),
+            "fill_difference": ArraySpec((height,), wp.float32),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Down the pyramid, up again, and the change against what readers have seen (on CPU, where it can be read for nothing)."""
+        self._arrays = arrays
+        self._on_cpu = device.is_cpu
+        height = self.request.quality.environment_height
+
+        def seed(rows: Rows | None) -> None:
+            environment.seed_fill(
+                arrays["environment_radiance"], arrays["environment_confidence"], arrays["fill_levels"], rows=rows
+            )
+
+        def push_pull(rows: Rows | None) -> None:
+            environment.push_pull(arrays["fill_levels"], height, 2 * height)
+
+        def finish(rows: Rows | None) -> None:
+            environment.finish_fill(arrays["fill_levels"], arrays["environment"], rows=rows)
+
+        def measure(rows: Rows | None) -> None:
+            environment.measure_difference(
+                arrays["environment"], arrays["fill_published"], arrays["fill_difference"], rows=rows
+            )
+
+        passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
+        return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
+
+    def changed(self, name: str) -> bool:
+        """Whether some texel moved by more than ``environment.CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
+
+        On CUDA always: to know it there, the host would have to wait for the device.
+        """
+        if not self._on_cpu:
+            return True
+        if not self._arrays["fill_difference"].numpy().max() > 1.0:
+            return False
+        wp.copy(self._arrays["fill_published"], self._arrays["environment"])
+        return True
