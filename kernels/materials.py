@@ -1,16 +1,21 @@
 """What surfaces do with light: textures, and four reflection models under virtual lights and under the room's light.
 
-Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. For
-virtual lights a model gives the reflected radiance per irradiance of a surface that *faces* the light, so the cosine is
-part of it. For the room it gives radiance from the prefiltered environment.
+Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. Every
+model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the room's light that is
+
+    diffuse E(normal) / pi + reflectance L(mirror direction, width of the lobe),
+
+E the irradiance, L the prefiltered environment; under a virtual light it is the reflected radiance per irradiance of a
+surface that *faces* the light, so the cosine is part of it.
 
 Phong is used in its radiance form: what is seen is the mean of the incoming radiance, weighted by (n + 1) / (2 pi)
-cos^n around the mirror direction. The weight integrates to 1, so the lobe neither gains energy at any exponent nor
-loses it above the horizon; a small far light shades the same whether it is part of the environment or a virtual light.
+cos^n around the mirror direction. The weight integrates to 1 at any exponent, so a small far light shades the same
+whether it is part of the environment or a virtual light.
 
 Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, Schlick's Fresnel with
-F0 = 0.04 for what is no metal, Lambert weighted by 1 - F below it; one scattering event, as glTF and the usual path
-tracers have it.
+F0 = 0.04 for what is no metal. Two things that glTF leaves open are settled by energy: light that scatters more than
+once between the facets is put back [Tur19], and the diffuse part gets what the facets let pass, 1 - (their directional
+albedo), rather than 1 - F of one facet. A white surface in a white room is white, at any roughness.
 
 References:
     [LW94] Lafortune, Willems, "Using the Modified Phong Reflectance Model for Physically Based Rendering", CW 197,
@@ -18,7 +23,7 @@ References:
     [WMLT07] Walter et al., "Microfacet Models for Refraction through Rough Surfaces", EGSR 2007.
     [Hei14] Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014.
     [glTF] Khronos, glTF 2.0 specification, appendix B.
-    [Kar13] Karis, "Real Shading in Unreal Engine 4", SIGGRAPH 2013 course.
+    [Tur19] Turquin, "Practical Multiple Scattering Compensation for Microfacet Models", 2019.
 """
 
 from __future__ import annotations
@@ -27,7 +32,8 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Material, RayScene
+from warp_ar.kernels.prefilter import energy_compensation, sample_dfg
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, MIRROR, PHONG, RayScene
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,14 +52,15 @@ MIN_COSINE = wp.constant(wp.float32(1.0e-4))
 
 @wp.struct
 class Surface:
-    """A material at one point, textures looked up."""
+    """A material at one point seen from one direction: textures looked up, energy divided."""
 
     model: wp.int32
-    base_color: wp.vec3
-    specular: wp.vec3
-    shininess: wp.float32
-    metallic: wp.float32
-    roughness: wp.float32
+    diffuse: wp.vec3  # Lambertian reflectance of what the lobe leaves
+    reflectance: wp.vec3  # of the lobe, under light from everywhere
+    f0: wp.vec3  # METALLIC_ROUGHNESS: reflectance of a facet at normal incidence
+    gain: wp.vec3  # METALLIC_ROUGHNESS: factor for light that scatters more than once
+    shininess: wp.float32  # PHONG
+    roughness: wp.float32  # METALLIC_ROUGHNESS; perceptual
 
 
 @wp.func
@@ -79,24 +86,51 @@ def sample_texture(scene: RayScene, index: wp.int32, uv: wp.vec2) -> wp.vec3:
 
 
 @functools.cache
-def make_surface(textures: bool) -> wp.Function:
-    """``surface_at(scene, material_index, uv) -> Surface``; without textures no lookup is compiled in."""
+def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
+    """``surface_at(scene, dfg, material, uv, cos_o) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.
 
-    @wp.func(name=f"surface_at_{int(textures)}", module="unique")
-    def surface_at(scene: RayScene, index: wp.int32, uv: wp.vec2) -> Surface:
+    Args:
+        models: Sorted models that exist.
+        textures: Whether any material has a texture.
+    """
+    label = "_".join(map(str, models))
+
+    @wp.func(name=f"surface_at_{label}_{int(textures)}", module="unique")
+    def surface_at(
+        scene: RayScene, dfg: wp.array2d[wp.vec2], index: wp.int32, uv: wp.vec2, cos_o: wp.float32
+    ) -> Surface:
         material = scene.materials[index]
-        surface = Surface()
-        surface.model = material.model
-        surface.base_color = material.base_color
-        surface.specular = material.specular
-        surface.shininess = material.shininess
-        surface.metallic = material.metallic
-        surface.roughness = material.roughness
+        base = material.base_color
+        specular = material.specular
         if wp.static(textures):
             if material.base_texture >= 0:
-                surface.base_color = wp.cw_mul(surface.base_color, sample_texture(scene, material.base_texture, uv))
+                base = wp.cw_mul(base, sample_texture(scene, material.base_texture, uv))
             if material.specular_texture >= 0:
-                surface.specular = wp.cw_mul(surface.specular, sample_texture(scene, material.specular_texture, uv))
+                specular = wp.cw_mul(specular, sample_texture(scene, material.specular_texture, uv))
+        surface = Surface()
+        surface.model = material.model
+        surface.diffuse = base
+        if wp.static(PHONG in models):
+            if material.model == PHONG:
+                surface.reflectance = specular
+                surface.shininess = material.shininess
+        if wp.static(MIRROR in models):
+            if material.model == MIRROR:
+                surface.diffuse = wp.vec3(0.0)
+                surface.reflectance = base
+        if wp.static(METALLIC_ROUGHNESS in models):
+            if material.model == METALLIC_ROUGHNESS:
+                one = wp.vec3(1.0, 1.0, 1.0)
+                metallic = material.metallic
+                scale_bias = sample_dfg(dfg, cos_o, material.roughness)
+                dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * energy_compensation(
+                    scale_bias, DIELECTRIC_F0 * one
+                )
+                surface.f0 = DIELECTRIC_F0 * (1.0 - metallic) * one + metallic * base
+                surface.gain = energy_compensation(scale_bias, surface.f0)
+                surface.reflectance = wp.cw_mul(scale_bias[0] * surface.f0 + scale_bias[1] * one, surface.gain)
+                surface.diffuse = (1.0 - metallic) * wp.cw_mul(base, one - dielectric)
+                surface.roughness = material.roughness
         return surface
 
     return surface_at
@@ -127,9 +161,7 @@ def phong_lobe(mirror: wp.vec3, wi: wp.vec3, exponent: wp.float32) -> wp.float32
 
 
 @wp.func
-def ggx_lobe(
-    normal: wp.vec3, half: wp.vec3, cos_i: wp.float32, cos_o: wp.float32, roughness: wp.float32
-) -> wp.float32:
+def ggx_lobe(normal: wp.vec3, half: wp.vec3, cos_i: wp.float32, cos_o: wp.float32, roughness: wp.float32) -> wp.float32:
     """GGX distribution times Smith visibility, D V = D G / (4 cos_i cos_o), without Fresnel.
 
     With s^2 = |n x h|^2 for 1 - (n.h)^2, D = k^2 / pi, k = alpha / (s^2 + alpha^2 (n.h)^2): equal to [WMLT07] eq. 33,
@@ -154,28 +186,12 @@ def schlick(cosine: wp.float32) -> wp.float32:
     return x * x * x * x * x
 
 
-@wp.func
-def mean_schlick(cos_o: wp.float32) -> wp.float32:
-    """Mean of ``schlick(wo.h)`` over light from everywhere, cosine-weighted: what Fresnel takes from the diffuse part.
-
-    g(cos_o) = 1 / pi int (1 - wo.h)^5 cos_i dwi has no closed form; this quartic follows its quadrature within 1e-5.
-    """
-    c = wp.clamp(cos_o, 0.0, 1.0)
-    return 0.02816409 + c * (-0.07984867 + c * (0.08643933 + c * (-0.04364023 + c * 0.00896795)))
-
-
-@wp.func
-def specular_f0(surface: Surface) -> wp.vec3:
-    """Reflectance at normal incidence of a metallic-roughness surface."""
-    m = surface.metallic
-    return wp.vec3(DIELECTRIC_F0 * (1.0 - m)) + m * surface.base_color
-
-
 @functools.cache
 def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
     """``reflect_direct(surface, normal, wo, wi) -> vec3`` for the given models; zero unless the light is in front.
 
-    The result times ``LightSample.irradiance_normal`` is radiance.
+    The result times ``LightSample.irradiance_normal`` is radiance. A mirror would show the light itself, and a light
+    without extent is nothing to see.
     """
     label = "_".join(map(str, models))
 
@@ -184,13 +200,10 @@ def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
         cos_i = wp.dot(normal, wi)
         result = wp.vec3(0.0)
         if cos_i > 0.0:
-            if wp.static(LAMBERT in models):
-                if surface.model == LAMBERT:
-                    result = surface.base_color * (cos_i / wp.pi)
+            result = surface.diffuse * (cos_i / wp.pi)
             if wp.static(PHONG in models):
                 if surface.model == PHONG:
-                    lobe = phong_lobe(reflect(wo, normal), wi, surface.shininess)
-                    result = surface.base_color * (cos_i / wp.pi) + surface.specular * lobe
+                    result += surface.reflectance * phong_lobe(reflect(wo, normal), wi, surface.shininess)
             if wp.static(METALLIC_ROUGHNESS in models):
                 if surface.model == METALLIC_ROUGHNESS:
                     half = wi + wo
@@ -198,13 +211,9 @@ def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
                     # wi = -wo has no half vector; it only comes up where both graze, and nothing is reflected there.
                     if length > 1.0e-6:
                         half = half / length
-                        f = schlick(wp.dot(wo, half))
-                        f0 = specular_f0(surface)
-                        fresnel = f0 + f * (wp.vec3(1.0) - f0)
-                        passed = (1.0 - surface.metallic) * (1.0 - DIELECTRIC_F0) * (1.0 - f)
+                        fresnel = surface.f0 + schlick(wp.dot(wo, half)) * (wp.vec3(1.0) - surface.f0)
                         lobe = ggx_lobe(normal, half, cos_i, wp.dot(normal, wo), surface.roughness)
-                        result = cos_i * (surface.base_color * (passed / wp.pi) + fresnel * lobe)
-            # A mirror shows lights that have an extent; a point light has none.
+                        result += cos_i * lobe * wp.cw_mul(fresnel, surface.gain)
         return result
 
     return reflect_direct

@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.structs import DIRECTIONAL, SPOT, Light, RayScene
+from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT, Light, RayScene
 from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
@@ -46,30 +46,45 @@ def spot_falloff(light: Light, wi: wp.vec3) -> wp.float32:
     return (light.outer_angle - angle) / (light.outer_angle - light.inner_angle)
 
 
-@wp.func
-def sample_light(light: Light, point: wp.vec3) -> LightSample:
-    """What ``light`` sends to a world point; finite everywhere (see MIN_DISTANCE)."""
-    sample = LightSample()
-    if light.kind == DIRECTIONAL:
-        sample.wi = -light.direction
-        sample.distance = FAR
-        sample.irradiance_normal = light.intensity
+@functools.cache
+def make_sample_light(kinds: tuple[int, ...]) -> wp.Function:
+    """``sample_light(light, point) -> LightSample`` for the given kinds of light."""
+    label = "_".join(map(str, kinds))
+    positional = POINT in kinds or SPOT in kinds
+
+    @wp.func(name=f"sample_light_{label}", module="unique")
+    def sample_light_of_kinds(light: Light, point: wp.vec3) -> LightSample:
+        sample = LightSample()
+        if wp.static(DIRECTIONAL in kinds):
+            if light.kind == DIRECTIONAL:
+                sample.wi = -light.direction
+                sample.distance = FAR
+                sample.irradiance_normal = light.intensity
+        if wp.static(positional):
+            if light.kind != DIRECTIONAL:
+                to_light = light.position - point
+                distance = wp.length(to_light)
+                wi = -light.direction
+                if distance > 0.0:
+                    wi = to_light / distance
+                elif wp.dot(wi, wi) == 0.0:
+                    wi = wp.vec3(0.0, 0.0, 1.0)  # a point light has no direction of its own
+                d = wp.max(distance, wp.max(light.radius, MIN_DISTANCE))
+                fall = light.attenuation[0] + (light.attenuation[1] + light.attenuation[2] * d) * d
+                falloff = 1.0 / wp.max(fall, 1.0e-12)
+                if wp.static(SPOT in kinds):
+                    if light.kind == SPOT:
+                        falloff *= spot_falloff(light, wi)
+                sample.wi = wi
+                sample.distance = distance
+                sample.irradiance_normal = falloff * light.intensity
         return sample
-    to_light = light.position - point
-    distance = wp.length(to_light)
-    wi = -light.direction
-    if distance > 0.0:
-        wi = to_light / distance
-    elif wp.dot(wi, wi) == 0.0:
-        wi = wp.vec3(0.0, 0.0, 1.0)  # a point light has no direction of its own
-    d = wp.max(distance, wp.max(light.radius, MIN_DISTANCE))
-    falloff = 1.0 / wp.max(light.attenuation[0] + (light.attenuation[1] + light.attenuation[2] * d) * d, 1.0e-12)
-    if light.kind == SPOT:
-        falloff *= spot_falloff(light, wi)
-    sample.wi = wi
-    sample.distance = distance
-    sample.irradiance_normal = falloff * light.intensity
-    return sample
+
+    return sample_light_of_kinds
+
+
+sample_light = make_sample_light((POINT, SPOT, DIRECTIONAL))
+"""``sample_light(light, point) -> LightSample``: what a light of any kind sends to a world point; finite everywhere."""
 
 
 @functools.cache

@@ -416,7 +416,7 @@ def inside_rect(row: wp.int32, column: wp.int32, rect: wp.vec4i) -> wp.bool:
 
 @functools.cache
 def make_primary(config: TraceConfig) -> wp.Function:
-    """``closest_visible(scene, origin, direction) -> Hit``: the closest object that no proxy hides; shape -1 if none."""
+    """``closest_visible(scene, origin, direction) -> Hit``: the closest object if no proxy hides it, else shape -1."""
     trace = make_trace(config)
     closest_object, occluded_by_proxies = trace.closest_object, trace.occluded_by_proxies
 

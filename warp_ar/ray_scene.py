@@ -36,6 +36,12 @@ BOX_MARGIN: Final = 2.0**-18
 
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
 _LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
+_MODELS: Final[dict[type, int]] = {
+    scenes.LambertMaterial: structs.LAMBERT,
+    scenes.PhongMaterial: structs.PHONG,
+    scenes.MetallicRoughnessMaterial: structs.METALLIC_ROUGHNESS,
+    scenes.MirrorMaterial: structs.MIRROR,
+}
 
 # Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
 _CONE_SIDES: Final = 8
@@ -58,11 +64,57 @@ def shape_kind(thing: scenes.Object | scenes.Proxy) -> int:
     return structs.MESH if thing.shape == "torus" else _SHAPES[thing.shape]
 
 
+def light_kind(light: scenes.Light) -> int:
+    """Kind of ``structs.Light`` that a light becomes."""
+    return _LIGHTS[light.kind]
+
+
 def trace_config(scene: scenes.Scene) -> TraceConfig:
     """Which kinds of shape the rays of ``scene`` can meet."""
     return TraceConfig(
         objects=tuple(sorted({shape_kind(thing) for thing in scene.objects})),
         proxies=tuple(sorted({shape_kind(thing) for thing in scene.proxies})),
+    )
+
+
+def _is_black(color: scenes.Color) -> bool:
+    return not isinstance(color, Path) and not any(color)
+
+
+def reflects_diffusely(material: scenes.Material) -> bool:
+    """Whether a material shows the room's irradiance."""
+    match material:
+        case scenes.LambertMaterial():
+            return not _is_black(material.base_color)
+        case scenes.PhongMaterial():
+            return not _is_black(material.diffuse)
+        case scenes.MetallicRoughnessMaterial():
+            return material.metallic < 1.0 and not _is_black(material.base_color)
+    return False
+
+
+def reflects_glossily(material: scenes.Material) -> bool:
+    """Whether a material shows the room's prefiltered light."""
+    match material:
+        case scenes.PhongMaterial():
+            return not _is_black(material.specular)
+        case scenes.MirrorMaterial():
+            return not _is_black(material.base_color)
+        case scenes.MetallicRoughnessMaterial():
+            return True
+    return False
+
+
+def material_model(material: scenes.Material) -> int:
+    """Model of ``structs.Material`` that a material becomes."""
+    return _MODELS[type(material)]
+
+
+def has_textures(scene: scenes.Scene) -> bool:
+    """Whether any virtual object may have a texture: meshes bring their own, which only reading them tells."""
+    return any(
+        thing.shape == "mesh" or any(isinstance(value, Path) for value in vars(thing.material).values())
+        for thing in scene.objects
     )
 
 
@@ -230,14 +282,12 @@ class HostScene:
                     )
         record["base_color"], record["base_texture"] = textures.add(first, mesh)
         record["specular_texture"] = -1
+        record["model"] = material_model(material)
         if isinstance(material, scenes.PhongMaterial):
-            record["model"], record["shininess"] = structs.PHONG, material.shininess
+            record["shininess"] = material.shininess
             record["specular"], record["specular_texture"] = textures.add(material.specular, None)
         elif isinstance(material, scenes.MetallicRoughnessMaterial):
-            record["model"] = structs.METALLIC_ROUGHNESS
             record["metallic"], record["roughness"] = material.metallic, material.roughness
-        else:
-            record["model"] = structs.MIRROR if isinstance(material, scenes.MirrorMaterial) else structs.LAMBERT
 
     def write_objects(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
         """Write the virtual objects as they stand ``seconds`` after the first frame.
@@ -262,7 +312,7 @@ class HostScene:
                 continue
             self._lit = None
             record["position"], record["direction"] = light.pose_at(seconds)
-            record["kind"] = _LIGHTS[light.kind]
+            record["kind"] = light_kind(light)
             record["intensity"] = light.intensity * np.array(light.color)
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius

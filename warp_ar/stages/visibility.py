@@ -20,6 +20,7 @@ class GrowingRows:
         self._previous: Rows = (0, 0)
 
     def __call__(self) -> Rows:
+        """Rows to run over; asked once per frame."""
         rows, previous = self._current(), self._previous
         self._previous = rows
         if previous[0] >= previous[1]:

@@ -1,0 +1,278 @@
+"""Virtual objects as the camera would see them: lit by the room and by virtual lights, shadowed, with smooth edges.
+
+The result is premultiplied: RGB is radiance times coverage, alpha the share of the pixel that virtual objects cover.
+
+Edges. Inside a surface one sample per pixel is enough. Where a neighbour sees another object, a surface farther off the
+tangent plane than two pixels' footprint, or a normal turned by more than 30 degrees, the pixel is traced again with n^2
+samples and averaged (a box filter, as a camera's pixels have). The samples are n-rooks in both axes, for n = 2 the
+rotated grid: no two of them share a row or column, so near-vertical and near-horizontal edges pass through n^2 shades,
+not n.
+
+Normals. Surfaces are seen from both sides: normals are turned toward the viewer. An interpolated normal can still point
+away at a silhouette; it is then tipped just as far as makes it perpendicular to the view, continuously, so that the
+mirror direction leaves the surface.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
+from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
+from warp_ar.kernels.shadow import make_sample_light, make_shadow
+from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Light, RayScene
+from warp_ar.kernels.visibility import Hit, TraceConfig, inside_rect, make_primary
+
+wp.set_module_options({"enable_backward": False})
+
+# Neighbours further off the tangent plane than this many pixel footprints belong to another surface.
+EDGE_FOOTPRINTS = wp.constant(wp.float32(2.0))
+# Cosine of the turn between neighbouring normals that counts as an edge.
+EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
+# Smallest cosine between shading normal and viewer.
+MIN_FACING = wp.constant(wp.float32(1.0e-3))
+
+RoomDiffuse = Literal["none", "sh", "map"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ShadeConfig:
+    """What a scene calls for; everything else is not compiled in."""
+
+    trace: TraceConfig
+    """Kinds of shape."""
+    models: tuple[int, ...]
+    """Sorted material models that exist."""
+    lights: tuple[int, ...]
+    """Sorted kinds of virtual light that exist."""
+    textures: bool
+    """Whether any material has a texture."""
+    room_diffuse: RoomDiffuse
+    """Where the room's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
+    room_specular: bool
+    """Whether the prefiltered environment is read."""
+    edge_samples: int
+    """Samples per pixel along edges: a square number; 1 leaves edges hard."""
+
+
+@functools.cache
+def make_shade_hit(config: ShadeConfig) -> wp.Function:
+    """``shade_hit(scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction) -> vec3``.
+
+    Radiance that leaves a hit against the ray's ``direction`` (not unit).
+    """
+    surface_at = make_surface(config.models, config.textures)
+    reflect_direct = make_reflect_direct(config.models)
+    sample_light = make_sample_light(config.lights)
+    is_lit = make_shadow(config.trace)
+
+    @wp.func(module="unique")
+    def shade_hit(
+        scene: RayScene,
+        lights: wp.array[Light],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        levels: wp.array[wp.vec3],
+        level_height: wp.int32,
+        dfg: wp.array2d[wp.vec2],
+        hit: Hit,
+        direction: wp.vec3,
+    ) -> wp.vec3:
+        wo = -wp.normalize(direction)
+        normal = hit.normal
+        geometric = hit.geometric_normal
+        if wp.dot(geometric, wo) < 0.0:
+            normal = -normal
+            geometric = -geometric
+        facing = wp.dot(normal, wo)
+        if facing < MIN_FACING:
+            normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
+        cos_o = wp.dot(normal, wo)
+        surface = surface_at(scene, dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+
+        radiance = wp.vec3(0.0)
+        if wp.static(config.room_diffuse == "sh"):
+            radiance += wp.cw_mul(surface.diffuse, sh_irradiance(irradiance_sh, normal)) / wp.pi
+        if wp.static(config.room_diffuse == "map"):
+            radiance += wp.cw_mul(surface.diffuse, sample_latlong(irradiance_map, normal)) / wp.pi
+        if wp.static(config.room_specular):
+            if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
+                level = level_from_roughness(surface.roughness, level_height)
+                if wp.static(PHONG in config.models):
+                    if surface.model == PHONG:
+                        level = level_from_shininess(surface.shininess, level_height)
+                if wp.static(MIRROR in config.models):
+                    if surface.model == MIRROR:
+                        level = 0.0
+                mirrored = sample_levels(levels, reflect(wo, normal), level, level_height)
+                radiance += wp.cw_mul(surface.reflectance, mirrored)
+        if wp.static(len(config.lights) > 0):
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                if wp.max(light.irradiance_normal) > 0.0:
+                    reflected = reflect_direct(surface, normal, wo, light.wi)
+                    if wp.max(reflected) > 0.0:
+                        if is_lit(scene, hit.point, geometric, hit.error, light):
+                            radiance += wp.cw_mul(reflected, light.irradiance_normal)
+        return radiance
+
+    return shade_hit
+
+
+@functools.cache
+def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
+    """Kernel of ``shade``, specialised to ``config``."""
+    shade_hit = make_shade_hit(config)
+    closest_visible = make_primary(config.trace)
+    side = math.isqrt(config.edge_samples)
+    if side * side != config.edge_samples or side < 1:
+        raise ValueError(f"edge_samples is {config.edge_samples}; expected a square number such as 1, 4 or 16")
+
+    @wp.func(module="unique")
+    def differs(
+        i: wp.int32,
+        j: wp.int32,
+        found: wp.int32,
+        reach: wp.float32,
+        rect: wp.vec4i,
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        hit: Hit,
+    ) -> wp.bool:
+        other = wp.int32(-1)
+        if inside_rect(i, j, rect):
+            other = hit_object[i, j]
+        if other != found:
+            return True
+        if found < 0:
+            return False
+        if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
+            return True
+        return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def shade_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        levels: wp.array[wp.vec3],
+        level_height: wp.int32,
+        dfg: wp.array2d[wp.vec2],
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        # Out:
+        virtual_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        result = wp.vec4(0.0)
+        rect = params[0].object_rect
+        if inside_rect(i, j, rect):
+            found = hit_object[i, j]
+            hit = Hit()
+            if found >= 0:
+                hit = hits[i, j]
+            edge = bool(False)
+            if wp.static(side > 1):
+                reach = EDGE_FOOTPRINTS * hit.t / params[0].focal[0]
+                edge = differs(i - 1, j, found, reach, rect, hit_object, hits, hit)
+                edge = edge or differs(i + 1, j, found, reach, rect, hit_object, hits, hit)
+                edge = edge or differs(i, j - 1, found, reach, rect, hit_object, hits, hit)
+                edge = edge or differs(i, j + 1, found, reach, rect, hit_object, hits, hit)
+            ray = rays[i, j]
+            origin = params[0].camera_position
+            if edge:
+                for sample in range(wp.static(side * side)):
+                    a = sample % wp.static(side)
+                    b = sample / wp.static(side)
+                    n = wp.static(float(side))
+                    x = (wp.float32(a) + (wp.float32(b) + 0.5) / n) / n - 0.5
+                    y = (wp.float32(b) + (n - 0.5 - wp.float32(a)) / n) / n - 0.5
+                    inner = wp.vec3(ray[0] + x / params[0].focal[0], ray[1] + y / params[0].focal[1], 1.0)
+                    direction = params[0].world_from_camera * inner
+                    seen = closest_visible(scene, origin, direction)
+                    if seen.shape >= 0:
+                        radiance = shade_hit(
+                            scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, seen, direction
+                        )
+                        result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+                result = result / wp.static(float(side * side))
+            elif found >= 0:
+                direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+                radiance = shade_hit(
+                    scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction
+                )
+                result = wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        virtual_out[i, j] = result
+
+    return shade_kernel
+
+
+def shade(
+    config: ShadeConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    lights: wp.array[Light] | None,
+    irradiance_sh: wp.array[wp.vec3] | None,
+    irradiance_map: wp.array2d[wp.vec3] | None,
+    levels: wp.array[wp.vec3] | None,
+    level_height: int,
+    dfg: wp.array2d[wp.vec2] | None,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    virtual_out: wp.array2d[wp.vec4],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Shade what ``trace_pixels`` found.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: Frame values: camera and object_rect.
+        rays: (H, W) undistorted x / z and y / z of each pixel centre.
+        scene: What rays meet, and what it is made of.
+        lights: Virtual lights.
+        irradiance_sh: Nine coefficients of the room's irradiance.
+        irradiance_map: The room's irradiance as a latlong map.
+        levels: The room's prefiltered light, as ``sample_levels`` reads it.
+        level_height: Rows of its level 0.
+        dfg: Table of ``integrate_dfg``, for metallic-roughness.
+        hit_object: (H, W) as ``trace_pixels`` writes.
+        hits: (H, W) likewise.
+        virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_shade_kernel(config),
+        rays.shape,
+        [
+            params,
+            rays,
+            scene,
+            lights,
+            irradiance_sh,
+            irradiance_map,
+            levels,
+            level_height,
+            dfg,
+            hit_object,
+            hits,
+        ],
+        [virtual_out],
+        rows=rows,
+        device=rays.device,
+    )

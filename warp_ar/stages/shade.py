@@ -1,0 +1,101 @@
+"""Virtual objects lit by the room and by virtual lights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.shade import RoomDiffuse, ShadeConfig, make_shade_kernel, shade
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.ray_scene import (
+    has_textures,
+    light_kind,
+    material_model,
+    reflects_diffusely,
+    reflects_glossily,
+    trace_config,
+)
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.visibility import GrowingRows
+
+# Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
+DFG_SIZE = 32
+
+
+def shade_config(request: Request) -> ShadeConfig:
+    """What the shading of a request's objects calls for."""
+    scene = request.scene
+    materials = [thing.material for thing in scene.objects]
+    diffuse: RoomDiffuse = "none"
+    if scene.probes and any(map(reflects_diffusely, materials)):
+        diffuse = "sh" if request.quality.rung("diffuse") == "sh2" else "map"
+    return ShadeConfig(
+        trace=trace_config(scene),
+        models=tuple(sorted(set(map(material_model, materials)))),
+        lights=tuple(sorted({light_kind(light) for light in scene.lights})),
+        textures=has_textures(scene),
+        room_diffuse=diffuse,
+        room_specular=bool(scene.probes) and any(map(reflects_glossily, materials)),
+        edge_samples=request.quality.edge_samples,
+    )
+
+
+class Shade(Stage):
+    """Radiance and coverage of virtual objects, with smooth edges."""
+
+    name = "shade"
+    rungs = ("default",)
+    summary = "shade virtual objects by the room's light and virtual lights, shadowed and anti-aliased"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Reads only the forms of light that its materials reflect."""
+        if not request.scene.objects:
+            return LeftOut("the scene has no virtual object")
+        config = shade_config(request)
+        reads = ["pose", "objects", "hit_object", "hits"]
+        if config.lights:
+            reads.append("lights")
+        if config.room_diffuse != "none":
+            reads.append(f"irradiance_{config.room_diffuse}")
+        if config.room_specular:
+            reads.append("specular_levels")
+        return Wiring(tuple(reads), ("virtual",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The shaded objects and, for metallic-roughness, the table of its reflectance."""
+        width, height = self.request.size
+        specs = {"virtual": ArraySpec((height, width), wp.vec4)}
+        if METALLIC_ROUGHNESS in shade_config(self.request).models:
+            specs["shade_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over the rows where objects are or were; the table is computed here, once."""
+        config = shade_config(self.request)
+        make_shade_kernel(config)
+        dfg = arrays.get("shade_dfg")
+        if dfg is not None:
+            integrate_dfg(dfg)
+        irradiance = {form: arrays.get(f"irradiance_{form}") for form in ("sh", "map")}
+        inputs = (
+            arrays["params"],
+            arrays["rays"],
+            arrays["ray_scene"],
+            arrays["light_array"],
+            irradiance["sh"] if config.room_diffuse == "sh" else None,
+            irradiance["map"] if config.room_diffuse == "map" else None,
+            arrays["specular_levels"] if config.room_specular else None,
+            self.request.quality.environment_height,
+            dfg,
+            arrays["hit_object"],
+            arrays["hits"],
+        )
+
+        def launch(rows: Rows | None) -> None:
+            shade(config, *inputs, arrays["virtual"], rows=rows)
+
+        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
