@@ -1,5 +1,4 @@
-"""Marker to pose: detection, refinement on every printed edge, steadying without lag, and a state that says what to
-trust.
+"""Marker to pose: detection, refinement on every printed edge, steadying without lag, and a state to trust it by.
 
 The world is the marker's frame: origin at the centre of the marker or board, x right and y up the printed page, z out
 of it, metres. A pose is ``camera_from_world``: it maps a world point X to the camera point R X + t; the camera looks
@@ -27,15 +26,16 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
-import re
 from collections.abc import Sequence
-from typing import Any, Protocol, TypeGuard
+from typing import Any, TypeGuard
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -67,6 +67,8 @@ _PATTERN = 0.7
 """Least correlation of the cells' brightness with the printed pattern."""
 _SUPPORT = 0.4
 """Least share of the printed edges that must agree with a pose: with less, chance and clutter could."""
+_ENOUGH = 0.7
+"""Share of a board's edges that makes detection needless."""
 _ALIKE = 3.0
 """The second pose of a plane is examined when its reprojection error is less than this many times that of the first
 ..."""
@@ -80,31 +82,6 @@ _SETTLE = 9.0
 """Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
 _FORGET = 0.4
 """Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
-
-
-class MarkerLike(Protocol):
-    """What tracking needs to know of a scene's marker."""
-
-    @property
-    def dictionary(self) -> str: ...  # noqa: D102
-    @property
-    def id(self) -> int: ...  # noqa: D102
-    @property
-    def size(self) -> float: ...  # noqa: D102
-    @property
-    def board(self) -> str | None: ...  # noqa: D102
-
-
-class CameraLike(Protocol):
-    """What tracking needs to know of a scene's camera."""
-
-    @property
-    def width(self) -> int: ...  # noqa: D102
-    @property
-    def height(self) -> int: ...  # noqa: D102
-    @property
-    def distortion(self) -> Sequence[float]: ...  # noqa: D102
-    def matrix(self) -> Array: ...  # noqa: D102
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,55 +159,27 @@ def find_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(number)
 
 
-def parse_board(board: str) -> tuple[str, int, int, float, float]:
-    """Kind, columns, rows and the two lengths in metres of ``"charuco 5x7 0.04 0.03"`` or ``"grid 4x3 0.04 0.01"``.
-
-    A ChArUco board has columns x rows squares, the length of a square and that of a marker; a grid has columns x rows
-    markers, the length of a marker and the gap between two.
-
-    Raises:
-        UsageError: if the text is neither, or its lengths are impossible.
-    """
-    match = re.fullmatch(r"\s*(charuco|grid)\s+(\d+)x(\d+)\s+(\S+)\s+(\S+)\s*", board)
-    try:
-        if match is None:
-            raise ValueError
-        kind, columns, rows = match[1], int(match[2]), int(match[3])
-        first, second = float(match[4]), float(match[5])
-    except ValueError:
-        raise UsageError(
-            f'marker board: {board!r} should read like "charuco 5x7 0.04 0.03" (squares, square and marker length in metres) '
-            'or "grid 4x3 0.04 0.01" (markers, marker length and gap in metres)'
-        ) from None
-    fits = 0 < second < first if kind == "charuco" else first > 0 and second > 0
-    if not (fits and np.isfinite([first, second]).all() and columns >= 1 and rows >= 1 and columns * rows >= 2):
-        raise UsageError(
-            f"marker board: {board!r} is impossible: lengths are positive, and a ChArUco marker is smaller than its square"
-        )
-    return kind, columns, rows, first, second
-
-
-def make_board(marker: MarkerLike) -> Any:
+def make_board(marker: Marker) -> Any:
     """OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, y down.
 
     Raises:
-        UsageError: if the board's text is wrong, or its dictionary holds too few markers.
+        UsageError: if the dictionary holds too few markers, or none of that name exists.
     """
-    assert marker.board is not None
-    kind, columns, rows, first, second = parse_board(marker.board)
+    board = marker.board
+    assert board is not None
     dictionary = find_dictionary(marker.dictionary)
-    needed = columns * rows // 2 if kind == "charuco" else columns * rows
-    if len(dictionary.bytesList) < needed:
+    available = len(dictionary.bytesList)
+    if available < board.marker_count:
         raise UsageError(
-            f"marker board: {marker.board!r} needs {needed} markers; {marker.dictionary} has {len(dictionary.bytesList)}"
+            f"marker board: {board} needs {board.marker_count} markers; {marker.dictionary} has {available}"
         )
-    make = cv2.aruco.CharucoBoard if kind == "charuco" else cv2.aruco.GridBoard
-    return make((columns, rows), first, second, dictionary)
+    if isinstance(board, CharucoBoard):
+        return cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_length, board.marker_length, dictionary)
+    return cv2.aruco.GridBoard((board.columns, board.rows), board.marker_length, board.separation, dictionary)
 
 
 class MarkerDetector:
-    """Finds every marker of a dictionary in a grey image, with sub-pixel corners; mirrored and inverted prints are not
-    accepted."""
+    """Finds every marker of a dictionary, with sub-pixel corners; mirrored and inverted prints are not accepted."""
 
     def __init__(self, dictionary: str) -> None:
         parameters = cv2.aruco.DetectorParameters()
@@ -292,8 +241,7 @@ class _Pattern:
 
 
 def _cell_edges(cells: NDArray[np.bool_], left: float, top: float, size: float, room: float) -> list[tuple[float, ...]]:
-    """Borders between neighbouring cells that differ, as rows of middle (x, y), tangent, normal toward white, length
-    and room."""
+    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length and room."""
     edges: list[tuple[float, ...]] = []
     for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
         sign = 1.0 if cells[row, column + 1] else -1.0
@@ -305,43 +253,38 @@ def _cell_edges(cells: NDArray[np.bool_], left: float, top: float, size: float, 
 
 
 @functools.cache
-def _make_pattern(dictionary: str, id: int, size: float, board: str | None) -> _Pattern:
+def _make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | GridBoard | None) -> _Pattern:
     book = find_dictionary(dictionary)
     bits = int(book.markerSize) + 2
-
-    def cells_of(number: int) -> NDArray[np.bool_]:
-        image = cv2.aruco.generateImageMarker(book, number, bits, borderBits=1)
-        return np.pad(np.asarray(image) > 127, 1, constant_values=True)
-
     edges: list[tuple[float, ...]] = []
     if board is None:
         if not 0 <= id < len(book.bytesList):
             raise UsageError(f"marker id: {dictionary} has ids 0 to {len(book.bytesList) - 1}, not {id}")
         if not (np.isfinite(size) and size > 0):
             raise UsageError(f"marker size: {size} should be the edge length in metres, above 0")
-        h = size / 2
-        places, width, height, margin = {id: (-h, h)}, size, size, size / bits
+        places, width, height, margin = {id: (-size / 2, size / 2)}, size, size, size / bits
     else:
-        spec = _BoardSpec(dictionary, id, size, board)
-        kind, columns, rows, first, second = parse_board(board)
-        print_ = make_board(spec)
-        length, gap = (second, (first - second) / 2) if kind == "charuco" else (first, second)
-        right, bottom = (float(v) for v in np.asarray(print_.getRightBottomCorner()).ravel()[:2])
-        width, height = right, bottom
+        printed = make_board(Marker(dictionary, board=board))
+        size, (width, height) = board.marker_length, board.size
         places = {
             int(number): (float(corners[0][0]) - width / 2, height / 2 - float(corners[0][1]))
-            for number, corners in zip(np.ravel(print_.getIds()), print_.getObjPoints(), strict=True)
+            for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
         }
-        size, margin = length, min(gap, length / bits)
-        if kind == "charuco":
+        if isinstance(board, CharucoBoard):
             # The top left square is black, in OpenCV's layout since 4.6.
-            squares = (np.add.outer(np.arange(rows), np.arange(columns)) % 2).astype(bool)
-            edges += _cell_edges(squares, -width / 2, height / 2, first, min(gap, first / 2))
+            squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2).astype(bool)
+            square = board.square_length
+            margin = (square - size) / 2
+            edges += _cell_edges(squares, -width / 2, height / 2, square, min(margin, square / 2))
+        else:
+            margin = board.separation
     cell = size / bits
+    margin = min(margin, cell)
     centres, white = [], []
     for number, (left, top) in places.items():
-        pattern = cells_of(number)
-        edges += _cell_edges(pattern, left - cell, top + cell, cell, min(cell, margin))
+        image = cv2.aruco.generateImageMarker(book, number, bits, borderBits=1)
+        pattern = np.pad(np.asarray(image) > 127, 1, constant_values=True)
+        edges += _cell_edges(pattern, left - cell, top + cell, cell, margin)
         rows_, columns_ = np.indices((bits, bits))
         centres.append(
             np.stack([left + (columns_ + 0.5) * cell, top - (rows_ + 0.5) * cell, 0.0 * rows_], -1).reshape(-1, 3)
@@ -351,7 +294,7 @@ def _make_pattern(dictionary: str, id: int, size: float, board: str | None) -> _
     # Inner points of an edge only: its ends are corners, where another edge's blur is near.
     count = int(np.clip(240 // len(table), 1, 4))
     along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
-    table = np.repeat(table[:: max(1, len(table) // 400)], count, axis=0)
+    table = np.repeat(table[:: -(-len(table) // 300)], count, axis=0)
     shift = np.tile(along, len(table) // count) * table[:, 6]
     flat = np.zeros((len(table), 1))
     tangents, normals = np.hstack([table[:, 2:4], flat]), np.hstack([table[:, 4:6], flat])
@@ -366,14 +309,6 @@ def _make_pattern(dictionary: str, id: int, size: float, board: str | None) -> _
         cells=np.concatenate(centres),
         white=np.concatenate(white).astype(float),
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _BoardSpec:
-    dictionary: str
-    id: int
-    size: float
-    board: str | None
 
 
 def _square(x: float, y: float, width: float, height: float) -> Array:
@@ -423,34 +358,23 @@ class Tracker:
 
     Args:
         marker: what to follow.
-        camera: pinhole and distortion as OpenCV has them.
+        camera: the camera; its transfer curve matters little, for a common shift of all edges is solved for.
         hold: seconds for which the pose is extrapolated after the last measurement.
         steady: whether to steady the pose over time. The steadied pose strays from the measured one by no more than
             about the measurement's own uncertainty: a still marker stands still, a moving one does not lag.
-        linear: (256,) linear value of each 8-bit code; the sRGB curve if left out.
 
     Raises:
         UsageError: if the marker does not exist.
     """
 
-    def __init__(
-        self,
-        marker: MarkerLike,
-        camera: CameraLike,
-        *,
-        hold: float = 0.2,
-        steady: bool = True,
-        linear: NDArray[Any] | None = None,
-    ) -> None:
+    def __init__(self, marker: Marker, camera: Camera, *, hold: float = 0.2, steady: bool = True) -> None:
         self._pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
         self._detector = MarkerDetector(marker.dictionary)
         self._shape = (camera.height, camera.width)
         self._matrix = np.asarray(camera.matrix(), float)
         self._distortion = np.asarray(camera.distortion, float).ravel()
         self._hold, self._steady = hold, steady
-        code = np.arange(256) / 255.0
-        srgb = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-        self._linear = np.asarray(srgb if linear is None else linear, np.float32).reshape(256)
+        self._linear = decode_table(camera.transfer).mean(1)
         self.reset()
 
     def reset(self) -> None:
@@ -514,17 +438,19 @@ class Tracker:
         return self._project(pose.apply(self._pattern.outline))[0].astype(np.float32)
 
     def _measure(self, image: Image, guess: Pose | None) -> _Fit | None:
-        """The marker's pose in this image alone; ``guess`` only says where to look, and which of two like poses to
-        prefer."""
+        """The pose in this image alone; ``guess`` only says where to look, and which of two like poses to prefer."""
         if guess is not None:
             box = self._around(self._outline(guess))
-            gray = _gray(image[box])
-            found = self._detect(gray, (box[1].start, box[0].start), self._smallest(guess))
-            fit = self._fit_detections(gray, (box[1].start, box[0].start), found, guess)
+            gray, origin = _gray(image[box]), (box[1].start, box[0].start)
+            # A board has no second pose to confuse it with, and dozens of markers to decode: its edges come first.
+            fit = self._fit_guess(gray, origin, guess) if len(self._pattern.markers) > 1 else None
+            if fit is not None and fit.support >= _ENOUGH:
+                return fit
+            fit = self._fit_detections(gray, origin, self._detect(gray, origin, self._smallest(guess)), guess)
             if fit is None or not fit.edges:
                 # Perhaps only partly hidden or cut off, so that corners are missing or wrong: its edges may still be
                 # there.
-                fit = self._fit_guess(gray, (box[1].start, box[0].start), guess) or fit
+                fit = self._fit_guess(gray, origin, guess) or fit
             if fit is not None:
                 return fit
         gray = _gray(image)
@@ -546,8 +472,7 @@ class Tracker:
         return 0.6 * min(float(np.linalg.norm(s - np.roll(s, 1, 0), axis=1).mean()) for s in sides)
 
     def _detect(self, gray: Image, origin: tuple[int, int], smallest: float = 10.0) -> list[Detection]:
-        """The followed markers in a part of the image that starts at pixel ``origin`` (x, y), in pixels of the
-        whole."""
+        """The followed markers in a part of the image that starts at pixel ``origin``, in pixels of the whole."""
         found = [d for d in self._detector.detect(gray, max(smallest, 10.0)) if d.id in self._pattern.markers]
         return [Detection(d.id, d.corners + np.asarray(origin, np.float32)) for d in found]
 
@@ -771,7 +696,7 @@ def _solve(rows: Array, offset: Array) -> tuple[Array, Array, Array, Array] | No
         weighted = design * weights[:, None]
         normal = weighted.T @ design + np.diag(prior)
         try:
-            solution = np.linalg.solve(normal, weighted.T @ offset)
+            solution = np.asarray(np.linalg.solve(normal, weighted.T @ offset), float)
         except np.linalg.LinAlgError:
             return None
         residual = offset - design @ solution
