@@ -1,0 +1,108 @@
+"""Diffuse: the irradiance of every orientation from the environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import irradiance, pyramid
+from warp_ar.quality import Quality
+from warp_ar.scene import LambertMaterial, MetallicRoughnessMaterial, PhongMaterial, Scene
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+
+TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
+MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
+CLUSTERS = (8, 16)
+
+
+def diffuse_output(quality: Quality) -> str:
+    """Name of the resource that holds irradiance at this quality: ``irradiance_sh`` or ``irradiance_map``."""
+    return "irradiance_sh" if quality.rung(Diffuse.name) == "sh2" else "irradiance_map"
+
+
+def has_diffuse_surface(scene: Scene) -> bool:
+    """Whether some virtual object reflects diffusely."""
+    for item in scene.objects:
+        material = item.material
+        if isinstance(material, LambertMaterial):
+            return True
+        if isinstance(material, PhongMaterial) and material.diffuse != (0.0, 0.0, 0.0):
+            return True
+        if isinstance(material, MetallicRoughnessMaterial) and material.metallic < 1.0:
+            return True
+    return False
+
+
+class Diffuse(Stage):
+    """Filters the environment with the cosine lobe."""
+
+    name: ClassVar[str] = "diffuse"
+    rungs: ClassVar[tuple[str, ...]] = ("top_mip", "sh2", "sh4", "clusters", "brute_force")
+    summary: ClassVar[str] = "irradiance of the environment for every orientation"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Read the environment, write irradiance in the form of the rung."""
+        if not request.scene.objects:
+            return LeftOut("the scene has no virtual object")
+        if not has_diffuse_surface(request.scene):
+            return LeftOut("no virtual object has a diffuse material")
+        return Wiring(("environment",), (diffuse_output(request.quality),))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Irradiance, and sums on the way to it."""
+        height = self.request.quality.environment_height
+        if self.rung == "top_mip":
+            size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
+            return {"irradiance_map": ArraySpec(size, wp.vec3)}
+        if self.rung == "sh2":
+            return {"irradiance_sh": ArraySpec((9,), wp.vec3), "diffuse_row_sums": ArraySpec((height, 5), wp.vec3)}
+        if self.rung == "sh4":
+            return {
+                "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
+                "diffuse_row_sums": ArraySpec((height, 9), wp.vec3),
+                "diffuse_coefficients": ArraySpec((25,), wp.vec3),
+            }
+        count = math.prod(self._blocks())
+        return {
+            "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
+            "diffuse_flux": ArraySpec((count,), wp.vec3),
+            "diffuse_clusters": ArraySpec((count,), wp.vec4),
+        }
+
+    def _blocks(self) -> tuple[int, int]:
+        height = self.request.quality.environment_height
+        if self.rung == "brute_force":
+            return height, 2 * height
+        return min(CLUSTERS[0], height), min(CLUSTERS[1], 2 * height)
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Launches of the rung, and the tables that they need."""
+        environment = arrays["environment"]
+        if self.rung == "top_mip":
+            top = arrays["irradiance_map"]
+            return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]
+        if self.rung in ("sh2", "sh4"):
+            order = 2 if self.rung == "sh2" else 4
+            tables = irradiance.make_sh_tables(*environment.shape, order, device)
+            sums = arrays["diffuse_row_sums"]
+            if self.rung == "sh2":
+                sh = arrays["irradiance_sh"]
+                return [
+                    Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, sh)),
+                    Pass(lambda rows: irradiance.window_sh(sh)),
+                ]
+            coefficients, target = arrays["diffuse_coefficients"], arrays["irradiance_map"]
+            return [
+                Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, coefficients)),
+                Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
+            ]
+        blocks = self._blocks()
+        flux, clusters, target = arrays["diffuse_flux"], arrays["diffuse_clusters"], arrays["irradiance_map"]
+        return [
+            Pass(lambda rows: irradiance.gather_clusters(environment, blocks, flux, clusters, rows=rows), rows=blocks[0]),
+            Pass(lambda rows: irradiance.sum_clusters(flux, clusters, target, rows=rows), rows=MAP_SIZE[0]),
+        ]

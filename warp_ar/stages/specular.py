@@ -1,0 +1,101 @@
+"""Specular: the environment as glossy materials reflect it, from mirror to matt."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_ar.kernels import prefilter, pyramid
+from warp_ar.scene import Material, MetallicRoughnessMaterial, MirrorMaterial, PhongMaterial, Scene
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+
+DFG_SIZE = (32, 32)
+
+
+def glossy_materials(scene: Scene) -> list[Material]:
+    """Materials of virtual objects that reflect more than diffusely."""
+    materials = [item.material for item in scene.objects]
+    return [
+        material
+        for material in materials
+        if isinstance(material, (MetallicRoughnessMaterial, MirrorMaterial))
+        or (isinstance(material, PhongMaterial) and material.specular != (0.0, 0.0, 0.0))
+    ]
+
+
+def scene_lobe(scene: Scene) -> prefilter.Lobe:
+    """Lobe that suits the scene: Phong's where no material has another, else GGX (Phong exponents map to the width that is nearest)."""
+    kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
+    return "phong" if kinds == {PhongMaterial} else "ggx"
+
+
+class Specular(Stage):
+    """Prefilters the environment with lobes of growing width."""
+
+    name: ClassVar[str] = "specular"
+    rungs: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis8", "fis32", "fis128", "brute_force")
+    summary: ClassVar[str] = "the environment filtered for glossy reflection, level by level"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Read the environment, write the levels; the split-sum table where a material needs it."""
+        if not request.scene.objects:
+            return LeftOut("the scene has no virtual object")
+        glossy = glossy_materials(request.scene)
+        if not glossy:
+            return LeftOut("no virtual object has a glossy material")
+        table = any(isinstance(material, MetallicRoughnessMaterial) for material in glossy)
+        return Wiring(("environment",), ("specular_levels", "dfg_table") if table else ("specular_levels",))
+
+    @property
+    def _mirrors_only(self) -> bool:
+        return all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Levels, the table, and the pyramid that the levels are made from."""
+        height = self.request.quality.environment_height
+        specs = {"specular_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
+        if "dfg_table" in self.wiring.writes:
+            specs["dfg_table"] = ArraySpec(DFG_SIZE, wp.vec2)
+        if self.rung != "brute_force" and not self._mirrors_only:
+            specs["specular_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
+        if self.rung not in ("box_mip", "brute_force") and not self._mirrors_only:
+            specs["specular_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
+            specs["specular_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Launches of the rung; weights, samples and the table are made here, once."""
+        height = self.request.quality.environment_height
+        lobe = scene_lobe(self.request.scene)
+        environment, levels = arrays["environment"], arrays["specular_levels"]
+        if "dfg_table" in self.wiring.writes:
+            prefilter.integrate_dfg(arrays["dfg_table"])
+        if self._mirrors_only:
+            return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
+        texels = levels.shape[0]
+        if self.rung == "brute_force":
+            return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
+
+        box = arrays["specular_pyramid"]
+        isotropic = self.rung != "box_mip"
+        passes = [Pass(lambda rows: pyramid.build_pyramid(environment, box, isotropic=isotropic))]
+        if self.rung in ("box_mip", "energy_mip"):
+            numbers = prefilter.mip_weights(height, lobe) if isotropic else prefilter.box_weights(height)
+            weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
+            passes.append(
+                Pass(lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows), rows=texels)
+            )
+        else:
+            samples = prefilter.make_lobe_samples(height, lobe, int(self.rung.removeprefix("fis")), device)
+            passes.append(Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels))
+        if isotropic:
+            row_energy, energy = arrays["specular_row_energy"], arrays["specular_energy"]
+            passes += [
+                Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
+                Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),
+            ]
+        return passes
