@@ -2,25 +2,27 @@
 
     E(n) = integral of L(w) max(n.w, 0) dw;   a constant L gives E = pi L.
 
-Two forms of the result. *Spherical harmonics*: E(n) = sum_i c_i Y_i(n) with the real orthonormal basis in the order l = 0; l = 1: y, z, x;
-l = 2: xy, yz, 3z^2 - 1, xz, x^2 - y^2; the cosine lobe is part of c. *Map*: a small latlong map of E, sampled with
-``latlong.sample_latlong``.
+Two forms of the result. *Spherical harmonics*: E(n) = sum_i c_i Y_i(n) with the real orthonormal basis in the order l =
+0; l = 1: y, z, x; l = 2: xy, yz, 3z^2 - 1, xz, x^2 - y^2; the cosine lobe is part of c. *Map*: a small latlong map of
+E, sampled with ``latlong.sample_latlong``.
 
-Projection. [RH01] eq. 8: c_lm = A_l L_lm with L_lm = integral of L Y_lm and A = pi, 2 pi/3, pi/4, 0, -pi/24. A texel's radiance is constant,
-so its integral is a closed form, and a separable one: with Y_lm = N P_lm(cos theta) times cos m phi or sin |m| phi,
+Projection. [RH01] eq. 8: c_lm = A_l L_lm with L_lm = integral of L Y_lm and A = pi, 2 pi/3, pi/4, 0, -pi/24. A texel's
+radiance is constant, so its integral is a closed form, and a separable one: with Y_lm = N P_lm(cos theta) times cos m
+phi or sin |m| phi,
 
-    L_lm = sum over rows [ integral of N P_lm(cos theta) sin theta dtheta ]  sum over columns L [ integral of cos m phi dphi ].
+    L_lm = sum over rows [integral of N P_lm(cos theta) sin theta dtheta] sum over columns L [integral of cos m phi dphi].
 
-The column integrals for all m are Fourier sums of a row, the row integrals one number per (row, l, |m|); both are tables made once, in
-double precision. There is no quadrature error: a constant map has no coefficient but the first. Sums run in a fixed order (a tile
-per row, then a tile per coefficient): the same input gives the same bits.
+The column integrals for all m are Fourier sums of a row, the row integrals one number per (row, l, |m|); both are
+tables made once, in double precision. There is no quadrature error: a constant map has no coefficient but the first.
+Sums run in a fixed order (a tile per row, then a tile per coefficient): the same input gives the same bits.
 
-Positivity. A small lamp of flux F makes order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle: down to -0.04 F at x = -8/15.
-As in [Sloan17], the coefficients are smoothed by a window with the least strength s that leaves no negative direction, found from the
-minimum; one s for the three channels, so that no hue shifts; 0 where nothing is negative. The mean is untouched: energy is kept.
-The window of [Sloan17], 1 / (1 + s l^2 (l + 1)^2), needs w_2 = 0.13 and w_1 = 0.57 for the lamp above. Errors in (w_1, w_2) cost
-(1 - w_1)^2 / 12 + (1 - w_2)^2 / 51 of F^2, and along the border of what is positive, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that is least at
-(0.86, 0.90). The family through that point and the identity is taken, with the mean as its limit:
+Positivity. A small lamp of flux F makes order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle: down to
+-0.04 F at x = -8/15. As in [Sloan17], the coefficients are smoothed by a window with the least strength s that leaves
+no negative direction, found from the minimum; one s for the three channels, so that no hue shifts; 0 where nothing is
+negative. The mean is untouched: energy is kept. The window of [Sloan17], 1 / (1 + s l^2 (l + 1)^2), needs w_2 = 0.13
+and w_1 = 0.57 for the lamp above. Errors in (w_1, w_2) cost (1 - w_1)^2 / 12 + (1 - w_2)^2 / 51 of F^2, and along the
+border of what is positive, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that is least at (0.86, 0.90). The family through that
+point and the identity is taken, with the mean as its limit:
 
     w_1 = 1 / (1 + s),  w_2 = 1 / (1 + 0.7 s).
 
@@ -28,23 +30,25 @@ E is a quadratic on the sphere,
 
     E_s(n) = w_2 n'Q n + 2 w_1 b'n + c,
 
-whose minimum comes from its dual (strong for one quadratic constraint, the S-lemma): with eigenvalues q_i of Q and b in its eigenvectors' frame
+whose minimum comes from its dual (strong for one quadratic constraint, the S-lemma): with eigenvalues q_i of Q and b in
+its eigenvectors' frame
 
     min E_s = max over mu <= w_2 min q of   c + mu - sum_i (w_1 b_i)^2 / (w_2 q_i - mu),
 
-concave in mu. The window scales the eigenvalues and does not turn the eigenvectors: one eigen-decomposition per channel serves the whole
-bisection over s. Evaluation clamps at zero what rounding leaves. Order 4 is clamped, not windowed: its lobes are a fifth as deep, and where
-the truth is not negative a clamp never errs more than what it clamps.
+concave in mu. The window scales the eigenvalues and does not turn the eigenvectors: one eigen-decomposition per channel
+serves the whole bisection over s. Evaluation clamps at zero what rounding leaves. Order 4 is clamped, not windowed: its
+lobes are a fifth as deep, and where the truth is not negative a clamp never errs more than what it clamps.
 
-Clusters. The sum over all texels costs texels times directions. Irradiance is smooth, so nearby texels may share a direction: a block of
-texels becomes one distant light with their summed flux and their mean direction m, weighted by brightness. As n.w is linear in w, a block
-that is wholly above the horizon is exact, whatever is in it. On the horizon max(n.w, 0) is averaged over the block's spread: |m|^2 = 1 - v with
-v its variance over two axes, and a box of that variance has the half width h = sqrt(3 v / 2), so
+Clusters. The sum over all texels costs texels times directions. Irradiance is smooth, so nearby texels may share a
+direction: a block of texels becomes one distant light with their summed flux and their mean direction m, weighted by
+brightness. As n.w is linear in w, a block that is wholly above the horizon is exact, whatever is in it. On the horizon
+max(n.w, 0) is averaged over the block's spread: |m|^2 = 1 - v with v its variance over two axes, and a box of that
+variance has the half width h = sqrt(3 v / 2), so
 
     mean of max(x, 0) over [c - h, c + h] = (c + h)^2 / (4 h) for |c| < h,  c = n.m.
 
-Never negative, keeps the energy, does not jump as a lamp moves. With one texel to a block this is the reference: the texel's own extent
-is in v, so that a furnace stays white at any size.
+Never negative, keeps the energy, does not jump as a lamp moves. With one texel to a block this is the reference: the
+texel's own extent is in v, so that a furnace stays white at any size.
 
 References:
     [RH01] Ramamoorthi, Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
@@ -59,8 +63,8 @@ import math
 import numpy as np
 import warp as wp
 
-from .launch import Rows, launch_rows
-from .pyramid import safe_radiance
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.pyramid import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,7 +96,9 @@ def cosine_lobe(l: int) -> float:
     if l % 2:
         return 0.0
     half = l // 2
-    return 2.0 * math.pi * (-1.0) ** (half - 1 if l else 0) / ((l + 2) * (l - 1 if l else 1)) * math.comb(l, half) / 2.0**l
+    return (
+        2.0 * math.pi * (-1.0) ** (half - 1 if l else 0) / ((l + 2) * (l - 1 if l else 1)) * math.comb(l, half) / 2.0**l
+    )
 
 
 def basis_row(l: int, m: int, z: np.ndarray) -> np.ndarray:
@@ -127,7 +133,8 @@ def make_sh_tables(height: int, width: int, order: int, device: wp.DeviceLike) -
     columns = [np.diff(edges)]
     for k in range(1, order + 1):
         columns += [np.diff(np.sin(k * edges)) / k, -np.diff(np.cos(k * edges)) / k]
-    # Gauss-Legendre over each row in theta: the integrands are trigonometric polynomials of low degree, exact to rounding.
+    # Gauss-Legendre over each row in theta: the integrands are trigonometric polynomials of low degree, exact to
+    # rounding.
     nodes, weights = np.polynomial.legendre.leggauss(16)
     half = 0.5 * np.pi / height
     theta = (2.0 * np.arange(height)[:, None] + 1.0 + nodes[None, :]) * half
@@ -239,16 +246,16 @@ def window_sh_kernel(
             c7 = irradiance_sh_out[7][channel] * inverse * 0.54627422
             c8 = irradiance_sh_out[8][channel] * inverse * 0.54627422
             quadratic = wp.mat33(c8 - c6, c4, c7, c4, -c8 - c6, c5, c7, c5, 2.0 * c6)
-            linear = (
-                wp.vec3(irradiance_sh_out[3][channel], irradiance_sh_out[1][channel], irradiance_sh_out[2][channel])
-                * (0.5 * 0.48860251 * inverse)
-            )
+            linear = wp.vec3(
+                irradiance_sh_out[3][channel], irradiance_sh_out[1][channel], irradiance_sh_out[2][channel]
+            ) * (0.5 * 0.48860251 * inverse)
             axes, q = wp.eig3(quadratic)
             b = wp.transpose(axes) * linear
             w1 = 1.0 / (1.0 + strength)
             w2 = 1.0 / (1.0 + 0.7 * strength)
             if sphere_minimum(q * w2, b * w1, 1.0) < 0.0:
-                # The previous channels' strength is not enough: the answer lies between it and one that leaves only the mean.
+                # The previous channels' strength is not enough: the answer lies between it and one that leaves only the
+                # mean.
                 low = strength
                 high = wp.float32(16.0)
                 for _ in range(WINDOW_STEPS):
@@ -349,7 +356,8 @@ def gather_clusters_kernel(
     for i in range(bi * height / blocks_high, (bi + 1) * height / blocks_high):
         sin_theta = wp.sin((2.0 * wp.float32(i) + 1.0) * half_step)
         solid_angle = 4.0 * sin_theta * wp.sin(half_step) * half_column
-        # A texel spreads over its own height and width: variance (2 half)^2 / 12 each, which shortens its mean direction by half of it.
+        # A texel spreads over its own height and width: variance (2 half)^2 / 12 each, which shortens its mean
+        # direction by half of it.
         spread = (half_step * half_step + sin_theta * sin_theta * half_column * half_column) / 3.0
         for j in range(bj * width / blocks_wide, (bj + 1) * width / blocks_wide):
             radiance = safe_radiance(environment[i, j]) * solid_angle
@@ -451,7 +459,12 @@ def evaluate_sh4(
         rows: Band of rows; None means all.
     """
     launch_rows(
-        evaluate_sh4_kernel, irradiance_map_out.shape, [coefficients], [irradiance_map_out], rows=rows, device=coefficients.device
+        evaluate_sh4_kernel,
+        irradiance_map_out.shape,
+        [coefficients],
+        [irradiance_map_out],
+        rows=rows,
+        device=coefficients.device,
     )
 
 
@@ -469,7 +482,7 @@ def gather_clusters(
         environment: (H, W) radiance.
         blocks: Blocks along rows and columns, at most (H, W).
         flux_out: (blocks[0] blocks[1],) irradiance of each on a surface that faces it.
-        cluster_out: (blocks[0] blocks[1],) mean direction of the flux, and the half width over which its cosines spread.
+        cluster_out: (blocks[0] blocks[1],) mean direction of the flux, half width of its cosines' spread.
         rows: Band of block rows; None means all.
     """
     inputs = [environment, *blocks]

@@ -1,17 +1,19 @@
-"""Glossy reflections of a latlong environment: one map per lobe, from mirror to the widest, that a shader samples and blends.
+"""Glossy reflections of a latlong environment: one map per lobe, from mirror to the widest, for a shader to blend.
 
 Levels. Level 0 is the environment itself (a mirror). Level l >= 1 holds the environment averaged with a lobe of width
 
     alpha_l = 2^(l - L),  l = 1 .. L,
 
-L such that the narrowest is about three texels of the map wide (full width at half maximum). Between levels, ``level_from_alpha`` is linear in
-log2 alpha: that lies between the blend with the least squared error and the one with the best encircled energy, for both lobes and all widths.
-A wider lobe needs fewer texels: level l has (H >> s, 2 H >> s) with s = max(l - 2, 0), which leaves eight texels per unit of alpha, bilinear
-error below 2 % of a single lamp's peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after another.
+L such that the narrowest is about three texels of the map wide (full width at half maximum). Between levels,
+``level_from_alpha`` is linear in log2 alpha: that lies between the blend with the least squared error and the one with
+the best encircled energy, for both lobes and all widths. A wider lobe needs fewer texels: level l has (H >> s, 2 H >>
+s) with s = max(l - 2, 0), which leaves eight texels per unit of alpha, bilinear error below 2 % of a single lamp's
+peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after another.
 
-Lobes, about the mirror direction R, cos theta = R.w, each normalised by its own sum so that a constant environment stays constant:
+Lobes, about the mirror direction R, cos theta = R.w, each normalised by its own sum so that a constant environment
+stays constant:
 
-    GGX with N = V = R, as split-sum shading takes it [Karis13]:  D(half vector) cos theta ~ cos theta / ((1 - c) / 2 + alpha^2 (1 + c) / 2)^2,
+    GGX with N = V = R, as split-sum shading takes it [Karis13]:  D(half vector) c ~ c / ((1 - c) / 2 + alpha^2 (1 + c) / 2)^2,
     c = cos theta; alpha = roughness^2. At alpha = 1 it is the plain cosine: roughness 1 reflects irradiance / pi.
     Phong:  cos^n theta with n = 1 / alpha^2. At alpha = 1 it is the plain cosine as well; exponents below 1 act as 1.
     The variance per axis of a narrow Phong lobe is 1 / n = alpha^2: both lobes are about as wide at equal alpha.
@@ -20,25 +22,28 @@ Ways to fill the levels, cheapest first.
 
 Box mips: level l is level l of a box pyramid, magnified bilinearly: the paper's filter. Its texel is 1.6 alpha wide.
 
-Mixed mips: level l is a sum of several levels m of an isotropic pyramid, sum_m w_lm mip_m with w >= 0 and sum w = 1, each read through
-quadratic B-splines. A box mip read so blurs with variance sigma_m^2 = (T_m^2 - T_0^2) / 12 + T_m^2 / 4 per axis, T_m = pi / H_m: the box and
-the spline; mip 0 is read as it is. On the sphere that is close to exp(-k (k + 1) sigma_m^2 / 2) in degree k. The weights minimise the expected
-squared error
+Mixed mips: level l is a sum of several levels m of an isotropic pyramid, sum_m w_lm mip_m with w >= 0 and sum w = 1,
+each read through quadratic B-splines. A box mip read so blurs with variance sigma_m^2 = (T_m^2 - T_0^2) / 12 + T_m^2 /
+4 per axis, T_m = pi / H_m: the box and the spline; mip 0 is read as it is. On the sphere that is close to exp(-k (k +
+1) sigma_m^2 / 2) in degree k. The weights minimise the expected squared error
 
     sum_k (2 k + 1) S_k (K_k - sum_m w_lm B_mk)^2,   S_k = 1 / (k + 1/2)^2,
 
-K_k the lobe's zonal coefficients (K_0 = 1) and S_k the power per coefficient of natural scenes. A single level with the lobe's second moment
-would do for Phong; GGX has tails so long that its moment grows without bound as alpha falls, and a single box cannot have peak and tails. Each
-level is then scaled, per channel, to hold exactly the energy of the environment.
+K_k the lobe's zonal coefficients (K_0 = 1) and S_k the power per coefficient of natural scenes. A single level with the
+lobe's second moment would do for Phong; GGX has tails so long that its moment grows without bound as alpha falls, and a
+single box cannot have peak and tails. Each level is then scaled, per channel, to hold exactly the energy of the
+environment.
 
-Filtered importance sampling [KC08]: S directions drawn from the lobe, each read from the level of an isotropic pyramid whose texel covers the
-direction's share 1 / (S pdf) of the sphere: m = log2(share / T_0^2) / 2 + bias. Directions are a Hammersley set in the frame of theta and phi,
-the same for every texel of a level: no noise between neighbours, no flicker between frames. Scaled to the energy as above.
+Filtered importance sampling [KC08]: S directions drawn from the lobe, each read from the level of an isotropic pyramid
+whose texel covers the direction's share 1 / (S pdf) of the sphere: m = log2(share / T_0^2) / 2 + bias. Directions are a
+Hammersley set in the frame of theta and phi, the same for every texel of a level: no noise between neighbours, no
+flicker between frames. Scaled to the energy as above.
 
 Brute force: every texel of the environment weighted by its solid angle and the lobe. The reference.
 
-Split sum. ``sample_dfg`` returns (scale, bias): the specular reflectance of the GGX surface under a white sky is F0 scale + bias [Karis13]. One
-scattering loses energy on rough surfaces; ``energy_compensation`` puts it back: a white metal keeps a white furnace white.
+Split sum. ``sample_dfg`` returns (scale, bias): the specular reflectance of the GGX surface under a white sky is F0
+scale + bias [Karis13]. One scattering loses energy on rough surfaces; ``energy_compensation`` puts it back: a white
+metal keeps a white furnace white.
 
 References:
     [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
@@ -57,17 +62,17 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from .latlong import latlong_from_direction, texel_solid_angle
-from .launch import Rows, launch_rows
-from .pyramid import level_count, level_offset, safe_radiance, sample_packed, sample_packed_smooth
-from .sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
+from warp_ar.kernels.latlong import latlong_from_direction, texel_solid_angle
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.pyramid import level_count, safe_radiance, sample_packed, sample_packed_smooth
+from warp_ar.kernels.sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
 
 wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 BLOCK = 64
-# How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as [KC08] advise. Between 0, best
-# for smooth skies, and 0.5, best for small lamps, by error against brute force.
+# How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as
+# [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small lamps, by error against brute force.
 SAMPLE_BIAS = 0.25
 # An energy correction beyond this factor would be a fault, not a correction.
 MAX_CORRECTION = wp.constant(wp.float32(4.0))
@@ -115,7 +120,7 @@ def last_lobe(height: wp.int32) -> wp.int32:
 
 @wp.func
 def level_from_alpha(alpha: wp.float32, height: wp.int32) -> wp.float32:
-    """Level, with fraction, of a lobe of width ``alpha``; below the narrowest lobe, a share of it proportional to alpha."""
+    """Level, with fraction, of a lobe of width ``alpha``; below the narrowest, a share of it proportional to alpha."""
     last = last_lobe(height)
     narrowest = 2.0 / wp.float32(1 << last)
     if alpha < narrowest:
@@ -137,11 +142,11 @@ def level_from_shininess(shininess: wp.float32, height: wp.int32) -> wp.float32:
 
 @wp.func
 def sample_levels(levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float32, height: wp.int32) -> wp.vec3:
-    """Radiance reflected from ``direction`` (need not be unit), blended between the two nearest levels; seam and poles are safe.
+    """Radiance reflected from ``direction``, blended between the two nearest levels; seam and poles are safe.
 
     Args:
         levels: Packed levels, (lobe_texels(height),).
-        direction: Mirror direction, world.
+        direction: Mirror direction, world; need not be unit.
         level: From ``level_from_roughness`` or ``level_from_shininess``; clamped to those that exist.
         height: Rows of level 0.
     """
@@ -312,7 +317,7 @@ def mix_mips_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One packed texel from the levels of a pyramid; a texel's place in a level needs no trigonometry, both are latlong."""
+    """One packed texel from the levels of a pyramid; no trigonometry, as both are latlong."""
     index = wp.tid() + row_start
     at = locate_texel(index, height)
     h = height >> wp.max(at[0] - 2, 0)
@@ -359,7 +364,8 @@ def sample_lobes_kernel(
     last = wp.int32(0)
     while (height >> (last + 1)) > 0:
         last += 1
-    # By symmetry about z a texel's samples are those of longitude 0, turned by the texel's own: its column is added to theirs.
+    # By symmetry about z a texel's samples are those of longitude 0, turned by the texel's own: its column is added to
+    # theirs.
     theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
     sin_theta = wp.sin(theta)
     cos_theta = wp.cos(theta)
@@ -416,13 +422,13 @@ def integrate_lobes_kernel(
     exponent = 1.0 / (alpha * alpha)
     theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
     sin_theta = wp.sin(theta)
-    cos_theta = wp.cos(theta)
     phi = 2.0 * PI * (wp.float32(at[2]) + 0.5) / wp.float32(w)
     total = wp.vec3()
     total_weight = wp.float32(0.0)
     for i in range(height):
         source_theta = PI * (wp.float32(i) + 0.5) / wp.float32(height)
-        # 1 - cos of the angle between = 2 (sin^2(dtheta / 2) + sin sin sin^2(dphi / 2)): no cancellation in narrow lobes.
+        # 1 - cos of the angle between = 2 (sin^2(dtheta / 2) + sin sin sin^2(dphi / 2)): no cancellation in narrow
+        # lobes.
         across = wp.sin(0.5 * (source_theta - theta))
         around = sin_theta * wp.sin(source_theta)
         row_total = wp.vec3()
@@ -533,7 +539,7 @@ def integrate_dfg_kernel(
     # Out:
     dfg_out: wp.array2d[wp.vec2],
 ):
-    """Scale and bias of F0 for one roughness (row) and one cosine to the viewer (column), both from 0 to 1 at the table's ends.
+    """Scale and bias of F0 for one roughness (row) and one n_dot_v (column), both from 0 to 1 at the table's ends.
 
     With half vectors visible from wo, D and one masking cancel: the estimate is F(wo.wh) G2 / G1(wo) [Heitz14].
     """
@@ -579,9 +585,10 @@ def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.fl
 
 @wp.func
 def energy_compensation(dfg: wp.vec2, f0: wp.vec3) -> wp.vec3:
-    """Factor on the specular part that adds what scatters more than once [Turquin19]: 1 + F0 (1 / E - 1), E = scale + bias.
+    """Factor on the specular part that adds what scatters more than once [Turquin19]: 1 + F0 (1 / E - 1).
 
-    A metal with F0 = 1 reflects E times this, exactly 1: a white furnace stays white. Holds for room light and virtual lights alike.
+    E = scale + bias is what a surface with F0 = 1 reflects after one scattering. Times this factor it reflects exactly 1: a white
+    furnace stays white. The factor holds for room light and virtual lights alike.
     """
     return wp.vec3(1.0, 1.0, 1.0) + f0 * (1.0 / wp.max(dfg[0] + dfg[1], 1.0e-3) - 1.0)
 
@@ -608,7 +615,14 @@ def mix_mips(
         smooth: Read mips through quadratic B-splines, as the fitted weights expect; else bilinearly, as the paper does.
         rows: Band of packed texels; None means all.
     """
-    launch_rows(mix_mips_kernel, levels_out.shape, [pyramid, weights, height, int(smooth)], [levels_out], rows=rows, device=pyramid.device)
+    launch_rows(
+        mix_mips_kernel,
+        levels_out.shape,
+        [pyramid, weights, height, int(smooth)],
+        [levels_out],
+        rows=rows,
+        device=pyramid.device,
+    )
 
 
 def box_weights(height: int) -> np.ndarray:
@@ -700,7 +714,9 @@ def scale_levels(
         levels_out: (lobe_texels(height),).
         rows: Band of packed texels; None means all.
     """
-    launch_rows(scale_levels_kernel, levels_out.shape, [energy, height], [levels_out], rows=rows, device=levels_out.device)
+    launch_rows(
+        scale_levels_kernel, levels_out.shape, [energy, height], [levels_out], rows=rows, device=levels_out.device
+    )
 
 
 def integrate_dfg(dfg_out: wp.array2d[wp.vec2], *, samples: int = 1024) -> None:

@@ -1,19 +1,25 @@
-"""Box pyramids of latlong maps: every level holds the mean radiance over its texels' solid angles, so every level keeps the energy.
+"""Box pyramids of latlong maps: every level holds the mean radiance over its texels' solid angles.
 
-A pyramid is one packed ``wp.array[wp.vec3]``: level l has (max(H >> l, 1), max(W >> l, 1)) texels in row-major order and follows the levels
-before it; there are ``level_count(H, W)``, down to one row or column. Level 0 is the map itself, made safe: see ``safe_radiance``.
+A pyramid is one packed ``wp.array[wp.vec3]``: level l has (max(H >> l, 1), max(W >> l, 1)) texels in row-major order
+and follows the levels before it; there are ``level_count(H, W)``, down to one row or column. Level 0 is the map itself,
+made safe: see ``safe_radiance``.
 
-A texel of level l is the mean of level l - 1 over the area that it covers. Sizes need not be even: the overlap of texels is counted in
-integers (texel i of h spans [i H, (i + 1) H] where texel r of H spans [r h, (r + 1) h]), its solid angle is a product
+A texel of level l is the mean of level l - 1 over the area that it covers. Sizes need not be even: the overlap of
+texels is counted in integers (texel i of h spans [i H, (i + 1) H] where texel r of H spans [r h, (r + 1) h]), its solid
+angle is a product
 
-    (cos theta0 - cos theta1) (phi1 - phi0),  cos theta0 - cos theta1 = 2 sin((theta0 + theta1) / 2) sin((theta1 - theta0) / 2).
+    (phi1 - phi0) (cos theta0 - cos theta1),
+    cos theta0 - cos theta1 = 2 sin((theta0 + theta1) / 2) sin((theta1 - theta0) / 2).
 
-For even sizes that is the 2x2 box with its solid angles as weights: the paper's filter (section 3.2), which also is what a graphics
-library's mipmap generation does but for the weights.
+So every level keeps the energy.
 
-An *isotropic* pyramid counts columns over a wider span: near the poles a texel of a latlong map is much narrower than high, so that a box
-of texels blurs along meridians only. There a texel averages over W' / (w sin theta) columns instead of W' / w, at most over all of them:
-its footprint is as wide as high. Rows are blurred around the axis only, which moves no energy from row to row: energy is still kept.
+For even sizes that is the 2x2 box with its solid angles as weights: the paper's filter (section 3.2), which also is
+what a graphics library's mipmap generation does but for the weights.
+
+An *isotropic* pyramid counts columns over a wider span: near the poles a texel of a latlong map is much narrower than
+high, so that a box of texels blurs along meridians only. There a texel averages over W' / (w sin theta) columns instead
+of W' / w, at most over all of them: its footprint is as wide as high. Rows are blurred around the axis only, which
+moves no energy from row to row: energy is still kept.
 
 References:
     [AG02] Ashikhmin, Ghosh 2002, Simple Blurry Reflections with Environment Maps.
@@ -25,8 +31,8 @@ import math
 
 import warp as wp
 
-from .latlong import latlong_from_direction, wrap_texel
-from .launch import Rows, launch_rows
+from warp_ar.kernels.latlong import latlong_from_direction, wrap_texel
+from warp_ar.kernels.launch import Rows, launch_rows
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,12 +71,14 @@ def safe_channel(value: wp.float32) -> wp.float32:
 
 @wp.func
 def safe_radiance(radiance: wp.vec3) -> wp.vec3:
-    """Radiance that a filter can take: one bad pixel must not spoil the map. NaN and negative to 0, infinity to ``MAX_RADIANCE``."""
+    """Radiance that a filter can take: NaN and negative to 0, infinity to ``MAX_RADIANCE``."""
     return wp.vec3(safe_channel(radiance[0]), safe_channel(radiance[1]), safe_channel(radiance[2]))
 
 
 @wp.func
-def sample_packed(levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32):
+def sample_packed(
+    levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
+):
     """Bilinear sample of one packed level at continuous coordinates, across the seam and the poles."""
     y = row - 0.5
     x = column - 0.5
@@ -96,8 +104,10 @@ def sample_packed(levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32,
 def sample_packed_smooth(
     levels: wp.array[wp.vec3], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.float32, column: wp.float32
 ):
-    """Sample of one packed level through quadratic B-splines (nine texels): smooths by a variance of a quarter texel per axis, and shows no
-    blocks. Weights at distance t from the nearest centre: (1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2.
+    """Sample of one packed level through quadratic B-splines: shows no blocks.
+
+    Nine texels, per axis (1/2 - t)^2 / 2, 3/4 - t^2, (1/2 + t)^2 / 2 at offset t from the nearest centre; the variance
+    that this adds is a quarter of a texel's width squared, per axis.
     """
     i = wp.int32(wp.floor(row))
     j = wp.int32(wp.floor(column))
@@ -123,7 +133,9 @@ def sample_packed_smooth(
 
 
 @wp.func
-def sample_pyramid(levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float32, height: wp.int32, width: wp.int32) -> wp.vec3:
+def sample_pyramid(
+    levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float32, height: wp.int32, width: wp.int32
+) -> wp.vec3:
     """Trilinear sample of a pyramid of a (height, width) map; ``level`` is clamped to those that exist."""
     size = wp.min(height, width)
     last = wp.int32(0)
@@ -270,7 +282,13 @@ def copy_safe(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *
 
 
 def reduce_level(
-    height: int, width: int, level: int, levels_out: wp.array[wp.vec3], *, isotropic: bool = False, rows: Rows | None = None
+    height: int,
+    width: int,
+    level: int,
+    levels_out: wp.array[wp.vec3],
+    *,
+    isotropic: bool = False,
+    rows: Rows | None = None,
 ) -> None:
     """Write one level of a pyramid from the level before it.
 
@@ -316,4 +334,10 @@ def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec
         reduced_out: (h, w), h <= H and w <= W.
         scale: Factor on the result.
     """
-    wp.launch(reduce_latlong_kernel, dim=reduced_out.shape, inputs=[radiance, scale], outputs=[reduced_out], device=radiance.device)
+    wp.launch(
+        reduce_latlong_kernel,
+        dim=reduced_out.shape,
+        inputs=[radiance, scale],
+        outputs=[reduced_out],
+        device=radiance.device,
+    )

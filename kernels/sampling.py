@@ -1,8 +1,9 @@
-"""Deterministic sample points, and lobes to draw them from: hashing, low-discrepancy sequences, disks, cones, Phong and GGX.
+"""Deterministic sample points, and lobes to draw them from.
 
-Local frames have the normal (or the lobe's axis) along +z. Directions ``wi``, ``wo`` and half vectors ``wh`` are unit and point away from
-the surface. A pdf is per steradian, of what its sampler returns. Sample points ``u`` lie in [0, 1)^2. ``alpha`` is the square of the
-perceptual roughness; values below ``MIN_ALPHA`` act as that, so that a mirror stays finite.
+Local frames have the normal (or the lobe's axis) along +z. Directions ``wi``, ``wo`` and half vectors ``wh`` are unit
+and point away from the surface. A pdf is per steradian, of what its sampler returns. Sample points ``u`` lie in [0,
+1)^2. ``alpha`` is the square of the perceptual roughness; values below ``MIN_ALPHA`` act as that, so that a mirror
+stays finite.
 
 References:
     [JO20] Jarzynski, Olano 2020, Hash Functions for GPU Rendering: the PCG hashes.
@@ -93,7 +94,7 @@ def hammersley(index: wp.int32, count: wp.int32) -> wp.vec2:
 
 @wp.func
 def frame_from_normal(normal: wp.vec3) -> wp.mat33:
-    """Orthonormal frame whose columns are tangent, bitangent and ``normal`` (world_from_local), finite for every unit normal [Duff17]."""
+    """Orthonormal world_from_local: columns tangent, bitangent, ``normal``; finite for every unit normal [Duff17]."""
     sign = wp.float32(1.0)
     if normal[2] < 0.0:
         sign = wp.float32(-1.0)
@@ -158,7 +159,8 @@ def cone_pdf(half_angle: wp.float32) -> wp.float32:
 def sample_phong_lobe(u: wp.vec2, exponent: wp.float32) -> wp.vec3:
     """Direction with pdf (n + 1) / (2 pi) cos^n theta about +z.
 
-    cos theta = u^(1 / (n + 1)); its complement comes from sinh: 1 - e^x = -2 e^(x/2) sinh(x/2), exact for exponents of 1e5.
+    cos theta = u^(1 / (n + 1)); its complement comes from sinh, exact for exponents of 1e5:
+    1 - e^x = -2 e^(x/2) sinh(x/2).
     """
     x = wp.log(wp.max(1.0 - u[0], 1.0e-30)) / (exponent + 1.0)
     versine = -2.0 * wp.exp(0.5 * x) * wp.sinh(0.5 * x)

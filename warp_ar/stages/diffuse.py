@@ -103,6 +103,8 @@ class Diffuse(Stage):
         blocks = self._blocks()
         flux, clusters, target = arrays["diffuse_flux"], arrays["diffuse_clusters"], arrays["irradiance_map"]
         return [
-            Pass(lambda rows: irradiance.gather_clusters(environment, blocks, flux, clusters, rows=rows), rows=blocks[0]),
+            Pass(
+                lambda rows: irradiance.gather_clusters(environment, blocks, flux, clusters, rows=rows), rows=blocks[0]
+            ),
             Pass(lambda rows: irradiance.sum_clusters(flux, clusters, target, rows=rows), rows=MAP_SIZE[0]),
         ]

@@ -27,7 +27,7 @@ def glossy_materials(scene: Scene) -> list[Material]:
 
 
 def scene_lobe(scene: Scene) -> prefilter.Lobe:
-    """Lobe that suits the scene: Phong's where no material has another, else GGX (Phong exponents map to the width that is nearest)."""
+    """Phong where no glossy material has another lobe, else GGX: exponents then take the width that is nearest."""
     kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
     return "phong" if kinds == {PhongMaterial} else "ggx"
 
@@ -87,11 +87,16 @@ class Specular(Stage):
             numbers = prefilter.mip_weights(height, lobe) if isotropic else prefilter.box_weights(height)
             weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
             passes.append(
-                Pass(lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows), rows=texels)
+                Pass(
+                    lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows),
+                    rows=texels,
+                )
             )
         else:
             samples = prefilter.make_lobe_samples(height, lobe, int(self.rung.removeprefix("fis")), device)
-            passes.append(Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels))
+            passes.append(
+                Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels)
+            )
         if isotropic:
             row_energy, energy = arrays["specular_row_energy"], arrays["specular_energy"]
             passes += [
