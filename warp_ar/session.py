@@ -10,8 +10,15 @@ from types import TracebackType
 from warp_ar.errors import UsageError
 from warp_ar.pipeline import Pipeline, Result
 from warp_ar.quality import DEFAULT_PRESET, Quality
-from warp_ar.scene import Camera, Scene, load_scene
+from warp_ar.scene import Camera, Scene, SourceSpec, load_scene
 from warp_ar.sources import Frame, Source, open_source
+
+
+def _where(spec: SourceSpec) -> str | int | Path:
+    """What ``open_source`` calls the source that a scene names; a scene names exactly one."""
+    if spec.path is not None:
+        return spec.path
+    return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
 
 
 class Session:
@@ -49,14 +56,14 @@ class Session:
         """
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         if calibration is not None:
-            camera = Camera.load_calibration(calibration)
-            self.scene = dataclasses.replace(self.scene, camera=dataclasses.replace(camera, transfer=self.scene.camera.transfer))
+            camera = Camera.load_calibration(calibration, self.scene.camera.transfer)
+            self.scene = dataclasses.replace(self.scene, camera=camera)
         chosen = source
         if chosen is None:
             spec = self.scene.source
             if spec is None:
                 raise UsageError(f"scene {self.scene.name!r} names no source; give one with --source")
-            chosen = spec.path if spec.path is not None else spec.camera if spec.camera is not None else spec.synthetic
+            chosen = _where(spec)
         fps = self.scene.source.fps if self.scene.source is not None and source is None else None
         self.source: Source = open_source(chosen, fps=fps, loop=loop)
         try:
