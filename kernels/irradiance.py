@@ -10,7 +10,8 @@ Projection. [RH01] eq. 8: c_lm = A_l L_lm with L_lm = integral of L Y_lm and A =
 radiance is constant, so its integral is a closed form, and a separable one: with Y_lm = N P_lm(cos theta) times cos m
 phi or sin |m| phi,
 
-    L_lm = sum over rows [integral of N P_lm(cos theta) sin theta dtheta] sum over columns L [integral of cos m phi dphi].
+    L_lm = sum over rows [integral of N P_lm(cos theta) sin theta dtheta]
+           sum over columns L [integral of cos m phi dphi].
 
 The column integrals for all m are Fourier sums of a row, the row integrals one number per (row, l, |m|); both are
 tables made once, in double precision. There is no quadrature error: a constant map has no coefficient but the first.

@@ -12,8 +12,6 @@ from warp_ar.kernels import prefilter, pyramid
 from warp_ar.scene import Material, MetallicRoughnessMaterial, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 
-DFG_SIZE = (32, 32)
-
 
 def glossy_materials(scene: Scene) -> list[Material]:
     """Materials of virtual objects that reflect more than diffusely."""
@@ -41,25 +39,21 @@ class Specular(Stage):
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Read the environment, write the levels; the split-sum table where a material needs it."""
+        """Read the environment, write the levels."""
         if not request.scene.objects:
             return LeftOut("the scene has no virtual object")
-        glossy = glossy_materials(request.scene)
-        if not glossy:
+        if not glossy_materials(request.scene):
             return LeftOut("no virtual object has a glossy material")
-        table = any(isinstance(material, MetallicRoughnessMaterial) for material in glossy)
-        return Wiring(("environment",), ("specular_levels", "dfg_table") if table else ("specular_levels",))
+        return Wiring(("environment",), ("specular_levels",))
 
     @property
     def _mirrors_only(self) -> bool:
         return all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """Levels, the table, and the pyramid that the levels are made from."""
+        """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
         specs = {"specular_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
-        if "dfg_table" in self.wiring.writes:
-            specs["dfg_table"] = ArraySpec(DFG_SIZE, wp.vec2)
         if self.rung != "brute_force" and not self._mirrors_only:
             specs["specular_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
         if self.rung not in ("box_mip", "brute_force") and not self._mirrors_only:
@@ -68,12 +62,10 @@ class Specular(Stage):
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Launches of the rung; weights, samples and the table are made here, once."""
+        """Launches of the rung; weights and samples are made here, once."""
         height = self.request.quality.environment_height
         lobe = scene_lobe(self.request.scene)
         environment, levels = arrays["environment"], arrays["specular_levels"]
-        if "dfg_table" in self.wiring.writes:
-            prefilter.integrate_dfg(arrays["dfg_table"])
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]
