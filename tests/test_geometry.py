@@ -276,7 +276,9 @@ def test_scene_graphs_are_joined_in_place(tmp_path: pathlib.Path) -> None:
 def textured_box(color: tuple[int, int, int], size: int, uv: Any = None) -> Any:
     box = trimesh.creation.box()
     uv = np.random.default_rng(0).random((8, 2)) if uv is None else uv
-    box.visual = trimesh.visual.TextureVisuals(uv=uv, image=Image.new("RGB", (size, 2 * size), color))
+    image = Image.new("RGB", (size, 2 * size), color)
+    image.paste((9, 9, 9), (0, size, size, 2 * size))  # the lower half, v < 0.5
+    box.visual = trimesh.visual.TextureVisuals(uv=uv, image=image)
     return box
 
 
@@ -302,10 +304,15 @@ def test_several_textures_are_stacked(tmp_path: pathlib.Path) -> None:
     path = tmp_path / "boxes.glb"
     scene.export(path)
     mesh = load_mesh(path)
+    heights = textured_box((0, 0, 0), 1).visual.uv[:, 1]
+    assert heights.min() < 0.4 < 0.6 < heights.max()
     colors = {0: [255, 0, 0], 1: [0, 255, 0], 2: [0, 0, 255], 3: [255, 255, 255]}
     assert len(mesh.vertices) == 32
     for vertex, position in enumerate(mesh.vertices):
-        assert sample(mesh, vertex) == colors[round(float(position[0]) / 3)]
+        place = round(float(position[0]) / 3)
+        corner = np.argmin(np.linalg.norm(plain.vertices - position + np.array([3.0 * place, 0, 0]), axis=1))
+        lower = place < 3 and heights[corner] < 0.5
+        assert sample(mesh, vertex) == ([9, 9, 9] if lower else colors[place])
 
 
 def test_repeating_textures_cannot_be_stacked(tmp_path: pathlib.Path) -> None:

@@ -413,6 +413,7 @@ ERRORS = [
     (CAMERA.replace("fx = 600.0", ""), r"camera\.fx is missing: expected a number above 0 \(pixels\)"),
     (CAMERA.replace("fx = 600.0", "fx = nan"), r"camera\.fx = NaN"),
     (CAMERA.replace("cx = 319.5", "cx = inf"), r"camera\.cx = Infinity: expected a number, finite"),
+    (CAMERA.replace("fx = 600.0", "fx = true"), r"camera\.fx = true: expected a number"),
     (CAMERA.replace("cx = 319.5", "cx = '3'"), r'camera\.cx = "3": expected a number'),
     (
         CAMERA.replace("cx = 319.5", "cx = 0x" + "f" * 400),
@@ -709,6 +710,12 @@ def test_what_is_written_loads_as_it_was(folder: pathlib.Path, data: st.DataObje
     text.encode("utf-8")
     assert loads_scene(text) == scene
     assert loads_scene(dumps_scene(scene, folder), folder / "other.toml") == scene
+
+
+@pytest.mark.parametrize("name", ["\x7f\x00\t\n\r\x1b", '"\\u0041"', "\u2028\U0001f4a1 \xe9"])
+def test_any_text_can_be_a_name(name: str) -> None:
+    scene = Scene(camera=Camera(640, 480, 600.0, 600.0, 320.0, 240.0), name=name)
+    assert loads_scene(dumps_scene(scene)) == scene
 
 
 def test_paths_inside_the_folder_are_written_relative(folder: pathlib.Path) -> None:

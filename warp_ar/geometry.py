@@ -240,7 +240,7 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
     Returns:
         Unit normals, (n, 3).
     """
-    points = np.asarray(vertices, dtype=np.float64) + 0.0  # -0 and 0 are one position
+    points = np.asarray(vertices, dtype=np.float64)
     corners = np.asarray(faces, dtype=np.int64)
     order = np.lexsort(points.T)
     fresh = np.any(np.diff(points[order], axis=0, prepend=np.nan) != 0.0, axis=1)

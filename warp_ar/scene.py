@@ -377,12 +377,8 @@ class Light:
             direction = self.animate.rotation_at(seconds) @ direction
         if self.target is not None:
             direction = np.array(self.target) - position
-        # Scaled first: the square of a tiny or huge component would leave the range of floats.
-        largest = np.abs(direction).max()
-        if largest == 0.0:
-            return position, np.array([0.0, 0.0, -1.0])
-        direction = direction / largest
-        return position, direction / np.linalg.norm(direction)
+        length = np.linalg.norm(direction)
+        return position, direction / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
 
 
 @dataclasses.dataclass(frozen=True)
