@@ -2,6 +2,31 @@
 
 from __future__ import annotations
 
+from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Stage
+from warp_ar.stages.composite import Composite
+from warp_ar.stages.diffuse import Diffuse
+from warp_ar.stages.expose import Expose
+from warp_ar.stages.fill import Fill
+from warp_ar.stages.key_lights import KeyLights
+from warp_ar.stages.relight import Relight
+from warp_ar.stages.shade import Shade
+from warp_ar.stages.specular import Specular
+from warp_ar.stages.summed_area import SummedArea
+from warp_ar.stages.unwrap import Unwrap
+from warp_ar.stages.visibility import Visibility
 
-STAGES: tuple[type[Stage], ...] = ()
+STAGES: tuple[type[Stage], ...] = (
+    Unwrap,
+    Accumulate,
+    Fill,
+    KeyLights,
+    Diffuse,
+    Specular,
+    Visibility,
+    SummedArea,
+    Relight,
+    Shade,
+    Composite,
+    Expose,
+)
