@@ -1,7 +1,7 @@
 """Virtual light on the physical desk: linear radiance that a virtual light adds to each pixel of the camera's frame.
 
-Every pixel's ray meets the nearest proxy. A light of irradiance E_v (facing it) arrives there along wi, unless a
-virtual object or a proxy stands between, and adds
+Every pixel's ray meets the nearest proxy; the mirror ball, if it is in front, shows no light of its own. A light of
+irradiance E_v (facing it) arrives there along wi, unless a virtual object or a proxy stands between, and adds
 
     added = sum over lights of  Kd / pi * E_v * visible * response.
 
@@ -62,9 +62,9 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, sample_light
-from warp_ar.kernels.structs import FrameParams, KeyLight, Light, RayScene
+from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
+from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,6 +95,8 @@ class RelightConfig:
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
     """Form of the room's irradiance, for ``reflectance``."""
+    probes: bool = False
+    """Whether there are mirror balls, which hide the desk and throw shadows of virtual light."""
 
     def __post_init__(self) -> None:
         if self.rung not in RUNGS:
@@ -151,6 +153,16 @@ def surrounding_luminance(
     return wp.max(linear, 1.0e-4)
 
 
+@wp.func
+def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    """Whether a mirror ball lies in the way."""
+    for index in range(probes.shape[0]):
+        probe = probes[index]
+        if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
+            return True
+    return False
+
+
 @functools.cache
 def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
@@ -168,6 +180,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         decode_table: wp.array[wp.vec3],
         table: wp.array2d[wp.uint32],
         scene: RayScene,
+        probes: wp.array[Probe],
         lights: wp.array[Light],
         key_lights: wp.array[KeyLight],
         irradiance_sh: wp.array[wp.vec3],
@@ -189,6 +202,9 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         # A face that is seen from behind is not the surface that the camera sees.
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return
+        if wp.static(config.probes):
+            if meets_probe(probes, params[0].camera_position, direction, hit.t):
+                return
 
         # What the desk is, found only once some light falls here.
         known = bool(False)
@@ -206,6 +222,9 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
                 continue
             if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
                 continue
+            if wp.static(config.probes):
+                if meets_probe(probes, hit.point, light.wi, light.distance):
+                    continue
             response = n_dot_l
             if wp.static(rung != "flat"):
                 if not known:
@@ -257,6 +276,7 @@ def relight(
     decode_table: wp.array,
     table: wp.array | None,
     scene: RayScene,
+    probes: wp.array | None,
     lights: wp.array,
     key_lights: wp.array | None,
     irradiance: wp.array | None,
@@ -274,6 +294,7 @@ def relight(
         decode_table: (256,) vec3 of ``color.decode_table``.
         table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
         scene: Objects and proxies.
+        probes: (p,) Probe; needed if ``config.probes``.
         lights: (n,) Light.
         key_lights: (k,) KeyLight, brightest first; needed by all rungs but ``flat``.
         irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
@@ -292,6 +313,7 @@ def relight(
             decode_table,
             table,
             scene,
+            probes,
             lights,
             key_lights,
             None if is_map else irradiance,

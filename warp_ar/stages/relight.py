@@ -44,7 +44,8 @@ class Relight(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows that light can reach."""
         form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
-        config = relight.RelightConfig(self.rung, trace_config(self.request.scene), form)  # type: ignore[arg-type]
+        scene = self.request.scene
+        config = relight.RelightConfig(self.rung, trace_config(scene), form, bool(scene.probes))  # type: ignore[arg-type]
         relight.make_relight_kernel(config)
 
         def launch(rows: Rows | None) -> None:
@@ -56,6 +57,7 @@ class Relight(Stage):
                 arrays["decode"],
                 arrays.get("summed_area"),
                 arrays["ray_scene"],
+                arrays["probes"],
                 arrays["light_array"],
                 arrays.get("key_lights"),
                 arrays.get(irradiance_name(self.request)),

@@ -9,6 +9,8 @@ import warp as wp
 
 from warp_ar.kernels import summed_area
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.composite import layer_names
+from warp_ar.stages.expose import uses_table
 
 
 class SummedArea(Stage):
@@ -21,10 +23,9 @@ class SummedArea(Stage):
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Wired for darkening by the paper's box, and for relief against its surroundings."""
-        scale = request.scene.exposure.scale
-        darkens = (isinstance(scale, str) or scale < 1.0) and request.quality.rung("expose") == "box"
-        relief = bool(request.scene.lights) and request.quality.rung("relight") in ("relief", "reflectance")
-        if not darkens and not relief:
+        lit = "physical_added" in layer_names(request)
+        relief = lit and request.quality.rung("relight") in ("relief", "reflectance")
+        if not uses_table(request) and not relief:
             return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
         return Wiring(("frame",), ("summed_area",))
 

@@ -1,0 +1,21 @@
+"""Float64 twin of ``warp_ar.kernels.composite``."""
+
+import numpy as np
+
+
+def compose(radiance, virtual=None, added=None, ratio=None):
+    """Linear radiance of all layers, (H, W, 3)."""
+    total = radiance.astype(np.float64)
+    if ratio is not None:
+        total = total * ratio
+    if added is not None:
+        total = total + added
+    if virtual is not None:
+        total = (1.0 - virtual[..., 3:].astype(np.float64)) * total + virtual[..., :3]
+    return total
+
+
+def within(rect, shape):
+    mask = np.zeros(shape, bool)
+    mask[rect[0] : rect[1], rect[2] : rect[3]] = True
+    return mask

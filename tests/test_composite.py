@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import color as reference_color
+from tests.reference import composite as reference
+from warp_ar.kernels import color, composite
+from warp_ar.kernels.structs import FrameParams
+
+H, W = 24, 40
+# float32 composing errs by some 1e-7 relative: only codes whose exact value lies this close to a half may differ, and
+# by one.
+NEAR_HALF = 1e-3
+
+CONFIGS = [composite.CompositeConfig(v, a, r) for v in (False, True) for a in (False, True) for r in (False, True)]
+
+
+def make_params(object_rect=(0, H, 0, W), light_rect=(0, H, 0, W), scale=1.0, time_step=0.0):
+    params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
+    params["object_rect"], params["light_rect"] = object_rect, light_rect
+    params["exposure_scale"], params["time_step"] = scale, time_step
+    return wp.array(params, dtype=FrameParams)
+
+
+def tables(transfer="srgb"):
+    return (
+        wp.array(color.decode_table(transfer), dtype=wp.vec3),
+        wp.array(color.encode_table(transfer), dtype=wp.vec3),
+    )
+
+
+def make_layers(seed=0):
+    rng = np.random.default_rng(seed)
+    frame = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
+    alpha = rng.choice([0.0, 0.25, 1.0], (H, W, 1))
+    virtual = np.concatenate([rng.random((H, W, 3)) * alpha, alpha], -1).astype(np.float32)
+    added = (rng.random((H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
+    ratio = rng.random((H, W, 3)).astype(np.float32)
+    return frame, virtual, added, ratio
+
+
+def array(values, dtype):
+    return None if values is None else wp.array(values, dtype=dtype)
+
+
+def run(config, frame, virtual=None, added=None, ratio=None, params=None, transfer="srgb", bands=(None,)):
+    out = wp.full(frame.shape[:2], wp.vec3ub(7, 7, 7), dtype=wp.vec3ub)
+    for rows in bands:
+        composite.composite(
+            config,
+            params or make_params(),
+            wp.array(frame, dtype=wp.vec3ub),
+            *tables(transfer),
+            array(virtual, wp.vec4),
+            array(added, wp.vec3),
+            array(ratio, wp.vec3),
+            out,
+            rows=rows,
+        )
+    return out.numpy()
+
+
+def assert_codes(got, linear):
+    exact = reference_color.encoded_srgb(np.clip(linear, 0.0, 1.0))
+    assert (np.abs(got - exact) <= 0.5 + NEAR_HALF).all()
+
+
+def test_opaque_layer_replaces_the_frame(device):
+    frame, *_ = make_layers()
+    virtual = np.broadcast_to(np.float32([0.2, 0.5, 1.0, 1.0]), (H, W, 4))
+    got = run(CONFIGS[4], frame, np.ascontiguousarray(virtual))
+    assert (got == reference_color.encode(np.array([0.2, 0.5, 1.0]), reference_color.encoded_srgb)).all()
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
+@pytest.mark.parametrize("config", CONFIGS, ids=str)
+def test_what_nothing_touches_stays_bit_for_bit(device, config, transfer):
+    frame, *_ = make_layers()
+    empty = np.zeros((H, W, 4), np.float32), np.zeros((H, W, 3), np.float32), np.ones((H, W, 3), np.float32)
+    np.testing.assert_array_equal(run(config, frame, *empty, transfer=transfer), frame)
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=str)
+def test_matches_twin(device, config):
+    frame, virtual, added, ratio = make_layers(1)
+    linear = reference.compose(
+        reference_color.decode(color.decode_table("srgb"), frame),
+        virtual if config.virtual else None,
+        added if config.added else None,
+        ratio if config.ratio else None,
+    )
+    assert_codes(run(config, frame, virtual, added, ratio), linear)
+
+
+def test_layers_count_only_inside_their_rectangles(device):
+    frame, virtual, added, _ = make_layers(2)
+    object_rect, light_rect = (3, 15, 5, 21), (10, 24, 0, 33)
+    got = run(CONFIGS[6], frame, virtual, added, params=make_params(object_rect, light_rect))
+    inside_object, inside_light = reference.within(object_rect, (H, W)), reference.within(light_rect, (H, W))
+    linear = reference.compose(
+        reference_color.decode(color.decode_table("srgb"), frame),
+        virtual * inside_object[..., None],
+        added * inside_light[..., None],
+    )
+    assert_codes(got, linear)
+    outside = ~(inside_object | inside_light)
+    np.testing.assert_array_equal(got[outside], frame[outside])
+
+
+def test_bands_give_the_same_picture(device):
+    frame, virtual, added, ratio = make_layers(3)
+    whole = run(CONFIGS[7], frame, virtual, added, ratio)
+    np.testing.assert_array_equal(run(CONFIGS[7], frame, virtual, added, ratio, bands=((0, 5), (5, 5), (5, H))), whole)
+    part = run(CONFIGS[7], frame, virtual, added, ratio, bands=((5, 9),))
+    assert (part[:5] == 7).all()
+    assert (part[9:] == 7).all()
+
+
+def test_light_does_not_reach_through_an_object(device):
+    frame, _, added, _ = make_layers(4)
+    virtual = np.zeros((H, W, 4), np.float32)
+    virtual[..., 3] = 1.0
+    np.testing.assert_array_equal(run(CONFIGS[6], frame, virtual, 1e6 * added), 0)
+
+
+def test_extremes_stay_in_range(device):
+    frame = np.zeros((1, 5, 3), np.uint8)
+    added = np.repeat(np.float32([np.nan, np.inf, -np.inf, 1e30, -1.0])[None, :, None], 3, axis=2)
+    got = run(CONFIGS[2], frame, added=added)
+    np.testing.assert_array_equal(got[0, :, 0], [0, 255, 0, 255, 0])

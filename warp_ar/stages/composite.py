@@ -1,0 +1,94 @@
+"""The picture at the camera's own exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels import composite
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+
+
+class Composite(Stage):
+    """Lays virtual light and virtual objects over the frame."""
+
+    name = "composite"
+    rungs = ("default",)
+    summary = "frame, virtual light on the desk and virtual objects, in linear light"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Left out where nothing is laid over the frame, and where the exposure stage does it in its own pass."""
+        layers = layer_names(request)
+        if exposes(request):
+            return LeftOut("the exposure stage composes what it exposes")
+        if not layers:
+            return LeftOut("nothing virtual is laid over the frame")
+        return Wiring(("frame", *layers), ("image",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The picture."""
+        width, height = self.request.size
+        return {"image": ArraySpec((height, width), wp.vec3ub)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
+        config = composite_config(layer_names(self.request))
+        composite.make_composite_kernel(config)
+        height = self.request.size[1]
+        image, frame = arrays["image"], arrays["frame"]
+
+        def launch(rows: Rows | None) -> None:
+            composite.composite(
+                config,
+                arrays["params"],
+                frame,
+                arrays["decode"],
+                arrays["encode"],
+                arrays.get("virtual"),
+                arrays.get("physical_added"),
+                arrays.get("physical_ratio"),
+                image,
+                rows=rows,
+            )
+
+        if not device.is_cpu or config.ratio:
+            return [Pass(launch, rows=height)]
+        extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
+        return [Pass(lambda rows: wp.copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
+
+
+def layer_names(request: Request) -> tuple[str, ...]:
+    """Resources that are laid over the frame."""
+    scene = request.scene
+    layers = []
+    if scene.objects:
+        layers.append("virtual")
+    if scene.lights and scene.proxies:
+        layers.append("physical_added")
+    return tuple(layers)
+
+
+def exposes(request: Request) -> bool:
+    """Whether the scene asks for another exposure; ``auto`` does where virtual light falls on the desk."""
+    scale = request.scene.exposure.scale
+    return "physical_added" in layer_names(request) if isinstance(scale, str) else scale != 1.0
+
+
+def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
+    """Which layers to compile in."""
+    return composite.CompositeConfig(
+        virtual="virtual" in layers, added="physical_added" in layers, ratio="physical_ratio" in layers
+    )
+
+
+def union_of(extents: list[Callable[[], Rows]]) -> Callable[[], Rows]:
+    """The rows from the first to the last of several extents, of which some may be empty."""
+
+    def union() -> Rows:
+        filled = [rows for rows in (extent() for extent in extents) if rows[1] > rows[0]]
+        return (min(rows[0] for rows in filled), max(rows[1] for rows in filled)) if filled else (0, 0)
+
+    return union

@@ -1,0 +1,85 @@
+"""The picture at another exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import warp as wp
+
+from warp_ar.kernels import exposure
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.composite import composite_config, exposes, layer_names
+
+
+class Expose(Stage):
+    """Composes the picture and scales its light, over-exposed regions by their surroundings."""
+
+    name = "expose"
+    rungs = exposure.RUNGS
+    summary = "another exposure: saturated centres darken last"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Reads the layers, and the table where it darkens by the box."""
+        if not exposes(request):
+            return LeftOut(
+                "exposure is 1"
+                if request.scene.exposure.scale == 1.0
+                else "exposure is auto and no virtual light falls"
+            )
+        reads = ["frame", "exposure", *layer_names(request)]
+        if request.scene.exposure.scale == "auto":
+            reads.append("clock")
+        if uses_table(request):
+            reads.append("summed_area")
+        return Wiring(tuple(reads), ("image",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The picture, the scale, the table of codes; for ``auto`` the counts."""
+        width, height = self.request.size
+        specs = {
+            "image": ArraySpec((height, width), wp.vec3ub),
+            "expose_scale": ArraySpec((1,), wp.float32),
+            "expose_codes": ArraySpec((256,), wp.vec3ub),
+        }
+        if self.request.scene.exposure.scale == "auto":
+            strips = -(-height // exposure.AUTO_STRIDE)
+            specs["expose_levels"] = ArraySpec((strips, exposure.LEVELS), wp.int32)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """The scale, the codes, the picture."""
+        layers = composite_config(layer_names(self.request))
+        config = exposure.ExposureConfig("box" if uses_table(self.request) else "plain", layers)
+        exposure.make_expose_kernel(config)
+        params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
+        scale, codes = arrays["expose_scale"], arrays["expose_codes"]
+        over = [arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio")]
+        passes: list[Pass] = []
+        if self.request.scene.exposure.scale == "auto":
+            levels = arrays["expose_levels"]
+
+            def count(rows: Rows | None) -> None:
+                exposure.count_levels(layers, params, frame, decode, *over, levels, rows=rows)
+
+            passes.append(Pass(count, rows=levels.shape[0]))
+            passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
+        else:
+            passes.append(Pass(lambda rows: exposure.read_scale(params, scale)))
+        passes.append(Pass(lambda rows: exposure.expose_codes(decode, encode, scale, codes)))
+
+        def launch(rows: Rows | None) -> None:
+            table = arrays.get("summed_area")
+            exposure.expose(
+                config, params, frame, decode, encode, *over, table, scale, codes, arrays["image"], rows=rows
+            )
+
+        passes.append(Pass(launch, rows=self.request.size[1]))
+        return passes
+
+
+def uses_table(request: Request) -> bool:
+    """Whether darkening looks at a pixel's surroundings: only the box does, and only where light is taken away."""
+    scale = request.scene.exposure.scale
+    return exposes(request) and request.quality.rung("expose") != "plain" and (isinstance(scale, str) or scale < 1.0)
