@@ -13,8 +13,9 @@ peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after a
 Lobes, about the mirror direction R, cos theta = R.w, each normalised by its own sum so that a constant environment
 stays constant:
 
-    GGX with N = V = R, as split-sum shading takes it [Karis13]:  D(half vector) cos theta
-    ~ c / ((1 - c) / 2 + alpha^2 (1 + c) / 2)^2,  c = cos theta;  alpha = roughness^2. At alpha = 1 it is the plain cosine: roughness 1 reflects irradiance / pi.
+    GGX with N = V = R, as split-sum shading takes it [Karis13], alpha = roughness^2, c = cos theta:
+    D(half vector) c ~ c / ((1 - c) / 2 + alpha^2 (1 + c) / 2)^2.
+    At alpha = 1 it is the plain cosine: roughness 1 reflects irradiance / pi.
     Phong:  cos^n theta with n = 1 / alpha^2. At alpha = 1 it is the plain cosine as well; exponents below 1 act as 1.
     The variance per axis of a narrow Phong lobe is 1 / n = alpha^2: both lobes are about as wide at equal alpha.
 
@@ -587,8 +588,8 @@ def sample_dfg(table: wp.array2d[wp.vec2], n_dot_v: wp.float32, roughness: wp.fl
 def energy_compensation(dfg: wp.vec2, f0: wp.vec3) -> wp.vec3:
     """Factor on the specular part that adds what scatters more than once [Turquin19]: 1 + F0 (1 / E - 1).
 
-    E = scale + bias is what a surface with F0 = 1 reflects after one scattering. Times this factor it reflects exactly 1:
-    a white furnace stays white. The factor holds for room light and virtual lights alike.
+    E = scale + bias is what a surface with F0 = 1 reflects after one scattering. Times this factor it reflects
+    exactly 1: a white furnace stays white. The factor holds for room light and virtual lights alike.
     """
     return wp.vec3(1.0, 1.0, 1.0) + f0 * (1.0 / wp.max(dfg[0] + dfg[1], 1.0e-3) - 1.0)
 

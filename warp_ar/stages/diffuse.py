@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_ar.kernels import irradiance, pyramid
 from warp_ar.quality import Quality
-from warp_ar.scene import LambertMaterial, MetallicRoughnessMaterial, PhongMaterial, Scene
+from warp_ar.ray_scene import reflects_diffusely
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 
 TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
@@ -21,19 +21,6 @@ CLUSTERS = (8, 16)
 def diffuse_output(quality: Quality) -> str:
     """Name of the resource that holds irradiance at this quality: ``irradiance_sh`` or ``irradiance_map``."""
     return "irradiance_sh" if quality.rung(Diffuse.name) == "sh2" else "irradiance_map"
-
-
-def has_diffuse_surface(scene: Scene) -> bool:
-    """Whether some virtual object reflects diffusely."""
-    for item in scene.objects:
-        material = item.material
-        if isinstance(material, LambertMaterial):
-            return True
-        if isinstance(material, PhongMaterial) and material.diffuse != (0.0, 0.0, 0.0):
-            return True
-        if isinstance(material, MetallicRoughnessMaterial) and material.metallic < 1.0:
-            return True
-    return False
 
 
 class Diffuse(Stage):
@@ -48,7 +35,9 @@ class Diffuse(Stage):
         """Read the environment, write irradiance in the form of the rung."""
         if not request.scene.objects:
             return LeftOut("the scene has no virtual object")
-        if not has_diffuse_surface(request.scene):
+        if not request.scene.probes:
+            return LeftOut("the scene has no probe, so the room's light is unknown")
+        if not any(reflects_diffusely(item.material) for item in request.scene.objects):
             return LeftOut("no virtual object has a diffuse material")
         return Wiring(("environment",), (diffuse_output(request.quality),))
 

@@ -9,19 +9,14 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels import prefilter, pyramid
-from warp_ar.scene import Material, MetallicRoughnessMaterial, MirrorMaterial, PhongMaterial, Scene
+from warp_ar.ray_scene import reflects_glossily
+from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
     """Materials of virtual objects that reflect more than diffusely."""
-    materials = [item.material for item in scene.objects]
-    return [
-        material
-        for material in materials
-        if isinstance(material, (MetallicRoughnessMaterial, MirrorMaterial))
-        or (isinstance(material, PhongMaterial) and material.specular != (0.0, 0.0, 0.0))
-    ]
+    return [item.material for item in scene.objects if reflects_glossily(item.material)]
 
 
 def scene_lobe(scene: Scene) -> prefilter.Lobe:
@@ -42,6 +37,8 @@ class Specular(Stage):
         """Read the environment, write the levels."""
         if not request.scene.objects:
             return LeftOut("the scene has no virtual object")
+        if not request.scene.probes:
+            return LeftOut("the scene has no probe, so the room's light is unknown")
         if not glossy_materials(request.scene):
             return LeftOut("no virtual object has a glossy material")
         return Wiring(("environment",), ("specular_levels",))
