@@ -204,9 +204,12 @@ def reduce_level_kernel(
         # Variances of boxes add: the source's own, widened already, gives about a quarter of what is wanted.
         wanted = wp.min(1.0 / sin_theta, wp.float32(width))
         wider = wp.sqrt(1.0 + 0.75 * (wanted * wanted - 1.0))
-        grow = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
-        column_first -= grow
-        column_last += grow
+        # Every column must count equally often: boxes of whole texels do, and any symmetric box over pairs of columns.
+        half = wp.int32(0.5 * wp.float32(source_width) * (wider - 1.0))
+        column_first -= half
+        column_last += half
+        if source_width != 2 * width:
+            column_last = column_first + source_width * wp.int32(wider + 0.5)
     total = wp.vec3()
     total_weight = wp.float32(0.0)
     r = row_first / height

@@ -1,0 +1,188 @@
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import pyramid as reference
+from warp_ar.kernels import pyramid
+from warp_ar.kernels.latlong import direction_from_latlong
+
+# Float32: sums of a few texels per level, a dozen levels at most, relative to the largest value around.
+ROUNDING = 3e-6
+# Sizes of a level: square numbers, odd ones, single rows, columns and texels.
+SIZES = [(64, 128), (16, 32), (5, 10), (7, 13), (33, 66), (1, 9), (9, 1), (1, 1), (3, 17)]
+
+
+@wp.kernel(enable_backward=False)
+def sample_kernel(
+    levels: wp.array[wp.vec3],
+    level: wp.float32,
+    height: wp.int32,
+    width: wp.int32,
+    coordinates: wp.array[wp.vec2],
+    out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    d = direction_from_latlong(coordinates[i][0], coordinates[i][1], height, width)
+    out[i] = pyramid.sample_pyramid(levels, d, level, height, width)
+
+
+@wp.kernel(enable_backward=False)
+def smooth_kernel(levels: wp.array[wp.vec3], height: wp.int32, coordinates: wp.array[wp.vec2], out: wp.array[wp.vec3]):
+    i = wp.tid()
+    out[i] = pyramid.sample_packed_smooth(levels, 0, height, 2 * height, coordinates[i][0], coordinates[i][1])
+
+
+def build(radiance, **options):
+    height, width = radiance.shape[:2]
+    levels = wp.full(pyramid.packed_texels(height, width), wp.vec3(np.nan), dtype=wp.vec3)
+    pyramid.build_pyramid(wp.array(radiance.astype(np.float32), dtype=wp.vec3), levels, **options)
+    return levels
+
+
+def unpack(levels, height, width):
+    texels = levels.numpy()
+    for level in range(pyramid.level_count(height, width)):
+        size = pyramid.level_size(height, width, level)
+        start = pyramid.level_offset(height, width, level)
+        yield texels[start : start + size[0] * size[1]].reshape(*size, 3).astype(np.float64)
+
+
+def sample(radiance, coordinates, level):
+    out = wp.zeros(len(coordinates), dtype=wp.vec3)
+    points = wp.array(np.asarray(coordinates, np.float32), dtype=wp.vec2)
+    wp.launch(sample_kernel, len(coordinates), [build(radiance), float(level), *radiance.shape[:2], points], [out])
+    return out.numpy()
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_a_constant_map_stays_constant(device, size, isotropic):
+    for level in unpack(build(np.full((*size, 3), (0.5, 2.0, 7.0)), isotropic=isotropic), *size):
+        np.testing.assert_allclose(level, np.broadcast_to((0.5, 2.0, 7.0), level.shape), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_levels_are_the_twin_s(device, size):
+    radiance = np.random.default_rng(1).random((*size, 3)).astype(np.float32).astype(np.float64)
+    for ours, twin in zip(unpack(build(radiance), *size), reference.build_pyramid(radiance), strict=True):
+        np.testing.assert_allclose(ours, twin, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("isotropic", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_every_level_keeps_the_energy(device, size, isotropic):
+    # One-texel sun of 1e6 over 1e-4, in every place: atlas rows 6 and 18.
+    for row in sorted({0, size[0] // 2, size[0] - 1}):
+        radiance = np.full((*size, 3), 1e-4, np.float32).astype(np.float64)
+        radiance[row, size[1] // 3] = 1e6
+        whole = reference.energy(radiance)
+        for level in unpack(build(radiance, isotropic=isotropic), *size):
+            np.testing.assert_allclose(reference.energy(level), whole, rtol=1e-5)
+
+
+def test_isotropic_footprints_are_as_wide_as_high(device):
+    height = 64
+    for row in (3, 9, 20, 32):
+        radiance = np.zeros((height, 2 * height, 3))
+        radiance[row, 60] = 1.0
+        level = list(unpack(build(radiance, isotropic=True), height, 2 * height))[3]  # texels of 8 x 8
+        weight = level[row // 8, :, 0]
+        sine = np.sin(np.pi * (row // 8 + 0.5) / 8)
+        position = (np.arange(16) + 0.5) * np.pi / 8 - (60.5 * np.pi / 64)
+        position = (position + np.pi) % (2 * np.pi) - np.pi
+        spread = np.sqrt((weight * position**2).sum() / weight.sum() + (np.pi / 8) ** 2 / 12) * sine
+        # A box as wide as a row is high has this spread; a bare texel's would be sin theta times it. Texels are
+        # counted whole, and the sun is not in the middle of one: a quarter.
+        assert spread == pytest.approx(np.pi / 8 / np.sqrt(12), rel=0.35)
+
+
+def test_bad_texels_are_contained(device):
+    radiance = np.ones((8, 16, 3))
+    radiance[1, 1], radiance[2, 2], radiance[3, 3], radiance[4, 4] = np.nan, -3281.0, np.inf, 1e30
+    levels = list(unpack(build(radiance), 8, 16))
+    assert levels[0][1, 1, 0] == 0.0
+    assert levels[0][2, 2, 0] == 0.0
+    assert levels[0][3, 3, 0] == levels[0][4, 4, 0] == pyramid.MAX_RADIANCE
+    for level in levels:
+        assert np.isfinite(level).all()
+        assert (level >= 0).all()
+
+
+@pytest.mark.parametrize("level", [0, 1, 2, 3])
+def test_sampling_follows_a_ramp_without_a_shift(device, level):
+    # A half-texel shift passes every furnace: theta itself as radiance, read at many latitudes.
+    height, width = 32, 64
+    theta = np.pi * (np.arange(height) + 0.5) / height
+    radiance = np.repeat(np.repeat(theta[:, None, None], width, 1), 3, 2)
+    rows = np.linspace(8, 24, 33)
+    values = sample(radiance, np.stack([rows, np.full(33, 20.0)], 1), level)[:, 0]
+    # The mean over a texel is weighted by sin theta: off by cot(theta) T^2 / 12 at the outermost texel's centre.
+    texel = np.pi / (height >> level)
+    bias = texel**2 / 12 / np.tan(np.pi / 4 - texel / 2)
+    np.testing.assert_allclose(values, np.pi * rows / height, atol=bias + 1e-5)
+    # And a ramp in longitude, away from the seam.
+    radiance = np.broadcast_to(np.arange(width)[None, :, None] + 0.5, (height, width, 3))
+    columns = np.linspace(12, 52, 41)
+    values = sample(radiance, np.stack([np.full(41, 16.0), columns], 1), level)[:, 0]
+    np.testing.assert_allclose(values, columns, atol=1e-4)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0, 2.3, 9.0, -1.0])
+def test_seam_and_poles_are_continuous(device, level):
+    height, width = 16, 32
+    radiance = np.random.default_rng(2).random((height, width, 3))
+    step = 1e-3
+    beside = [[r, c] for r in (0.3, 4.2, 8.0, 15.9) for c in (step, width - step)]
+    values = sample(radiance, beside, level).reshape(-1, 2, 3)
+    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=4 * step)
+    across = [[r, c] for c in (1.0, 7.3, 15.5) for r, c in ((step, c), (step, c + width / 2))]
+    values = sample(radiance, across, level).reshape(-1, 2, 3)
+    np.testing.assert_allclose(values[:, 0], values[:, 1], atol=4 * step)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_any_direction_of_any_map_is_finite_and_within_its_range(device, size):
+    radiance = 1.0 + np.random.default_rng(3).random((*size, 3))
+    coordinates = np.random.default_rng(4).random((200, 2)) * size
+    coordinates[:4] = [[0, 0], [size[0], 0], [0, size[1]], [size[0], size[1]]]
+    for level in (0.0, 0.7, 2.0, 20.0):
+        values = sample(radiance, coordinates, level)
+        assert (values >= 1.0 - 1e-5).all()
+        assert (values <= 2.0 + 1e-5).all()
+
+
+def test_smooth_sampling_reproduces_a_ramp_and_wraps(device):
+    height, width = 8, 16
+    radiance = np.broadcast_to(np.arange(height)[:, None, None] + 0.5, (height, width, 3)).astype(np.float32)
+    levels = wp.array(np.ascontiguousarray(radiance).reshape(-1, 3), dtype=wp.vec3)
+    rows = np.linspace(2, 6, 17)
+    points = np.array([[r, c] for c in (0.0, 0.4, 8.0, 15.9) for r in rows], np.float32)
+    out = wp.zeros(len(points), dtype=wp.vec3)
+    wp.launch(smooth_kernel, len(points), [levels, height, wp.array(points, dtype=wp.vec2)], [out])
+    np.testing.assert_allclose(out.numpy()[:, 0], points[:, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("source", "target"), [((64, 128), (4, 8)), ((13, 26), (4, 8)), ((9, 20), (9, 20)), ((5, 7), (2, 3))]
+)
+def test_reducing_at_once_is_the_twin_s(device, source, target):
+    radiance = np.random.default_rng(5).random((*source, 3)).astype(np.float32)
+    out = wp.zeros(target, dtype=wp.vec3)
+    pyramid.reduce_latlong(wp.array(radiance, dtype=wp.vec3), out, scale=2.0)
+    np.testing.assert_allclose(
+        out.numpy(), 2 * reference.reduce_latlong(radiance.astype(np.float64), *target), rtol=1e-5
+    )
+
+
+def test_bands_of_rows_make_the_same_bits(device):
+    radiance = np.random.default_rng(6).random((16, 32, 3))
+    whole = build(radiance).numpy()
+    levels = wp.zeros(pyramid.packed_texels(16, 32), dtype=wp.vec3)
+    environment = wp.array(radiance.astype(np.float32), dtype=wp.vec3)
+    for rows in ((0, 7), (7, 16)):
+        pyramid.copy_safe(environment, levels, rows=rows)
+    for level in range(1, pyramid.level_count(16, 32)):
+        height = pyramid.level_size(16, 32, level)[0]
+        for rows in ((0, height // 2), (height // 2, height)):
+            pyramid.reduce_level(16, 32, level, levels, rows=rows)
+    np.testing.assert_array_equal(levels.numpy(), whole)
