@@ -659,8 +659,7 @@ def _read_source(table: _Table) -> SourceSpec:
         also = f"{given[0]} is given too; " if given else ""
         table.fail(key, f"{also}expected exactly one of path, camera and synthetic")
     path = table.resolve("path", "a folder of frames or a video") if "path" in table else None
-    if path is not None and not path.exists():
-        table.fail("path", f"no such file or folder: {path}")
+    # Whether the path is there is asked when the source is opened: another source may stand in for it.
     return SourceSpec(
         path=path,
         camera=table.integer("camera", low=0, high=1023) if "camera" in table else None,
