@@ -21,7 +21,7 @@ shares of finer ones by exact overlap, so every size works. Without any confiden
 **Key lights.** With the mean radiance L0 of the map, a texel's excess max(lum L - lum L0, 0) is what makes it a light; a uniform room has none.
 Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have left over: the best of the 8 x 16 cells' directions, pulled
 to the centre of its lobe by mean shifts with ever narrower kernels (max(cos, 0), cos^2, cos^8, then the texels within ``LOBE_OUTER``), and at last to
-the centroid of what is brighter than half the lobe's peak. Starting broad keeps the centre of a window half a sky wide where it is.
+the centroid of what rises above ``CORE`` of the lobe's peak: glow and scratches of the ball do not pull at it. Starting broad keeps the centre of a window half a sky wide where it is.
 
 A direction s dominates as far as the light's flow goes its way and no rival stands elsewhere. With V = integral of L d and the scalar
 irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first order (the cosine lobe's first two
@@ -84,6 +84,8 @@ KEY_CELLS = wp.constant(CELL_ROWS * CELL_COLUMNS)
 LOBE_INNER = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 LOBE_OUTER = wp.constant(wp.float32(math.cos(math.radians(40.0))))
 """Cosines of the angles up to which a texel belongs to a light whole, and at all."""
+CORE = wp.constant(wp.float32(0.9))
+"""Share of a lobe's peak above which texels say where exactly the light is."""
 LOBE_ANGLE = wp.constant(wp.float32(math.radians(40.0)))
 SEGMENTS = wp.constant(4)
 KEY_BLOCK = 256  # as other launches: another size would compile the whole module a second time
@@ -740,7 +742,7 @@ def find_key_lights_kernel(
                 power = wp.where(step < 2, 1, wp.where(step < 4, 2, 8))
                 direction = shift_on_cells(cells, found, k, direction, power)
 
-        # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of what is brighter than half the peak;
+        # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
         # 3: what the lobe gives.
         peak = wp.float32(0.0)
         for step in range(4):
@@ -767,7 +769,7 @@ def find_key_lights_kernel(
                             share = lobe_window(cosine) * left_over(at, found, k)
                             weight = area * share * excess
                             if step == 2:
-                                weight = area * share * wp.max(excess - 0.5 * peak, 0.0)
+                                weight = area * share * wp.max(excess - CORE * peak, 0.0)
                             if step < 3:
                                 highest = wp.max(highest, share * excess)
                                 sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
