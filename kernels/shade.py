@@ -185,37 +185,36 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
             hit = Hit()
             if found >= 0:
                 hit = hits[i, j]
-            edge = bool(False)
+            samples = wp.where(found >= 0, 1, 0)
             if wp.static(side > 1):
                 reach = EDGE_FOOTPRINTS * hit.t / params[0].focal[0]
-                edge = differs(i - 1, j, found, reach, rect, hit_object, hits, hit)
-                edge = edge or differs(i + 1, j, found, reach, rect, hit_object, hits, hit)
-                edge = edge or differs(i, j - 1, found, reach, rect, hit_object, hits, hit)
-                edge = edge or differs(i, j + 1, found, reach, rect, hit_object, hits, hit)
+                for k in range(4):
+                    row = i + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
+                    column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
+                    if differs(row, column, found, reach, rect, hit_object, hits, hit):
+                        samples = wp.static(side * side)
             ray = rays[i, j]
             origin = params[0].camera_position
-            if edge:
-                for sample in range(wp.static(side * side)):
-                    a = sample % wp.static(side)
-                    b = sample / wp.static(side)
-                    n = wp.static(float(side))
-                    x = (wp.float32(a) + (wp.float32(b) + 0.5) / n) / n - 0.5
-                    y = (wp.float32(b) + (n - 0.5 - wp.float32(a)) / n) / n - 0.5
-                    inner = wp.vec3(ray[0] + x / params[0].focal[0], ray[1] + y / params[0].focal[1], 1.0)
-                    direction = params[0].world_from_camera * inner
-                    seen = closest_visible(scene, origin, direction)
-                    if seen.shape >= 0:
-                        radiance = shade_hit(
-                            scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, seen, direction
-                        )
-                        result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
-                result = result / wp.static(float(side * side))
-            elif found >= 0:
-                direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
-                radiance = shade_hit(
-                    scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction
-                )
-                result = wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+            for sample in range(samples):
+                inner = wp.vec3(ray[0], ray[1], 1.0)
+                if wp.static(side > 1):
+                    if samples > 1:
+                        n = wp.static(float(side))
+                        a = wp.float32(sample % wp.static(side))
+                        b = wp.float32(sample / wp.static(side))
+                        inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
+                        inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
+                direction = params[0].world_from_camera * inner
+                if wp.static(side > 1):
+                    if samples > 1:
+                        hit = closest_visible(scene, origin, direction)
+                if hit.shape >= 0:
+                    radiance = shade_hit(
+                        scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction
+                    )
+                    result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+            if samples > 1:
+                result = result / wp.float32(samples)
         virtual_out[i, j] = result
 
     return shade_kernel

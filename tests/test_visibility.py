@@ -1,0 +1,480 @@
+"""Rays: closed forms, the float64 twin, edges that must not leak, origins that must not shadow themselves."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import visibility as reference
+from warp_ar.geometry import Mesh, rotation_matrix, smooth_normals, sphere_mesh, torus_mesh
+from warp_ar.kernels import structs
+from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, make_trace, offset_origin, trace_pixels
+from warp_ar.ray_scene import make_ray_mesh
+
+EVERY = (structs.PLANE, structs.BOX, structs.MESH, structs.SPHERE)
+GENERAL = TraceConfig(EVERY, EVERY)
+
+# Float32 positions and directions of order 1 carry 6e-8 each; some twenty roundings reach t and point, and a grazing
+# angle of 3 degrees multiplies them by 20.
+T_TOLERANCE = 3e-5
+# The same roundings over the size of a triangle, here a tenth of its mesh.
+NORMAL_TOLERANCE = 1e-5
+# A ray within this of an outline may fall on either side of it.
+OUTLINE_SHARE = 2e-4
+
+
+@functools.cache
+def make_probe_kernel(config: TraceConfig) -> wp.Kernel:
+    """Runs every trace function on one ray per thread."""
+    trace = make_trace(config)
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    by_objects, by_proxies, by_any = trace.occluded_by_objects, trace.occluded_by_proxies, trace.occluded
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def probe_kernel(
+        # In:
+        scene: structs.RayScene,
+        origins: wp.array[wp.vec3],
+        directions: wp.array[wp.vec3],
+        t_max: wp.float32,
+        # Out:
+        objects_out: wp.array[Hit],
+        proxies_out: wp.array[Hit],
+        occluded_out: wp.array[wp.vec3i],
+    ):
+        i = wp.tid()
+        objects_out[i] = closest_object(scene, origins[i], directions[i], t_max)
+        proxies_out[i] = closest_proxy(scene, origins[i], directions[i], t_max)
+        occluded_out[i] = wp.vec3i(
+            wp.where(by_objects(scene, origins[i], directions[i], t_max), 1, 0),
+            wp.where(by_proxies(scene, origins[i], directions[i], t_max), 1, 0),
+            wp.where(by_any(scene, origins[i], directions[i], t_max), 1, 0),
+        )
+
+    return probe_kernel
+
+
+# A scene holds meshes by number only; these keep them until the test ends.
+_ALIVE: list = []
+
+
+@pytest.fixture(autouse=True)
+def _release_meshes():
+    yield
+    _ALIVE.clear()
+
+
+class World:
+    """Shapes on a device and their twins."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.bodies: list[reference.Body] = []
+        self._records: list[np.ndarray] = []
+        self._meshes: list = []
+        self._corners = 0
+
+    def add(self, kind, extent=(1.0, 1.0, 1.0), at=(0.0, 0.0, 0.0), rotate=(0.0, 0.0, 0.0), scale=1.0, mesh=None):
+        record = np.zeros((), np.dtype(structs.Shape.numpy_dtype()))
+        rotation, position = rotation_matrix(rotate), np.array(at, np.float64)
+        record["rotation"], record["scale"], record["smooth"], record["material"] = rotation, scale, 1, -1
+        if mesh is not None:
+            made = make_ray_mesh(mesh, self.device)
+            record["mesh"], record["first_vertex"], extent = made.mesh.id, self._corners, made.half
+            position = position + scale * rotation @ made.center
+            triangles = (mesh.vertices.astype(np.float64) - made.center)[mesh.faces]
+            self._corners += len(made.normals)
+            self._meshes.append(made)
+            _ALIVE.append(made)
+        else:
+            triangles = None
+        kinds = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
+        record["kind"], record["extent"], record["position"] = kinds[kind], extent, position
+        self._records.append(record)
+        # The twin sees the rounded numbers that the device sees.
+        self.bodies.append(
+            reference.Body(
+                kind,
+                record["rotation"].astype(np.float64),
+                record["position"].astype(np.float64),
+                float(record["scale"]),
+                record["extent"].astype(np.float64),
+                triangles,
+            )
+        )
+        return self
+
+    def scene(self, *, proxies: bool = False) -> structs.RayScene:
+        records = np.zeros(len(self._records), self._records[0].dtype)
+        for index, record in enumerate(self._records):
+            records[index] = record
+        shapes = wp.array(records, dtype=structs.Shape, device=self.device)
+        nothing = wp.zeros(0, dtype=structs.Shape, device=self.device)
+        scene = structs.RayScene()
+        scene.objects, scene.proxies = (nothing, shapes) if proxies else (shapes, nothing)
+        normals = np.concatenate([np.zeros((0, 3), np.float32), *(mesh.normals for mesh in self._meshes)])
+        uvs = np.concatenate([np.zeros((0, 2), np.float32), *(mesh.uvs for mesh in self._meshes)])
+        scene.vertex_normals = wp.array(normals, dtype=wp.vec3, device=self.device)
+        scene.vertex_uvs = wp.array(uvs, dtype=wp.vec2, device=self.device)
+        return scene
+
+
+def shoot(scene, origins, directions, device, *, config=GENERAL, t_max=float(FAR)):
+    """Hits on objects and proxies as structured arrays, and the three answers of the any-hit functions."""
+    origins, directions = np.broadcast_arrays(np.asarray(origins, np.float32), np.asarray(directions, np.float32))
+    count = len(origins)
+    outputs = [
+        wp.zeros(count, dtype=Hit, device=device),
+        wp.zeros(count, dtype=Hit, device=device),
+        wp.zeros(count, dtype=wp.vec3i, device=device),
+    ]
+    inputs = [
+        scene,
+        wp.array(np.ascontiguousarray(origins), dtype=wp.vec3, device=device),
+        wp.array(np.ascontiguousarray(directions), dtype=wp.vec3, device=device),
+        t_max,
+    ]
+    wp.launch(make_probe_kernel(config), dim=count, inputs=inputs, outputs=outputs, device=device)
+    return tuple(output.numpy() for output in outputs)
+
+
+def unit(rng, count):
+    v = rng.normal(size=(count, 3))
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def icosphere(subdivisions: int) -> Mesh:
+    """Closed sphere of radius 1 whose triangles share every vertex."""
+    g = (1 + 5**0.5) / 2
+    v = [[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0], [0, -1, g], [0, 1, g]]
+    v += [[0, -1, -g], [0, 1, -g], [g, 0, -1], [g, 0, 1], [-g, 0, -1], [-g, 0, 1]]
+    f = np.array(
+        [[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6]]
+        + [[7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10]]
+        + [[8, 6, 7], [9, 8, 1]]
+    )
+    v = np.array(v) / np.linalg.norm(v[0])
+    for _ in range(subdivisions):
+        edges = np.sort(f[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        middle = v[unique].mean(1)
+        m = len(v) + inverse.reshape(-1, 3)
+        v = np.concatenate([v, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        f = np.concatenate(
+            [
+                np.stack([f[:, 0], m[:, 0], m[:, 2]], 1),
+                np.stack([f[:, 1], m[:, 1], m[:, 0]], 1),
+                np.stack([f[:, 2], m[:, 2], m[:, 1]], 1),
+                m,
+            ]
+        )
+    return Mesh(v.astype(np.float32), f.astype(np.int32), v.astype(np.float32))
+
+
+# --- Closed form ------------------------------------------------------------------------------------------------------
+
+
+def test_closed_form(device):
+    """One ray each at a sphere, a box, a plane and a mesh, turned, moved and scaled."""
+    cases = [
+        ("sphere", {"extent": (0.5, 0.5, 0.5), "scale": 2.0, "at": (1, 2, 3)}, (1, 2, 10), (0, 0, -2), 3.0, (0, 0, 1)),
+        ("sphere", {"extent": (0.5, 0.5, 0.5), "scale": 2.0}, (0, 0, 0), (0, 1, 0), 1.0, (0, 1, 0)),
+        ("box", {"extent": (1, 2, 3), "rotate": (0, 0, 90)}, (5, 0, 0), (-1, 0, 0), 3.0, (1, 0, 0)),
+        ("box", {"extent": (1, 2, 3)}, (0, 0, 0), (0, 0, -1), 3.0, (0, 0, -1)),
+        ("plane", {"extent": (1, 1, 0), "at": (0, 0, 1)}, (0.9, 0.9, 3), (0, 0, -1), 2.0, (0, 0, 1)),
+        ("plane", {"extent": (1, 1, 0), "at": (0, 0, 1)}, (0.9, 0.9, 0), (0, 0, 1), 1.0, (0, 0, 1)),
+    ]
+    for kind, shape, origin, direction, t, normal in cases:
+        hits, _, occluded = shoot(World(device).add(kind, **shape).scene(), [origin], [direction], device)
+        assert hits["shape"][0] == 0
+        np.testing.assert_allclose(hits["t"][0], t, rtol=1e-6)
+        np.testing.assert_allclose(hits["point"][0], np.add(origin, np.multiply(t, direction)), atol=2e-6)
+        np.testing.assert_allclose(hits["geometric_normal"][0], normal, atol=1e-6)
+        assert occluded[0].tolist() == [1, 0, 1]
+        hits, _, occluded = shoot(
+            World(device).add(kind, **shape).scene(), [origin], [direction], device, t_max=t - 0.01
+        )
+        assert hits["shape"][0] == -1
+        assert occluded[0].tolist() == [0, 0, 0]
+    hits, _, _ = shoot(World(device).add("plane", extent=(1, 1, 0)).scene(), [(1.1, 0, 1)], [(0, 0, -1)], device)
+    assert hits["shape"][0] == -1
+
+
+def test_texture_coordinates(device):
+    """Spheres as a latlong map, boxes 0 to 1 on every face, meshes interpolated."""
+    hits, _, _ = shoot(
+        World(device).add("sphere").scene(),
+        [(3, 0, 0), (0, 3, 0), (0, 0, 3)],
+        [(-1, 0, 0), (0, -1, 0), (0, 0, -1)],
+        device,
+    )
+    np.testing.assert_allclose(hits["uv"][0], [0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(hits["uv"][1], [0.75, 0.5], atol=1e-6)
+    assert hits["uv"][2][1] == pytest.approx(1.0, abs=1e-6)
+    box = World(device).add("box", extent=(1, 2, 4)).scene()
+    hits, _, _ = shoot(box, [(5, 1, 2), (-5, 1, 2)], [(-1, 0, 0), (1, 0, 0)], device)
+    np.testing.assert_allclose(hits["uv"], [[0.75, 0.75], [0.25, 0.75]], atol=1e-6)
+    ball = sphere_mesh(1.0)
+    rng = np.random.default_rng(5)
+    directions = unit(rng, 500)
+    hits, _, _ = shoot(World(device).add("mesh", mesh=ball).scene(), 3 * directions, -directions, device)
+    u = 0.5 + np.arctan2(directions[:, 1], directions[:, 0]) / (2 * np.pi)
+    away_from_poles = np.abs(directions[:, 2]) < 0.9
+    assert (hits["shape"] == 0).all()
+    # Interpolated over triangles of 1/100 turn; what is wrong is far more.
+    np.testing.assert_allclose(hits["uv"][away_from_poles, 0], u[away_from_poles], atol=2e-3)
+    np.testing.assert_allclose(hits["normal"], directions, atol=2e-3)
+
+
+# --- The float64 twin -------------------------------------------------------------------------------------------------
+
+
+def test_matches_reference(device):
+    """A crowd of all kinds, as objects and as proxies, general and specialised, against brute force in double precision."""
+    rng = np.random.default_rng(1)
+    world = World(device)
+    torus = torus_mesh(0.5, 0.2, tolerance=0.02)
+    for kind in ("sphere", "box", "plane", "mesh") * 3:
+        world.add(
+            kind,
+            extent=rng.uniform(0.2, 0.6, 3) if kind != "sphere" else np.full(3, rng.uniform(0.2, 0.6)),
+            at=rng.uniform(-1.5, 1.5, 3),
+            rotate=rng.uniform(-180, 180, 3),
+            scale=rng.uniform(0.5, 1.5),
+            mesh=torus if kind == "mesh" else None,
+        )
+    origins = rng.uniform(-3, 3, (20000, 3)).astype(np.float32)
+    directions = (rng.uniform(-1, 1, (20000, 3)) - origins * 0.3).astype(np.float32)
+    t, which, normal = reference.closest(world.bodies, origins.astype(np.float64), directions.astype(np.float64))
+    objects, none, occluded = shoot(world.scene(), origins, directions, device)
+    assert (none["shape"] == -1).all()
+    same = objects["shape"] == which
+    assert (which >= 0).mean() > 0.15
+    assert (~same).mean() < OUTLINE_SHARE
+    hit = same & (which >= 0)
+    np.testing.assert_array_equal(occluded[:, 0], objects["shape"] >= 0)
+    np.testing.assert_array_equal(occluded[:, 1], 0)
+    facing = np.abs(np.sum(normal * directions, -1)) / np.linalg.norm(directions, axis=-1)
+    steep = hit & (facing > 0.05)
+    np.testing.assert_allclose(objects["t"][steep], t[steep], rtol=T_TOLERANCE, atol=T_TOLERANCE)
+    turned = np.abs(objects["geometric_normal"] - normal).max(-1)[steep]
+    assert (turned > NORMAL_TOLERANCE).mean() < 2e-3  # rays at the edge between two faces
+    points = origins + t[:, None] * directions
+    np.testing.assert_allclose(objects["point"][steep], points[steep], atol=1e-4)
+
+    nothing, proxies, occluded = shoot(world.scene(proxies=True), origins, directions, device)
+    assert (nothing["shape"] == -1).all()
+    np.testing.assert_array_equal(proxies["shape"], objects["shape"])
+    np.testing.assert_array_equal(occluded[:, 1], objects["shape"] >= 0)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "mesh"])
+def test_specialised_equals_general(device, kind):
+    """A config that knows only the kinds that exist gives the same hits, bit for bit."""
+    rng = np.random.default_rng(2)
+    mesh = torus_mesh(0.5, 0.2, tolerance=0.02) if kind == "mesh" else None
+    scene = World(device).add(kind, mesh=mesh, extent=(0.6, 0.6, 0.6)).add(kind, mesh=mesh, at=(0.5, 0, 0)).scene()
+    directions = unit(rng, 2000)
+    origins = 2 * unit(rng, 2000)
+    special = TraceConfig((structs.SPHERE if kind == "sphere" else structs.MESH,), ())
+    general = shoot(scene, origins, directions, device)
+    specialised = shoot(scene, origins, directions, device, config=special)
+    for field in ("shape", "t", "point", "normal", "geometric_normal", "uv"):
+        np.testing.assert_allclose(
+            specialised[0][field], general[0][field], rtol=0, atol=0 if device == "cpu" else 1e-6
+        )
+    np.testing.assert_array_equal(specialised[2], general[2])
+
+
+# --- Hard cases -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("far", [0.0, 30.0])
+def test_no_leak_through_shared_edges_and_vertices(device, far):
+    """Rays aimed at edges and vertices of closed meshes from inside; and from far outside, where the silhouette is clear."""
+    rng = np.random.default_rng(3)
+    for mesh in (icosphere(4), torus_mesh(0.5, 0.2, tolerance=0.01)):
+        world = World(device).add("mesh", mesh=mesh, rotate=(10, 20, 30))
+        body = world.bodies[0]
+        count = 200_000
+        corners = body.triangles[rng.integers(len(body.triangles), size=count)]
+        weight = rng.random(count)[:, None]
+        weight[::10] = 0.0
+        targets = corners[:, 0] * (1 - weight) + corners[:, 1] * weight
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        tube = targets * [1, 1, 0]
+        inside = 0.0 * targets if len(mesh.faces) == 5120 else 0.5 * tube / np.linalg.norm(tube, axis=-1, keepdims=True)
+        start = targets + far * normals if far else inside
+        origins = (start @ body.rotation.T + body.position).astype(np.float32)
+        directions = ((targets - start) @ body.rotation.T).astype(np.float32)
+        hits, _, occluded = shoot(world.scene(), origins, directions, device)
+        assert (hits["shape"] == 0).all(), f"{(hits['shape'] != 0).sum()} of {count} rays leaked"
+        assert (occluded[:, 0] == 1).all()
+        if not far:
+            assert (hits["t"] < 1.0 + 1e-4).all()
+
+
+def test_axis_aligned_rays_from_a_face(device):
+    """Along an axis from an origin on a face, and in the plane of a face: as seen from inside, never NaN."""
+    cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)], np.float32)
+    faces = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+    ]
+    faces = np.array([*faces, [1, 5, 7], [1, 7, 3]], np.int32)
+    mesh = Mesh(cube, faces, smooth_normals(cube, faces))
+    origins = [(1, 0, 0), (1, 0.3, -5), (0.2, 1, -5), (0, 0, 1), (1, 1, -5)]
+    directions = [(-1, 0, 0), (0, 0, 1), (0, 0, 1), (0, 0, -1), (0, 0, 1)]
+    for world in (World(device).add("box"), World(device).add("mesh", mesh=mesh)):
+        hits, _, occluded = shoot(world.scene(), origins, directions, device)
+        assert np.isfinite(hits["t"]).all()
+        # From a face inward: the far side. The mesh may report the face itself, at t = 0.
+        assert hits["shape"][0] == 0
+        assert hits["shape"][3] == 0
+        # In the plane of a face, five units before it.
+        for index in (1, 2, 4):
+            assert hits["shape"][index] == 0
+            np.testing.assert_allclose(hits["t"][index], 4.0, rtol=1e-5)
+        np.testing.assert_array_equal(occluded[:, 0], 1)
+
+
+def test_degenerate_triangles(device):
+    """Zero-area, duplicated and inside-out triangles: hits stay finite, the good ones are found."""
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 1], [4, 4, 4], [0, 4, 2], [0, 0, 1]], np.int32)
+    mesh = Mesh(vertices, faces, smooth_normals(vertices, faces))
+    rng = np.random.default_rng(4)
+    origins = np.concatenate([rng.uniform(-0.9, 0.9, (1000, 2)), np.full((1000, 1), 2.0)], -1)
+    hits, _, _ = shoot(World(device).add("mesh", mesh=mesh).scene(), origins, [(0, 0, -1)], device)
+    assert (hits["shape"] == 0).all()
+    np.testing.assert_allclose(hits["t"], 2.0, rtol=1e-5)
+    assert np.isfinite(hits["normal"]).all()
+    np.testing.assert_allclose(np.abs(hits["geometric_normal"][:, 2]), 1.0, atol=1e-6)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def leave_kernel(
+    # In:
+    hits: wp.array[Hit],
+    directions: wp.array[wp.vec3],
+    # Out:
+    origins_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    hit = hits[i]
+    origins_out[i] = offset_origin(hit.point, hit.geometric_normal, directions[i], hit.error)
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.05, 1.0, 1e3])
+@pytest.mark.parametrize("distance", [0.0, 1.0, 1e3])
+@pytest.mark.parametrize("kind", ["sphere", "box", "plane", "mesh"])
+def test_rays_that_leave_do_not_come_back(device, kind, size, distance):
+    """From any convex surface outward, at any scale and distance from the origin: nothing shadows itself; inward: all do."""
+    rng = np.random.default_rng(6)
+    at = distance * np.array([0.6, -0.64, 0.48])
+    mesh = icosphere(3) if kind == "mesh" else None
+    scene = World(device).add(kind, at=at, rotate=(20, 30, 40), scale=size, mesh=mesh).scene()
+    views = unit(rng, 4000)
+    starts = (at + size * 3 * views + size * rng.uniform(-0.5, 0.5, (4000, 3))).astype(np.float32)
+    hits, _, _ = shoot(scene, starts, -views, device)
+    met = hits["shape"] == 0
+    assert met.mean() > 0.1
+    hits = hits[met]
+    normal = hits["geometric_normal"]
+    directions = unit(rng, len(hits))
+    directions *= np.sign(np.sum(directions * normal, -1, keepdims=True))
+    # Half of them graze.
+    graze = directions - 0.9999 * np.sum(directions * normal, -1, keepdims=True) * normal
+    directions[::2] = (graze / np.linalg.norm(graze, axis=-1, keepdims=True))[::2]
+    origins = wp.zeros(len(hits), dtype=wp.vec3, device=device)
+    wp.launch(
+        leave_kernel,
+        dim=len(hits),
+        inputs=[
+            wp.array(hits, dtype=Hit, device=device),
+            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=device),
+        ],
+        outputs=[origins],
+        device=device,
+    )
+    _, _, occluded = shoot(scene, origins.numpy(), directions, device)
+    assert occluded[:, 0].sum() == 0
+    # The offset is no more than a few roundings of the numbers at hand.
+    assert hits["error"].max() < 1e-5 * (size * 2 + distance)
+
+
+# --- Frames -----------------------------------------------------------------------------------------------------------
+
+
+def camera(device, *, rect, eye=(0.0, 0.0, 0.0), size=(48, 64), focal=60.0):
+    """Frame values and rays of a camera at ``eye`` that looks along +z."""
+    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+    params["camera_position"], params["world_from_camera"] = eye, np.eye(3)
+    params["focal"], params["object_rect"] = focal, rect
+    x, y = np.meshgrid((np.arange(size[1]) - 31.5) / focal, (np.arange(size[0]) - 23.5) / focal)
+    return (
+        wp.array(params, dtype=structs.FrameParams, device=device),
+        wp.array(np.stack([x, y], -1).astype(np.float32), dtype=wp.vec2, device=device),
+    )
+
+
+def frame_of(scene, device, *, rect, bands=(None,)):
+    params, rays = camera(device, rect=rect)
+    found = wp.full(rays.shape, 7, dtype=wp.int32, device=device)
+    depth = wp.zeros(rays.shape, dtype=wp.float32, device=device)
+    hits = wp.zeros(rays.shape, dtype=Hit, device=device)
+    for rows in bands:
+        trace_pixels(GENERAL, params, rays, scene, found, depth, hits, rows=rows)
+    return found.numpy(), depth.numpy(), hits.numpy()
+
+
+def test_frame(device):
+    """Depth is along the camera's axis; outside the rectangle nothing is found; bands make the whole."""
+    scene = World(device).add("sphere", extent=(0.5, 0.5, 0.5), at=(0, 0, 2)).add("box", at=(0, 0, 5), extent=(9, 9, 1))
+    scene = scene.scene()
+    found, depth, hits = frame_of(scene, device, rect=(0, 48, 0, 64))
+    assert set(np.unique(found)) == {0, 1}
+    np.testing.assert_allclose(depth[found == 1], 4.0, rtol=1e-6)
+    assert depth[24, 32] == pytest.approx(1.5, abs=1e-3)
+    np.testing.assert_allclose(hits["point"][..., 2], depth, rtol=1e-5)
+    # The ball's outline: half angle asin(0.5 / 2), area pi (60 tan)^2.
+    assert (found == 0).sum() == pytest.approx(np.pi * (60 * np.tan(np.arcsin(0.25))) ** 2, rel=0.02)
+
+    part, part_depth, _ = frame_of(scene, device, rect=(10, 20, 30, 40))
+    outside = np.ones(part.shape, bool)
+    outside[10:20, 30:40] = False
+    assert (part[outside] == -1).all()
+    assert np.isposinf(part_depth[outside]).all()
+    np.testing.assert_array_equal(part[~outside], found[~outside])
+
+    banded, banded_depth, _ = frame_of(scene, device, rect=(0, 48, 0, 64), bands=((0, 11), (11, 40), (40, 48)))
+    np.testing.assert_array_equal(banded, found)
+    np.testing.assert_array_equal(banded_depth, depth)
+
+
+def test_proxies_hide_what_is_behind_them(device):
+    """A plane hides from both sides; an object that touches a proxy is seen."""
+    for turn, hidden in ((0, True), (180, True)):
+        world = World(device).add("sphere", extent=(0.5, 0.5, 0.5), at=(0, 0, 2))
+        screen = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 1), rotate=(turn, 0, 0))
+        scene = world.scene()
+        scene.proxies = screen.scene(proxies=True).proxies
+        found, depth, _ = frame_of(scene, device, rect=(0, 48, 0, 64))
+        assert (found == -1).all() == hidden
+        assert np.isposinf(depth).all()
+    touching = World(device).add("box", at=(0, 0, 3), extent=(1, 1, 1)).scene()
+    touching.proxies = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 2)).scene(proxies=True).proxies
+    found, _, _ = frame_of(touching, device, rect=(0, 48, 0, 64))
+    assert found[24, 32] == 0
