@@ -12,6 +12,11 @@ import warp as wp
 wp.config.log_level = wp.LOG_WARNING
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of this suite."""
+    parser.addoption("--update-golden", action="store_true", help="write the golden frames anew instead of comparing")
+
+
 def _devices() -> list[str]:
     wp.init()
     return ["cpu", *(str(device) for device in wp.get_cuda_devices()[:1])]

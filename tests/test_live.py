@@ -1,0 +1,203 @@
+"""The command, from its arguments to its files, messages and exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from warp_ar import explain, live
+from warp_ar.sinks import read_environment
+from warp_ar.sources import Synthetic
+
+FRAMES = 4
+
+SCENE = """
+schema = 1
+name = "small"
+[camera]
+width = {width}
+height = {height}
+fx = {fx}
+fy = {fy}
+cx = {cx}
+cy = {cy}
+[source]
+{source}
+[marker]
+size = {marker}
+{body}
+"""
+PROBE = """
+[probe]
+center = [-0.1, 0.03, 0.03]
+radius = 0.03
+"""
+OBJECT = """
+[[object]]
+shape = "sphere"
+radius = 0.03
+at = [0.1, 0.0, 0.03]
+[object.material]
+model = "lambert"
+base_color = [0.5, 0.5, 0.5]
+"""
+
+
+def write_scene(folder: Path, body: str = PROBE + OBJECT, source: str = 'synthetic = "card"', **changes: float) -> Path:
+    with Synthetic("card") as card:
+        matrix, (width, height) = card.camera_matrix, card.size
+    values = {"width": width, "height": height, "fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    path = folder / "scene.toml"
+    path.write_text(SCENE.format(body=body, source=source, marker=Synthetic.MARKER_SIZE, **{**values, **changes}))
+    return path
+
+
+def run(*arguments: object) -> int:
+    return live.main([str(argument) for argument in ("--device", "cpu", "--quality", "low", *arguments)])
+
+
+def message(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that an error prints."""
+    text = capsys.readouterr().err
+    assert text.startswith("warp_ar: ")
+    assert text.count("\n") == 1, text
+    return text
+
+
+def test_folder_report_and_environment(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path)
+    out, light, report = tmp_path / "out", tmp_path / "light", tmp_path / "reports" / "run.json"
+    assert run(scene, "--headless", "--frames", FRAMES, "--output", out, "--save-environment", light, "--report", report) == 0
+    assert sorted(path.name for path in out.iterdir()) == [f"{index:04d}.png" for index in range(FRAMES)]
+    assert sorted(path.name for path in light.iterdir()) == [f"{index:04d}.exr" for index in range(FRAMES)]
+    assert read_environment(light / "0000.exr").shape == (32, 64, 3)
+    data = json.loads(report.read_text())
+    assert data["device"] == "cpu"
+    assert data["quality"] == "low"
+    assert data["warp"]
+    assert [frame["index"] for frame in data["frames"]] == list(range(FRAMES))
+    assert data["stages_run"][:2] == ["track", "unwrap"]
+    assert {entry["stage"] for entry in data["stages_left_out"]} == {"key_lights", "specular", "summed_area", "relight", "expose"}
+    with Synthetic("card") as card:
+        for frame in data["frames"]:
+            rotation, translation = card.pose(frame["index"])
+            np.testing.assert_allclose(frame["pose"]["R"], rotation, atol=0.02)
+            np.testing.assert_allclose(frame["pose"]["t"], translation, atol=0.01)
+            assert set(frame["stages"]) <= set(data["stages_run"])
+
+
+def test_video_and_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    video = tmp_path / "lit.mp4"
+    assert run(write_scene(tmp_path), "--frames", FRAMES, "--output", video) == 0
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        assert sum(1 for _ in container.decode(video=0)) == FRAMES
+    text = capsys.readouterr().out
+    assert "left out" in text
+    assert "unwrap" in text
+
+
+def test_the_frame_passes_untouched_where_nothing_is_asked_for(tmp_path: Path) -> None:
+    assert run(write_scene(tmp_path, body=""), "--headless", "--frames", 2, "--output", tmp_path / "out") == 0
+    with Synthetic("card") as card:
+        for frame, path in zip(card, sorted((tmp_path / "out").iterdir()), strict=False):
+            np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], frame.image)
+
+
+def test_list_names_every_bundled_scene(capsys: pytest.CaptureFixture[str]) -> None:
+    assert live.main(["--list"]) == 0
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert {"desk", "torus", "wire_coincident", "wire_opposing", "darken", "mirror"} <= set(names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["no_such_scene"], "no_such_scene"),
+        (["desk", "--quality", "best"], "quality 'best' is no preset; expected paper, low, medium"),
+        (["desk", "--device", "cuda:99"], "device 'cuda:99' is not here"),
+        (["desk", "--frames", "0"], "--frames 0"),
+        (["desk", "--frames", "many"], "--frames"),
+        (["desk", "--source", "/no/such/clip.mp4"], "/no/such/clip.mp4"),
+        (["desk", "--calibration", "/no/such/file.yml"], "/no/such/file.yml"),
+        (["desk", "--output", "/proc/no.mp4"], "/proc cannot be written to"),
+        (["desk", "--output", "picture.xyz"], "picture.xyz"),
+        (["desk", "--no-such-option"], "--no-such-option"),
+    ],
+)
+def test_bad_usage_is_one_line_and_exit_code_2(
+    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert live.main([*arguments, "--headless"]) == 2
+    assert expected in message(capsys)
+
+
+def test_unknown_key_names_the_nearest(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(tmp_path, body=OBJECT.replace("radius", "raduis"))
+    assert run(scene, "--headless") == 2
+    text = message(capsys)
+    assert "raduis" in text
+    assert "radius" in text.replace("raduis", "")
+
+
+def test_another_size_must_scale_the_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(write_scene(tmp_path, width=640, height=400), "--headless") == 2
+    assert "640" in message(capsys)
+
+
+def test_no_marker_is_said_and_the_frames_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(tmp_path)
+    scene.write_text(scene.read_text().replace("[marker]", "[marker]\nid = 7"))
+    assert run(scene, "--headless", "--frames", 3, "--output", tmp_path / "out") == 1
+    assert "no marker in the first 3 frames: expected DICT_4X4_50 id 7" in message(capsys)
+    assert len(list((tmp_path / "out").iterdir())) == 3
+
+
+def test_a_source_that_breaks_leaves_a_valid_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    with Synthetic("card", length=3) as card:
+        for frame in card:
+            cv2.imwrite(str(frames / f"{frame.index:04d}.png"), frame.image[..., ::-1])
+    (frames / "0003.png").write_bytes((frames / "0002.png").read_bytes()[:2000])
+    video = tmp_path / "out.mp4"
+    assert run(write_scene(tmp_path, source='path = "frames"'), "--headless", "--output", video) == 1
+    text = message(capsys)
+    assert "0003.png" in text
+    assert "3 frames were written" in text
+    with av.open(str(video)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are sent as on POSIX")
+def test_interrupt_finishes_the_file_and_exits_130(tmp_path: Path) -> None:
+    video = tmp_path / "out.mp4"
+    scene = write_scene(tmp_path)
+    command = [sys.executable, "-m", "warp_ar.live", str(scene), "--device", "cpu", "--quality", "low", "--loop", "--headless", "--output", str(video)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not (video.exists() and video.stat().st_size > 1000) and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert errors == ""
+    with av.open(str(video)) as container:
+        assert sum(1 for _ in container.decode(video=0)) > 0
+
+
+def test_explain_runs_no_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(tmp_path, source='path = "scene.toml"')  # no picture: opening it as a source would fail
+    assert explain.main([str(scene)]) == 0
+    assert "unwrap" in capsys.readouterr().out

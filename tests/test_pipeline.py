@@ -1,0 +1,174 @@
+"""The pipeline as a whole: what goes in, what comes out, what is spared, what stays the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import warp as wp
+
+from warp_ar.errors import UsageError
+from warp_ar.pipeline import Pipeline, Result
+from warp_ar.scene import (
+    Camera,
+    Exposure,
+    LambertMaterial,
+    Light,
+    Marker,
+    MetallicRoughnessMaterial,
+    Object,
+    Probe,
+    Proxy,
+    Scene,
+)
+from warp_ar.sources import Synthetic
+from warp_ar.tracking import TrackState
+
+SIZE = (320, 240)
+Frames = list[npt.NDArray[np.uint8]]
+
+
+@pytest.fixture(scope="module")
+def frames() -> Frames:
+    with Synthetic("card", size=SIZE) as card:
+        return [frame.image.copy() for frame, _ in zip(card, range(4), strict=False)]
+
+
+def make_scene(**changes: object) -> Scene:
+    """A scene with every effect."""
+    with Synthetic("card", size=SIZE) as card:
+        k = card.camera_matrix
+    scene = Scene(
+        camera=Camera(*SIZE, k[0, 0], k[1, 1], k[0, 2], k[1, 2]),
+        marker=Marker(size=Synthetic.MARKER_SIZE),
+        probes=(Probe((-0.1, 0.03, 0.03), 0.03),),
+        proxies=(Proxy("plane", size=(1.0, 1.0)), Proxy("box", at=(0.0, 0.15, 0.03), size=(0.1, 0.05, 0.06))),
+        objects=(
+            Object("sphere", radius=0.03, at=(0.1, 0.0, 0.03), material=LambertMaterial((0.5, 0.4, 0.3))),
+            Object(
+                "torus",
+                major_radius=0.03,
+                minor_radius=0.01,
+                at=(0.05, 0.08, 0.02),
+                material=MetallicRoughnessMaterial((0.9, 0.8, 0.4), 1.0, 0.3),
+            ),
+        ),
+        lights=(Light("point", 0.3, at=(0.0, -0.1, 0.3)),),
+        exposure=Exposure(0.7),
+    )
+    return dataclasses.replace(scene, **changes)
+
+
+def run(pipeline: Pipeline, images: Frames) -> list[Result]:
+    results = []
+    for index, image in enumerate(images):
+        result = pipeline(image, time_seconds=index / 30)
+        _ = result.image, result.environment  # taken now: arrays are valid until the next call
+        results.append(result)
+    return results
+
+
+def test_numpy_and_warp_frames_give_the_same(frames: Frames, device: str) -> None:
+    scene = make_scene()
+    with Pipeline(scene, device=device, quality="low") as first, Pipeline(scene, device=device, quality="low") as second:
+        for image in frames:
+            array = wp.array(image, dtype=wp.vec3ub, device=device)
+            np.testing.assert_array_equal(first(image).image, second(array).image)
+
+
+def test_result_stays_on_the_device(frames: Frames, device: str) -> None:
+    with Pipeline(make_scene(), device=device, quality="low", outputs=("image", "environment", "pose")) as pipeline:
+        result = pipeline(frames[0])
+        assert result.image_array.device == wp.get_device(device)
+        assert result.environment_array.shape == (32, 64)
+        assert result.pose is not None
+        kept = result.image
+        before = kept.copy()
+        pipeline(np.zeros_like(frames[0]))
+        np.testing.assert_array_equal(kept, before)
+
+
+@pytest.mark.parametrize("bands", [1, 2, 3, 16])
+def test_bands_give_the_same_bits(frames: Frames, bands: int) -> None:
+    outputs = ("image", "environment")
+    with (
+        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs, bands=5) as expected,
+        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs, bands=bands) as pipeline,
+    ):
+        for one, other in zip(run(expected, frames), run(pipeline, frames), strict=True):
+            np.testing.assert_array_equal(one.image, other.image)
+            np.testing.assert_array_equal(one.environment, other.environment)
+
+
+def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
+    scene = make_scene(lights=(), exposure=Exposure(1.0))
+    with Pipeline(scene, device="cpu", quality="low") as pipeline:
+        for index in range(60):  # the light settles, the tracker too
+            result = pipeline(frames[0], time_seconds=index / 30)
+        skipped = {name for name, timing in result.stages.items() if timing.skipped}
+    assert {"diffuse", "specular", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
+    assert "accumulate" not in skipped, "accumulation follows the clock"
+
+
+def test_lost_marker_passes_the_frame_and_keeps_the_light(frames: Frames) -> None:
+    outputs = ("image", "environment", "pose")
+    grey = np.full_like(frames[0], 90)
+    with Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs) as pipeline:
+        never = pipeline(grey, time_seconds=0.0)
+        assert never.state is TrackState.LOST
+        assert never.environment is None
+        np.testing.assert_array_equal(never.image, grey)
+        seen = pipeline(frames[0], time_seconds=1.0)
+        light = seen.environment
+        assert seen.pose is not None
+        assert light is not None
+        lost = pipeline(grey, time_seconds=9.0)
+        assert lost.pose is None
+        np.testing.assert_array_equal(lost.image, grey)
+        np.testing.assert_array_equal(lost.environment, light)
+        assert pipeline(frames[1], time_seconds=9.1).pose is not None
+
+
+def test_only_what_the_scene_calls_for_is_planned() -> None:
+    def stages(**changes: object) -> set[str]:
+        with Pipeline(make_scene(**changes), device="cpu", quality="low") as pipeline:
+            return {stage.name for stage, _ in pipeline.plan.stages}
+
+    room = {"unwrap", "accumulate", "fill"}
+    off = Exposure(1.0)
+    assert stages(objects=(), lights=(), exposure=off) == set()
+    assert stages(objects=(), lights=()) == {"summed_area", "expose"}
+    assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
+    assert {"shade", "visibility", "diffuse", "specular"}.isdisjoint(stages(objects=(), exposure=off))
+    assert room.isdisjoint(stages(probes=())), "without a ball there is no room light to capture"
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (np.zeros((240, 320, 4), np.uint8), r"frame is uint8 \(240, 320, 4\); expected uint8 RGB \(240, 320, 3\)"),
+        (np.zeros((240, 320, 3), np.float32), r"frame is float32"),
+        (np.zeros((120, 160, 3), np.uint8), r"frame is uint8 \(120, 160, 3\)"),
+        ("frame.png", r"frame is str"),
+    ],
+)
+def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected: str, frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
+        with pytest.raises(UsageError, match=expected):
+            pipeline(image)
+        assert pipeline(frames[0]).pose is not None
+
+
+def test_wrong_warp_frame_is_refused() -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline, pytest.raises(UsageError, match="of vec3ub on cpu"):
+        pipeline(wp.zeros((240, 320), dtype=wp.vec3, device="cpu"))
+
+
+def test_captured_graph_equals_eager(frames: Frames, device: str) -> None:
+    """On CUDA the scheduler replays graphs; the same stages launched one by one must give the same bits."""
+    with Pipeline(make_scene(), device=device, quality="low") as replayed, Pipeline(make_scene(), device=device, quality="low") as eager:
+        eager._scheduler.run = eager._scheduler._run_eager  # type: ignore[method-assign]
+        for one, other in zip(run(replayed, frames * 2), run(eager, frames * 2), strict=True):
+            np.testing.assert_array_equal(one.image, other.image)
