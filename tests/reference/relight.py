@@ -1,0 +1,81 @@
+"""Float64 twins of ``warp_ar.kernels.relight`` for one plane z = 0 as proxy and spheres in the way."""
+
+import numpy as np
+
+from tests.reference import summed_area
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def plane_points(camera, rays, world_from_camera):
+    """Where the pixels' rays meet z = 0, (H, W, 3)."""
+    directions = np.concatenate([rays, np.ones_like(rays[..., :1])], -1).astype(np.float64) @ world_from_camera.T
+    return camera - directions * (camera[2] / directions[..., 2:])
+
+
+def hidden(points, light, centers, radii):
+    """Whether a sphere lies between points and a light, and how near the nearest miss is, relative to the radius."""
+    out = np.zeros(points.shape[:-1], bool)
+    margin = np.full(points.shape[:-1], np.inf)
+    to_light = light - points
+    distance = np.linalg.norm(to_light, axis=-1, keepdims=True)
+    wi = to_light / distance
+    for center, radius in zip(centers, radii, strict=True):
+        along = np.clip(((center - points) * wi).sum(-1, keepdims=True), 0.0, distance)
+        miss = np.linalg.norm(points + along * wi - center, axis=-1)
+        out |= miss < radius
+        margin = np.minimum(margin, np.abs(miss / radius - 1.0))
+    return out, margin
+
+
+def point_light(points, light, intensity):
+    """Direction to the light, N.L on z = 0 and the irradiance facing it."""
+    to_light = light - points
+    d2 = (to_light**2).sum(-1, keepdims=True)
+    wi = to_light / np.sqrt(d2)
+    return wi, np.maximum(wi[..., 2:], 0.0), intensity / d2
+
+
+def printed_response(n_dot_l, m, alpha):
+    w = np.minimum(np.abs(alpha), 1.0)
+    return (1.0 - w) * n_dot_l + w * np.where(alpha > 0.0, m, 1.0 - m)
+
+
+def relief_factor(m, alpha):
+    return np.maximum(1.0 + np.clip(alpha, -1.0, 1.0) * (np.minimum(m, 4.0) - 1.0), 0.0)
+
+
+def turned_relief(m, alpha, dominance):
+    x = np.clip((m - 1.0) / 0.6, -1.0, 1.0)
+    e = dominance * (1.0 - x * x) ** 2 * 0.6 * x
+    return (1.0 + alpha * e) / (1.0 + e)
+
+
+def reflectance(radiance, irradiance):
+    weight = 0.002 * np.pi
+    return np.clip((np.pi * radiance + 0.5 * weight) / (irradiance + weight), 0.0, 1.0)
+
+
+def surrounding_luminance(frame, decode_table, size):
+    values = summed_area.intensity(frame)
+    mean = np.array(
+        [[summed_area.box_mean(values, i, j, size) for j in range(frame.shape[1])] for i in range(frame.shape[0])]
+    )
+    grey = decode_table.astype(np.float64) @ LUMINANCE
+    return np.maximum(np.interp(mean, np.arange(256), grey), 1e-4)
+
+
+def respond(rung, frame, radiance, around, n_dot_l, alpha, dominance, room):
+    """(Kd, response) of one light, equations of the module's docstring."""
+    m = (radiance @ LUMINANCE)[..., None]
+    kd = np.full(radiance.shape, 0.5)
+    if rung == "flat":
+        return kd, n_dot_l
+    if rung == "paper":
+        return kd, printed_response(n_dot_l, m, alpha * dominance)
+    relative = m / around[..., None]
+    if rung == "relief":
+        hue = radiance + 0.01
+        kd = np.minimum(around[..., None] / (hue @ LUMINANCE)[..., None] * hue, 1.0)
+        return kd, n_dot_l * relief_factor(relative, alpha * dominance)
+    return reflectance(radiance, room), n_dot_l * turned_relief(relative, alpha, dominance)
