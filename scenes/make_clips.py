@@ -46,6 +46,8 @@ ROOM = {"x": (-1.7, 2.3), "y": (-2.6, 0.85), "z": (-0.74, 1.75)}
 
 PATH = {"type": "path", "max_depth": 8, "rr_depth": 4}
 """Path tracing up to seven bounces: what more would add is below a grey level in a room this bright."""
+GUIDE_SPP = 32
+"""Samples per pixel of the albedo and the normals that guide the denoiser: they need to resolve edges, not light."""
 
 Dict = dict[str, Any]
 
@@ -312,18 +314,18 @@ def room(clip: str) -> Dict:
         return {"bsdf": matte(0.7), "emitter": {"type": "area", "radiance": rgb(radiance)}}
 
     if clip == "desk":
-        shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 12.0 * view(3))
+        shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 10.5 * view(3))
         shapes["ceiling_lamp"] = {
             "type": "disk",
             "to_world": turned((0.75, -0.65, z1 - 0.06), 0, 0.2) @ mi.ScalarTransform4f().rotate([1, 0, 0], 180),
             **lamp(30.0 * np.array([1.0, 0.72, 0.42])),
         }
     elif clip == "wire":
-        shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 0.35 * view(3) * (0.55, 0.75, 1.2))
-        shapes["table_lamp"] = ball(LAMP, 0.06, {}) | lamp(290.0 * np.array([1.0, 0.86, 0.66]))
+        shapes |= window("window", (x0 + 0.01, 0.0, 0.8), (0, 0.75, 0), (0, 0, 0.68), 0.3 * view(3) * (0.55, 0.75, 1.2))
+        shapes["table_lamp"] = ball(LAMP, 0.045, {}) | lamp(780.0 * np.array([1.0, 0.86, 0.66]))
     else:
-        shapes |= window("window", (-0.55, y1 - 0.01, 0.72), (0.45, 0, 0), (0, 0, 0.66), 7.0 * view(3))
-        shapes["globe"] = ball((0.2, 0.24, 0.135), 0.055, {}) | lamp(7.0 * np.array([1.0, 0.8, 0.52]))
+        shapes |= window("window", (-0.55, y1 - 0.01, 0.72), (0.45, 0, 0), (0, 0, 0.66), 9.0 * view(3))
+        shapes["globe"] = ball((0.2, 0.24, 0.135), 0.055, {}) | lamp(14.0 * np.array([1.0, 0.8, 0.52]))
         brass = glossy((0.75, 0.55, 0.25), 0.3, 1.0)
         shapes["globe_foot"] = {"type": "cylinder", "p0": [0.2, 0.24, TABLE], "p1": [0.2, 0.24, 0.014], "radius": 0.04, "bsdf": {"type": "twosided", "bsdf": brass}}
         shapes["globe_top"] = {"type": "disk", "to_world": turned((0.2, 0.24, 0.014), 0, 0.04), "bsdf": brass}
@@ -571,8 +573,8 @@ class Renderer:
             for k, light in enumerate((virtual or {}).get("light", [])):
                 content[f"light{k}"] = virtual_light(light)
             self.scene = mi.load_dict({"type": "scene", **content})
-        guides = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal", "image": PATH}
-        self.integrator = mi.load_dict(guides)
+        self.integrator = mi.load_dict(PATH)
+        self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
         self.lamps = mi.traverse(self.scene)
         self.base = {}
         for lamp in CLIPS[clip].levels(0.0):
@@ -601,9 +603,10 @@ class Renderer:
                 "sampler": {"type": "independent"},
             }
         )
-        image = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=self.spp, seed=seed)
-        color, albedo, normal = (np.ascontiguousarray(part) for part in np.split(np.array(image), 3, -1))
-        return pyoidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True)
+        color = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=self.spp, seed=seed)
+        guides = np.array(mi.render(self.scene, sensor=sensor, integrator=self.guides, spp=GUIDE_SPP, seed=seed))
+        albedo, normal = np.clip(guides[..., -6:-3], 0, 1), guides[..., -3:]
+        return pyoidn.denoise(np.array(color), albedo=albedo, normal=np.ascontiguousarray(normal), hdr=True)
 
     def environment(self, t: float, height: int = 256, rounds: int = 64) -> np.ndarray:
         """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``: the scene must be without the ball."""
