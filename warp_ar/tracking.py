@@ -514,7 +514,10 @@ class Tracker:
         return list(best.values())
 
     def _plane_poses(self, points: Array, corners: Array) -> list[tuple[Pose, float]]:
-        """Both poses of a plane [CB14] that face the camera, with reprojection errors in pixels, best first."""
+        """Both poses of a plane [CB14], with reprojection errors in pixels, best first.
+
+        Clockwise corners make z point toward the camera in both.
+        """
         try:
             _, rotations, translations, _ = cv2.solvePnPGeneric(
                 points, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
@@ -525,7 +528,7 @@ class Tracker:
         for r, t in zip(rotations, translations, strict=True):
             pose = Pose(_rotation(r), np.asarray(t, float).ravel())
             ahead = pose.apply(self._pattern.outline)[:, 2].min() > 0 if np.isfinite([r, t]).all() else False
-            if ahead and pose.rotation[:, 2] @ pose.translation < 0:  # z comes out of the page, toward the camera
+            if ahead:
                 residual = self._project(pose.apply(points))[0] - corners
                 poses.append((pose, float(np.sqrt((residual**2).sum(1).mean()))))
         return sorted(poses, key=lambda p: p[1])
