@@ -226,7 +226,7 @@ def test_opposed_lights_cancel_their_relief(device):
 
 
 def test_relief_keeps_the_mean(device):
-    """Over codes that average to their surroundings, light is neither made nor lost by more than the curve of the transfer."""
+    """Over codes that average to their surroundings no light is made or lost, but for the curve of the transfer."""
     frame = np.full((H, W, 3), 120, np.uint8)
     frame[:, ::2] = 136
     light = [{"kind": DIRECTIONAL, "direction": (0.0, 0.0, -1.0), "intensity": (1.0,) * 3}]
@@ -346,11 +346,8 @@ def test_ball_hides_the_desk_and_throws_a_shadow(device):
 )
 @pytest.mark.parametrize("content", ["noise", "black", "white"])
 def test_hard_lights_stay_finite(device, rung, light, content):
-    frame = {
-        "noise": noise_frame(0, 256),
-        "black": np.zeros((H, W, 3), np.uint8),
-        "white": np.full((H, W, 3), 255, np.uint8),
-    }
+    white = np.full((H, W, 3), 255, np.uint8)
+    frame = {"noise": noise_frame(0, 256), "black": 0 * white, "white": white}
     for room in ((1, 1, 1), (0, 0, 0), (np.nan, np.inf, -1)):
         got = run(rung, [light], frame[content], key=((0, 0, 1), 1.0), sh=constant_room(room))
         assert np.isfinite(got).all()
