@@ -347,6 +347,7 @@ def test_ball_hides_the_desk_and_throws_a_shadow(device):
 @pytest.mark.parametrize("content", ["noise", "black", "white"])
 def test_hard_lights_stay_finite(device, rung, light, content):
     white = np.full((H, W, 3), 255, np.uint8)
+    white = np.full((H, W, 3), 255, np.uint8)
     frame = {"noise": noise_frame(0, 256), "black": 0 * white, "white": white}
     for room in ((1, 1, 1), (0, 0, 0), (np.nan, np.inf, -1)):
         got = run(rung, [light], frame[content], key=((0, 0, 1), 1.0), sh=constant_room(room))

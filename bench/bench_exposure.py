@@ -1,0 +1,38 @@
+"""Exposure of a 640x480 frame: the frame alone and with layers, plain and by the box, a tenth of it saturated."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from bench.bench_composite import H, W, frame_and_layers
+from bench.common import measure, report
+from warp_ar.kernels import composite, exposure, summed_area
+
+LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.CompositeConfig(virtual=True, added=True)))
+
+
+def main(device: str) -> None:
+    params, frame, decode, encode, virtual, added = frame_and_layers(device, H)
+    picture = frame.numpy()
+    picture[: H // 10] = 255
+    frame = wp.array(picture, dtype=wp.vec3ub, device=device)
+    table, image = wp.zeros((H, W), wp.uint32, device=device), wp.zeros((H, W), wp.vec3ub, device=device)
+    scale, codes = wp.zeros(1, wp.float32, device=device), wp.zeros(256, wp.vec3ub, device=device)
+    summed_area.sum_area(frame, table)
+    for name, layers in LAYERS:
+        contenders = {}
+        for rung in exposure.RUNGS:
+
+            def call(config: exposure.ExposureConfig = exposure.ExposureConfig(rung, layers)) -> None:  # noqa: B008
+                exposure.read_scale(params, scale)
+                exposure.expose_codes(decode, encode, scale, codes)
+                exposure.expose(config, params, frame, decode, encode, virtual, added, None, table, scale, codes, image)
+
+            call()
+            if (
+                not layers.virtual
+            ):  # away from saturation both rungs scale plainly: black stays black, nothing brightens
+                assert (image.numpy()[H // 10 :] <= picture[H // 10 :]).all()
+            contenders[rung] = call
+        for rung, times in measure(contenders, device).items():
+            report(f"expose {W}x{H} {name} {rung}", times, device)
