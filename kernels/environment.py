@@ -1,38 +1,46 @@
 """The room's light over time, whole, and its dominant directions.
 
-**Accumulation.** Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x with confidence c:
+**Accumulation.** Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x
+with confidence c:
 
     m += a (x - m),   a = a0 c / (a0 c + (1 - a0) k),   a0 = 1 - exp(-time_step / tau):
 
-the plain exponential mean where c = k, quicker where the new view is the better one, slower where it is the worse, and nothing at c = 0. A
-texel that was never seen takes x whole. The form m + a (x - m) is exact where x = m: nothing drifts. k is drawn toward c in the same way
-and fades with ``FORGET_TIME``, so that what has not been seen for long gives way to what is.
+the plain exponential mean where c = k, quicker where the new view is the better one, slower where it is the worse, and
+nothing at c = 0. A texel that was never seen takes x whole. The form m + a (x - m) is exact where x = m: nothing
+drifts. k is drawn toward c in the same way and fades with ``FORGET_TIME``, so that what has not been seen for long
+gives way to what is.
 
-tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of the tracked pose make
-large differences of both signs in single texels; a change of the room moves a whole neighbourhood one way, and stays. So the signed mean
-of x - m is taken over cells of ``CELL_SIZE`` texels squared, and what counts is its smaller value in two successive frames of one sign: one
-corrupt frame is worth no haste, and is forgotten as fast as it came.
+tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of
+the tracked pose make large differences of both signs in single texels; a change of the room moves a whole neighbourhood
+one way, and stays. So the signed mean of x - m is taken over cells of ``CELL_SIZE`` texels squared, and what counts is
+its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is forgotten as fast as
+it came.
 
-**Filling.** What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go means of radiance
-weighted by confidence and solid angle, up again each texel is completed from its coarser level, as far as it lacks confidence. Both are
-normalised, and in forms that are exact for equal values: a constant room stays constant under any mask. Texels of a coarser level cover
-shares of finer ones by exact overlap, so every size works. Without any confidence there is no light: the map is zero.
+**Filling.** What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go
+means of radiance weighted by confidence and solid angle, up again each texel is completed from its coarser level, as
+far as it lacks confidence. Both are normalised, and in forms that are exact for equal values: a constant room stays
+constant under any mask. Texels of a coarser level cover shares of finer ones by exact overlap, so every size works.
+Without any confidence there is no light: the map is zero.
 
-**Key lights.** With the mean radiance L0 of the map, a texel's excess max(lum L - lum L0, 0) is what makes it a light; a uniform room has none.
-Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have left over: the best of the 8 x 16 cells' directions, pulled
-to the centre of its lobe by mean shifts with ever narrower kernels (max(cos, 0), cos^2, cos^8, then the texels within ``LOBE_OUTER``), and at last to
-the centroid of what rises above ``CORE`` of the lobe's peak: glow and scratches of the ball do not pull at it. Starting broad keeps the centre of a window half a sky wide where it is.
+**Key lights.** With the mean radiance L0 of the map, a texel's excess max(lum L - lum L0, 0) is what makes it a light;
+a uniform room has none. Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have left
+over: the best of the 8 x 16 cells' directions, moved to the centre of its lobe by mean shifts with ever narrower
+kernels: all that faces it (whose fixed point is the maximum of that irradiance), cos^2, cos^8, the texels within
+``LOBE_OUTER``; and at last to the centroid of what rises above ``CORE`` of the lobe's peak, where glow and scratches of
+the ball do not pull at it. Starting broad keeps the centre of a window half a sky wide where it is.
 
-A direction s dominates as far as the light's flow goes its way and no rival stands elsewhere. With V = integral of L d and the scalar
-irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first order (the cosine lobe's first two
-bands, pi and 2 pi / 3), so facets toward and away from s differ by (E(s) - E(-s)) / (E(s) + E(-s)) = 2 V . s / phi: the contrast that relief
-shows. It is 0 in a uniform room and between two equal opposite lights, 1 (held there) for a sun and still for a window that is half a black
-sky; a lamp that gives a share q of the light of an otherwise uniform room has 2 q. Where two lights are of one strength, which is the
-brighter is an accident of noise, and a picture that follows it would flicker; the dominance
+A direction s dominates as far as the light's flow goes its way and no rival stands elsewhere. With V = integral of L d
+and the scalar irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first
+order (the cosine lobe's first two bands, pi and 2 pi / 3), so facets toward and away from s differ by (E(s) - E(-s)) /
+(E(s) + E(-s)) = 2 V . s / phi: the contrast that relief shows. It is 0 in a uniform room and between two equal opposite
+lights, 1 (held there) for a sun and still for a window that is half a black sky; a lamp that gives a share q of the
+light of an otherwise uniform room has 2 q. Where two lights are of one strength, which is the brighter is an accident
+of noise, and a picture that follows it would flicker; the dominance
 
-    D_k = clamp(2 V . s_k / phi, 0, 1) * min over j of (1 - min(1, E_j / E_k) min(1, 2 (1 - s_j . s_k)))
+    D_k = clamp(2 V . s_k / phi, 0, 1) * min over j of (1 - min(1, E_j / E_k) min(1, 2 (1 - s_j . s_k)) valley_jk)
 
-is 0 there if they are 60 degrees apart or more, and hardly less if they are neighbours, between which a change of place is small.
+is 0 there if they are 60 degrees apart or more, and hardly less if they are neighbours, between which a change of place
+is small. What is bright halfway between two directions too is one window, not two rivals: there the valley is 0.
 
 References:
     [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4.
@@ -73,9 +81,9 @@ SUPPORT = wp.constant(wp.float32(4.0))
 
 CHANGE_FLOOR = 0.0005
 CHANGE_SHARE = 0.01
-"""An environment has changed once some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one 8-bit step. Any
-normalised filter F of the map with weights that are not negative (a mirror's sample, a glossy lobe, irradiance / pi) is then off by at most
-``CHANGE_FLOOR + CHANGE_SHARE * F`` while its readers do not run."""
+"""An environment has changed once some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one
+8-bit step. Any normalised filter F of the map with weights that are not negative (a mirror's sample, a glossy lobe,
+irradiance / pi) is then off by at most ``CHANGE_FLOOR + CHANGE_SHARE * F`` while its readers do not run."""
 
 KEY_LIGHT_COUNT = 4
 CELL_ROWS = wp.constant(8)
@@ -127,7 +135,7 @@ def usable_confidence(value: wp.vec3, confidence: wp.float32) -> wp.float32:
     return 0.0
 
 
-# ---- accumulation -------------------------------------------------------------------------------------------------------------
+# ---- accumulation ----
 
 
 @wp.kernel(enable_backward=False)
@@ -141,6 +149,7 @@ def measure_change_kernel(
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
+    """Mean signed change of one cell a thread."""
     band_row, cell_column = wp.tid()
     cell_row = row_start + band_row
     height = radiance.shape[0]
@@ -192,6 +201,7 @@ def accumulate_environment_kernel(
     confidence_out: wp.array2d[wp.float32],
     clipped_out: wp.array2d[wp.vec3],
 ):
+    """One texel a thread, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
     x = radiance[i, j]
@@ -300,7 +310,7 @@ def accumulate_environment(
     )
 
 
-# ---- filling ------------------------------------------------------------------------------------------------------------------
+# ---- filling ----
 
 
 @wp.func
@@ -341,6 +351,7 @@ def seed_fill_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],  # radiance and trust
 ):
+    """Level 0: radiance, and how far it is to be kept."""
     band_row, j = wp.tid()
     i = row_start + band_row
     value = radiance[i, j]
@@ -365,6 +376,7 @@ def pull_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
+    """Next coarser level: means over exactly what each texel covers."""
     band_row, j = wp.tid()
     i = row_start + band_row
     top = wp.float32(i * fine_height) / wp.float32(height)
@@ -425,6 +437,7 @@ def push_level_kernel(
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
+    """Complete a level from its coarser one, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
     value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
@@ -443,6 +456,7 @@ def finish_fill_kernel(
     # Out:
     environment_out: wp.array2d[wp.vec3],
 ):
+    """Complete level 0 into the map."""
     band_row, j = wp.tid()
     i = row_start + band_row
     environment_out[i, j] = completed(
@@ -461,6 +475,7 @@ def measure_difference_kernel(
     # Out:
     difference_out: wp.array[wp.float32],
 ):
+    """Largest change of one row a thread."""
     i = row_start + wp.tid()
     largest = wp.float32(0.0)
     for j in range(environment.shape[1]):
@@ -566,7 +581,7 @@ def measure_difference(
     )
 
 
-# ---- key lights ---------------------------------------------------------------------------------------------------------------
+# ---- key lights ----
 
 
 @wp.kernel(enable_backward=False)
@@ -577,6 +592,7 @@ def sum_rows_kernel(
     # Out:
     sums_out: wp.array[wp.vec4],  # luminance times direction, and luminance, over the row's solid angle
 ):
+    """Flow of one row a thread."""
     i = row_start + wp.tid()
     height = environment.shape[0]
     width = environment.shape[1]
@@ -611,6 +627,7 @@ def sum_cells_kernel(
     # Out:
     cells_out: wp.array[wp.vec3],  # excess luminance times direction, over the cell's solid angle
 ):
+    """Excess of one cell a thread."""
     cell = wp.tid()
     cell_row = cell // CELL_COLUMNS
     cell_column = cell % CELL_COLUMNS
@@ -655,26 +672,57 @@ def block_sum(value: wp.vec4) -> wp.vec4:
 
 @wp.func
 def shift_on_cells(
-    cells: wp.array[wp.vec3], found: mat43, count: wp.int32, direction: wp.vec3, power: wp.int32
+    cells: wp.array[wp.vec3], found: mat43, count: wp.int32, direction: wp.vec3, power: wp.int32, thread: wp.int32
 ) -> wp.vec3:
-    """One mean shift with the kernel max(cos, 0)^power, power 1, 2 or 8."""
-    sum = wp.vec3(0.0, 0.0, 0.0)
-    for cell in range(KEY_CELLS):
+    """One mean shift with the kernel cos^power of all that faces the direction; for a whole block, power 0, 2 or 8."""
+    sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    cell = thread
+    while cell < KEY_CELLS:
         moment = cells[cell]
-        size = wp.length(moment)
-        if size > 0.0:
-            at = moment / size
-            cosine = wp.max(wp.dot(at, direction), 0.0)
-            weight = cosine
+        cosine = wp.dot(moment, direction)
+        if cosine > 0.0:
+            at = wp.normalize(moment)
+            cosine = wp.dot(at, direction)
+            weight = left_over(at, found, count)
             if power >= 2:
-                weight = cosine * cosine
+                weight *= cosine * cosine
             if power >= 8:
-                weight = weight * weight
-                weight = weight * weight
-            sum += (weight * left_over(at, found, count)) * moment
-    if wp.length(sum) > 0.0:
-        return wp.normalize(sum)
+                weight *= cosine * cosine * cosine
+                weight *= cosine * cosine * cosine
+            sum += weight * wp.vec4(moment[0], moment[1], moment[2], 0.0)
+        cell += wp.block_dim()
+    total = block_sum(sum)
+    centre = wp.vec3(total[0], total[1], total[2])
+    if wp.length(centre) > 0.0:
+        return wp.normalize(centre)
     return direction
+
+
+@wp.func
+def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3) -> wp.float32:
+    """Excess within some 17 degrees of a direction: weighted by cos^16."""
+    sum = wp.float32(0.0)
+    for cell in range(KEY_CELLS):
+        facing = wp.dot(cells[cell], direction)
+        if facing > 0.0:
+            cosine = facing / wp.length(cells[cell])
+            power = cosine * cosine
+            power *= power
+            power *= power
+            sum += facing / cosine * power * power
+    return sum
+
+
+@wp.func
+def valley_between(cells: wp.array[wp.vec3], a: wp.vec3, b: wp.vec3) -> wp.float32:
+    """1 if it is dark halfway between two directions, 0 if both look into one window."""
+    middle = a + b
+    if wp.length(middle) < 0.1:
+        return 1.0
+    least = wp.min(excess_around(cells, a), excess_around(cells, b))
+    if least <= 0.0:
+        return 1.0
+    return 1.0 - smooth_ramp(0.3, 0.6, excess_around(cells, wp.normalize(middle)) / least)
 
 
 @wp.kernel(enable_backward=False)
@@ -686,6 +734,7 @@ def find_key_lights_kernel(
     # Out:
     key_lights_out: wp.array[KeyLight],
 ):
+    """One block finds all lights, one after another; thread 0 ranks and writes them."""
     _block, thread = wp.tid()
     threads = wp.block_dim()
     height = environment.shape[0]
@@ -738,9 +787,9 @@ def find_key_lights_kernel(
                 CELL_ROWS,
                 CELL_COLUMNS,
             )
-            for step in range(6):
-                power = wp.where(step < 2, 1, wp.where(step < 4, 2, 8))
-                direction = shift_on_cells(cells, found, k, direction, power)
+            for step in range(10):
+                power = wp.where(step < 2, 0, wp.where(step < 4, 2, 8))
+                direction = shift_on_cells(cells, found, k, direction, power, thread)
 
         # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
         # 3: what the lobe gives.
@@ -801,9 +850,7 @@ def find_key_lights_kernel(
             pick = wp.int32(-1)
             for k in range(count):
                 if taken[k] == 0.0:
-                    if pick < 0:
-                        pick = k
-                    elif strengths[k] > strengths[pick]:
+                    if pick < 0 or strengths[k] > strengths[wp.max(pick, 0)]:
                         pick = k
             taken[pick] = 1.0
             light = KeyLight()
@@ -813,24 +860,24 @@ def find_key_lights_kernel(
             if strengths[pick] > 0.0:
                 alone = wp.float32(1.0)
                 for k in range(count):
-                    if k != pick:
+                    if k != pick and strengths[k] > 0.0:
                         rival = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
-                        apart = wp.min(1.0, 2.0 * (1.0 - wp.dot(rival, light.direction)))
-                        alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * wp.max(apart, 0.0))
+                        apart = wp.clamp(2.0 * (1.0 - wp.dot(rival, light.direction)), 0.0, 1.0)
+                        apart *= valley_between(cells, rival, light.direction)
+                        alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * apart)
                 light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
             key_lights_out[place] = light
 
 
-def find_key_lights(
-    environment: wp.array, sums_out: wp.array, cells_out: wp.array, key_lights_out: wp.array
-) -> None:
+def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.array, key_lights_out: wp.array) -> None:
     """Find the dominant directions of the room's light, brightest first.
 
     Args:
         environment: ``wp.vec3`` (h, w), finite and not negative.
         sums_out: Scratch, ``wp.vec4`` (h).
-        cells_out: Scratch, ``wp.vec3`` (``CELL_ROWS * CELL_COLUMNS``).
-        key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0 and looks toward +z.
+        cells_out: Scratch, ``wp.vec3`` (``KEY_CELLS``).
+        key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0
+            and looks toward +z.
 
     Raises:
         ValueError: More lights were asked for than can be found.
@@ -839,7 +886,13 @@ def find_key_lights(
         raise ValueError(f"key_lights_out has {len(key_lights_out)} places; expected 1 to {MAX_KEY_LIGHTS}")
     device = environment.device
     launch_rows(sum_rows_kernel, (environment.shape[0],), [environment], [sums_out], rows=None, device=device)
-    wp.launch(sum_cells_kernel, dim=CELL_ROWS * CELL_COLUMNS, inputs=[environment, sums_out], outputs=[cells_out], device=device)
+    wp.launch(
+        sum_cells_kernel,
+        dim=CELL_ROWS * CELL_COLUMNS,
+        inputs=[environment, sums_out],
+        outputs=[cells_out],
+        device=device,
+    )
     wp.launch_tiled(
         find_key_lights_kernel,
         dim=[1],

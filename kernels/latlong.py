@@ -1,8 +1,8 @@
 """The latlong map: directions, texels and how to sample them.
 
-A map has H rows and W columns (W = 2H where the program makes it, any size where a user does). Continuous coordinates ``(row, column)``
-run over [0, H] x [0, W]; texel (i, j) covers [i, i + 1] x [j, j + 1], its centre at half-integers. Row 0 looks toward +z, the centre
-column toward +x, columns grow toward +y:
+A map has H rows and W columns (W = 2H where the program makes it, any size where a user does). Continuous coordinates
+``(row, column)`` run over [0, H] x [0, W]; texel (i, j) covers [i, i + 1] x [j, j + 1], its centre at half-integers.
+Row 0 looks toward +z, the centre column toward +x, columns grow toward +y:
 
     theta = pi row / H,  phi = (2 column / W - 1) pi,  d = (sin theta cos phi, sin theta sin phi, cos theta).
 """
@@ -39,14 +39,14 @@ def latlong_from_direction(direction: wp.vec3, height: wp.int32, width: wp.int32
 
 @wp.func
 def texel_solid_angle(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
-    """Exact solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W, written as a product of sines (no cancellation)."""
+    """Solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W as a product of sines (no cancellation)."""
     half_step = 0.5 * PI / wp.float32(height)
     return 2.0 * wp.sin((2.0 * wp.float32(row) + 1.0) * half_step) * wp.sin(half_step) * 2.0 * PI / wp.float32(width)
 
 
 @wp.func
 def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int32) -> wp.vec2i:
-    """Texel of an index up to one row beyond a pole or any number of columns beyond the seam; across a pole, half a turn away."""
+    """Texel of an index up to one row beyond a pole, where it is half a turn away, or any columns beyond the seam."""
     r = row
     c = column
     if r < 0:
@@ -83,7 +83,7 @@ def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> w
 
 @wp.func
 def sample_latlong(radiance: wp.array2d[wp.vec3], direction: wp.vec3) -> wp.vec3:
-    """Bilinear sample, continuous across the seam and the poles for every size; a constant map gives its value to the bit."""
+    """Bilinear sample, continuous across seam and poles for every size; exact for a constant map."""
     at = latlong_from_direction(direction, radiance.shape[0], radiance.shape[1])
     y = at[0] - 0.5
     row = wp.floor(y)

@@ -1,24 +1,26 @@
 """The mirror ball unwrapped: which light arrives at it from every direction.
 
-The room is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the ball's centre, with the axis
-a toward the camera and D = distance / radius, the ball's point with normal n at angle theta from a (in the plane of a and d) looks at the
-camera along v = (D a - n) / |D a - n|, at angle beta = atan2(sin theta, D - cos theta) on the other side of the axis, and so reflects
-light that arrives from the angle
+The room is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the ball's
+centre, with the axis a toward the camera and D = distance / radius, the ball's point with normal n at angle theta from
+a (in the plane of a and d) looks at the camera along v = (D a - n) / |D a - n|, at angle beta = atan2(sin theta, D -
+cos theta) on the other side of the axis, and so reflects light that arrives from the angle
 
     f(theta) = 2 theta + beta(theta),    f'(theta) = 2 + (D cos theta - 1) / |D a - n|^2,
 
-which is theta + atan2(D sin theta, D cos theta - 1) written without the difference of two nearly equal numbers. On the visible cap,
-0 <= theta <= acos(1 / D), f rises from 0 to acos(1 / D) + pi / 2 and is concave, so Newton's method finds theta for a given d; what lies
-beyond is the blind cone behind the ball. The iteration turns n by e / f', where e, the angle still missing, is the cross product of the
-reflected direction and d: square roots only, and nothing is divided by the sine of an angle that can be zero (light that returns straight
-to the camera).
+which is theta + atan2(D sin theta, D cos theta - 1) written without the difference of two nearly equal numbers. On the
+visible cap, 0 <= theta <= acos(1 / D), f rises from 0 to acos(1 / D) + pi / 2 and is concave, so Newton's method finds
+theta for a given d; what lies beyond is the blind cone behind the ball. The iteration turns n by e / f', where e, the
+angle still missing, is the cross product of the reflected direction and d: square roots only, and nothing is divided by
+the sine of an angle that can be zero (light that returns straight to the camera).
 
-The point is then projected through the lens to where the frame shows it. This is done at the texels' corners; within a texel, samples are
-placed by bilinear interpolation between its corners, as many as its footprint is long in pixels, so that each pixel of the ball counts.
+The point is then projected through the lens to where the frame shows it. This is done at the texels' corners; within a
+texel, samples are placed by bilinear interpolation between its corners, as many as its footprint is long in pixels, so
+that each pixel of the ball counts.
 
-Confidence is 0 where the ball says nothing (blind, outside the frame, hidden by a proxy or by another ball) and where what lies behind the
-ball could leak in: pixels nearer than ``rim_start`` to the silhouette. It rises over the next ``rim_width`` pixels, and is scaled by
-density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels per steradian is worth.
+Confidence is 0 where the ball says nothing (blind, outside the frame, hidden by a proxy or by another ball) and where
+what lies behind the ball could leak in: pixels nearer than ``rim_start`` to the silhouette. It rises over the next
+``rim_width`` pixels, and is scaled by density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels
+per steradian is worth.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ wp.set_module_options({"enable_backward": False})
 RUNGS = ("nearest", "bilinear", "area")
 
 RIM_START = 2.5
-"""Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the pixel it finds there
-spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
+"""Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
+pixel it finds there spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
 RIM_WIDTH = 1.5
 """Pixels over which confidence then rises to its full value."""
 
@@ -112,7 +114,7 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
 
 @wp.func
 def project(params: FrameParams, from_camera: wp.vec3) -> wp.vec3:
-    """Pixel of a point given relative to the camera, in world axes, and its depth; only a positive depth has a pixel."""
+    """Pixel and depth of a point given relative to the camera in world axes; only a positive depth has a pixel."""
     p = wp.transpose(params.world_from_camera) * from_camera
     if p[2] <= 0.0:
         return wp.vec3(0.0, 0.0, p[2])
@@ -198,10 +200,9 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         rim_sine = wp.sqrt((1.0 - least) * (1.0 + least))
         if cos_psi <= -rim_sine:
             return  # blind cone: psi >= acos(1 / D) + pi / 2
-        if sin_psi > 1.0e-6:
-            side = side / sin_psi
-        else:
+        if sin_psi <= 1.0e-6:  # straight back: any plane through the axis will do
             side = any_perpendicular(axis)
+        side = wp.normalize(side)
 
         n = reflecting_normal(distance, cos_psi, sin_psi)
         # Relative to the camera from the start: far from the world's origin nothing cancels.
@@ -258,8 +259,8 @@ def project_corners(
         probes: ``Probe`` (P).
         rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
         scene: What can hide the balls: its proxies.
-        corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's silhouette; the last is -1
-            where the direction is not seen.
+        corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
+            silhouette; the last is -1 where the direction is not seen.
         config: Kinds of proxy.
         rim_start: Pixels around a proxy's outline that count as hidden as well.
         rows: Band of corner rows, None for all h + 1.
@@ -335,7 +336,8 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
                 if wp.static(rung == "area"):
                     count_y = footprint_samples(c00, c10, c01, c11)
                     count_x = footprint_samples(c00, c01, c10, c11)
-                # Running means, m += (x - m) w / W: exact where all x are equal, so a constant frame gives a constant map.
+                # Running means, m += (x - m) w / W: exact where all x are equal, so a constant frame gives a constant
+                # map.
                 mean = wp.vec3(0.0, 0.0, 0.0)
                 mean_clipped = wp.vec3(0.0, 0.0, 0.0)
                 total = wp.float32(0.0)
@@ -431,7 +433,8 @@ def gather_probe(
         radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
         confidence_out: ``wp.float32`` (h, w) in 0..1.
         clipped_out: ``wp.vec3`` (h, w): share of the footprint that is at clipping, per channel.
-        rung: ``nearest`` or ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint, up to 8 x 8.
+        rung: ``nearest`` or ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
+            up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
         rim_width: Pixels over which confidence then rises.
         rows: Band of texel rows, None for all.

@@ -83,7 +83,9 @@ def test_directions_match_twin_and_return(device, height, width):
 def test_coordinates_of_poles_and_of_more_than_unit_length(device):
     """Hard case 5: z of 1 + ulp, normals exactly along z, no direction at all."""
     one_up = np.nextafter(np.float32(1), np.float32(2))
-    d = np.array([[0, 0, 1], [0, 0, -1], [0, 0, one_up], [1e-20, 0, -one_up], [0, 0, 0], [-1, 0, 0], [-1, -0.0, 0]], np.float32)
+    d = np.array(
+        [[0, 0, 1], [0, 0, -1], [0, 0, one_up], [1e-20, 0, -one_up], [0, 0, 0], [-1, 0, 0], [-1, -0.0, 0]], np.float32
+    )
     at = run(coordinates_kernel, [64, 128], d, wp.vec3, wp.vec2)
     assert np.isfinite(at).all()
     np.testing.assert_allclose(at[:4, 0], [0, 64, 0, 64], atol=TEXEL)

@@ -26,7 +26,8 @@ from warp_ar.kernels.structs import (
 NORMAL = 2e-6
 # A pixel coordinate of up to 400, computed from those: 400 * a few roundings.
 PIXEL = 1e-3
-# What a shift of PIXEL does to a bilinear sample of a picture of noise (slope 1 per pixel at most), divided by the reflectance.
+# What a shift of PIXEL does to a bilinear sample of a picture of noise (slope 1 per pixel at most), divided by the
+# reflectance.
 SAMPLE = 2 * PIXEL
 
 CENTER, RADIUS, REFLECTANCE = (0.1, -0.05, 0.035), 0.035, (0.85, 0.8, 0.9)
@@ -78,7 +79,9 @@ def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
     return corners
 
 
-def unwrap(view, frame, balls=(BALL,), *, rung="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None):
+def unwrap(
+    view, frame, balls=(BALL,), *, rung="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
+):
     corners = project(view, balls, shapes, kinds, height)
     radiance = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
     confidence = wp.full((height, 2 * height), -1.0, dtype=wp.float32)
@@ -138,7 +141,8 @@ def test_normals_reflect_every_direction_to_the_camera(device, distance):
     inputs = [wp.full(len(psi), distance, dtype=wp.float32), wp.array(given, dtype=wp.vec2)]
     wp.launch(normal_kernel, len(psi), inputs, [out])
     n = out.numpy().astype(np.float64)
-    # Compared as what they reflect: at D = 1.01 that turns 102 times faster than the normal, so its error is what counts there.
+    # Compared as what they reflect: at D = 1.01 that turns 102 times faster than the normal, so its error is what
+    # counts there.
     slope = 2 + 1 / (distance - 1)
     got = reference.reflected_angle(np.arctan2(n[:, 1], n[:, 0]), np.float64(np.float32(distance)))
     np.testing.assert_allclose(got, np.arctan2(given[:, 1], given[:, 0]), atol=NORMAL * slope)
@@ -224,7 +228,8 @@ def test_specialised_equals_general(device):
 @pytest.mark.parametrize("distance", [0.15, 0.5, 2.0])
 @pytest.mark.parametrize("rung", probe.RUNGS)
 def test_ramp_is_where_it_belongs(device, rung, distance):
-    """Hard cases 2 and 4: seam, poles and perspective. One texel of shift would be 0.035, an orthographic map 0.06 at 0.15 m."""
+    """Hard cases 2 and 4: seam, poles and perspective. One texel of shift would be 0.035, an orthographic map 0.06 at
+    0.15 m."""
     view = look(distance, focal=min(0.8 * 110 * distance / RADIUS, 900.0), size=(400, 400))
     frame = encode(reference.render(view, [BALL], smooth_light, lambda d: np.ones_like(d)))
     radiance, confidence, _ = unwrap(view, frame, rung=rung, transfer="linear")
@@ -251,10 +256,13 @@ def test_orthographic_unwrapping_would_fail_here(device):
 @pytest.mark.parametrize("background", [0.0, 1.0])
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.35, -0.35)])
 def test_nothing_of_the_background_bleeds_in(device, distance, background, shift):
-    """Hard case 1: a grey ball before black or white, its outline known to half a pixel: grey to the bit wherever trusted."""
+    """Hard case 1: a grey ball before black or white, its outline known to half a pixel: grey to the bit wherever
+    trusted."""
     true = look(distance, focal=500.0)
     frame = encode(
-        reference.render(true, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, background))
+        reference.render(
+            true, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, background)
+        )
     )
     center = true.principal
     tracked = look(distance, focal=500.0, principal=(center[0] + shift[0], center[1] + shift[1]))
@@ -266,7 +274,8 @@ def test_nothing_of_the_background_bleeds_in(device, distance, background, shift
 
 
 def test_light_is_a_mean_over_the_footprint(device):
-    """A checker of single pixels has mean one half: area sees it where texels cover many pixels, one sample does not."""
+    """A checker of single pixels has mean one half: area sees it where texels cover many pixels, one sample does
+    not."""
     view = look(0.2, focal=700.0, size=(400, 400))
     checker = (np.indices((400, 400)).sum(0) % 2 * 255).astype(np.uint8)
     frame = np.repeat(checker[..., None], 3, -1)
@@ -303,7 +312,8 @@ def test_partly_outside_the_frame(device):
     [(0.1, -0.05, 0.05), (0.1, -0.05, 0.07), (0.1, -0.05, 0.035), (np.nan, 0.0, 0.0), (1e9, 0.0, 0.0)],
 )
 def test_camera_where_it_cannot_see_a_ball(device, position):
-    """Hard case 3: inside the ball, touching it, in its centre, nowhere, far beyond sight: finite, and no confidence."""
+    """Hard case 3: inside the ball, touching it, in its centre, nowhere, far beyond sight: finite, and no
+    confidence."""
     view = look(0.4)
     view.position = np.array(position)
     radiance, confidence, clipped = unwrap(view, constant_frame(view, 200))
@@ -362,7 +372,44 @@ def test_hidden_by_a_proxy(device, kind):
     mesh = None
     if kind == "mesh":
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        faces = [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
+        faces = [
+            0,
+            1,
+            3,
+            0,
+            3,
+            2,
+            4,
+            6,
+            7,
+            4,
+            7,
+            5,
+            0,
+            4,
+            5,
+            0,
+            5,
+            1,
+            2,
+            3,
+            7,
+            2,
+            7,
+            6,
+            0,
+            2,
+            6,
+            0,
+            6,
+            4,
+            1,
+            5,
+            7,
+            1,
+            7,
+            3,
+        ]
         mesh = wp.Mesh(wp.array((signs * half).astype(np.float32), dtype=wp.vec3), wp.array(faces, dtype=wp.int32))
         shape |= {"kind": MESH, "mesh": mesh.id}
     frame = encode(
@@ -425,7 +472,8 @@ def test_clipped_share(device, code, share):
 
 
 def test_a_lens_that_folds_over_shows_nothing_twice(device):
-    """Barrel distortion of k1 = -0.5 turns back at 55 degrees; a ball beyond that is not in the frame, whatever the formula says."""
+    """Barrel distortion of k1 = -0.5 turns back at 55 degrees; a ball beyond that is not in the frame, whatever the
+    formula says."""
     lens = (-0.5, 0, 0, 0, 0, 0, 0, 0)
     view = reference.View((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), distortion=lens, focal=150.0)
     beyond = np.radians(54.0)
@@ -473,8 +521,8 @@ def test_light_directions_of_real_photographs(device, shared, number):
     x, y, radius = map(float, (folder / "circle_data.txt").read_text().split())
     expected = np.loadtxt(folder / "light_directions.txt")[:, number - 1]
     image = cv2.cvtColor(cv2.imread(str(folder / f"Image_{number:02d}.JPG")), cv2.COLOR_BGR2RGB)
-    # Photographed from so far that it is orthographic: 1000 radii. World: x right, y up, z toward the camera. Their origin is the
-    # picture's corner, half a pixel from the centre of its first pixel.
+    # Photographed from so far that it is orthographic: 1000 radii. World: x right, y up, z toward the camera. Their
+    # origin is the picture's corner, half a pixel from the centre of its first pixel.
     distance = 1000.0
     rows, columns = image.shape[:2]
     focal = radius * np.sqrt(distance**2 - 1.0)
@@ -491,9 +539,10 @@ def test_light_directions_of_real_photographs(device, shared, number):
 
 
 TRUTH = {
-    # Mean |error| over mean radiance, above the horizon (below it the desk is near: not a distant room), where nothing clips.
+    # Mean |error| over mean radiance, above the horizon (below it the desk is near: not a distant room), where nothing
+    # clips.
     "gold_torus_interior": 0.035,
-    "mirror_and_chalk_studio": 0.20,  # black walls with hair-thin edges: the mean is 0.03, and a pixel is two texels wide
+    "mirror_and_chalk_studio": 0.20,  # black walls with hair-thin edges, and a pixel is two texels wide
     "night_desk_lamp": 0.015,
     "overexposed_desk": 0.006,
     "plastic_bunny_sunset": 0.015,

@@ -87,7 +87,8 @@ def render(view, balls, light, background, samples=4):
 
 
 def corners(view, center, radius, height):
-    """Pixel column, pixel row and pixels to the silhouette of each texel corner; NaN where blind. Nothing hides the ball."""
+    """Pixel column, pixel row and pixels to the silhouette of each texel corner; NaN where blind. Nothing hides the
+    ball."""
     rows, columns = np.meshgrid(np.arange(height + 1.0), np.arange(2 * height + 1.0), indexing="ij")
     d = latlong.directions(height, 2 * height, rows, columns)
     axis = view.position - np.asarray(center, np.float64)

@@ -38,7 +38,7 @@ class Fill(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Down the pyramid, up again, and the change against what readers have seen (on CPU, where it can be read for nothing)."""
+        """Down the pyramid, up again, and on CPU, where reading costs nothing, the change since readers last ran."""
         self._arrays = arrays
         self._on_cpu = device.is_cpu
         height = self.request.quality.environment_height
@@ -63,7 +63,7 @@ class Fill(Stage):
         return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
 
     def changed(self, name: str) -> bool:
-        """Whether some texel moved by more than ``environment.CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
+        """Whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.
 
         On CUDA always: to know it there, the host would have to wait for the device.
         """

@@ -1,0 +1,106 @@
+"""Float64 twin of ``warp_ar.kernels.environment``, as plain as it can be."""
+
+import numpy as np
+
+from tests.reference import latlong
+
+
+def smooth_ramp(low, high, x):
+    t = np.clip((np.asarray(x, np.float64) - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+class Accumulator:
+    """Environment over time."""
+
+    def __init__(self, height, width, cell=8, follow=0.15, haste=6.0, forget=20.0):
+        self.environment = np.zeros((height, width, 3))
+        self.clipped = np.zeros((height, width, 3))
+        self.confidence = np.zeros((height, width))
+        self.rows, self.columns = max(1, height // cell), max(1, width // cell)
+        self.change = np.zeros((2, self.rows, self.columns))
+        self.follow, self.haste, self.forget = follow, haste, forget
+
+    def step(self, radiance, confidence, clipped, time_step):
+        height, width = confidence.shape
+        area = latlong.solid_angles(height, width)
+        weight = area * np.minimum(confidence, self.confidence)
+        new, old = radiance.mean(-1), self.environment.mean(-1)
+        current = np.zeros((self.rows, self.columns))
+        for i in range(self.rows):
+            for j in range(self.columns):
+                part = np.s_[
+                    i * height // self.rows : (i + 1) * height // self.rows,
+                    j * width // self.columns : (j + 1) * width // self.columns,
+                ]
+                level = (weight[part] * (np.maximum(new, old)[part] + 0.01)).sum()
+                current[i, j] = (weight[part] * (new - old)[part]).sum() / level if level > 0 else 0.0
+        self.change = np.stack([current, self.change[0]])
+        lasting = np.where(self.change[0] * self.change[1] > 0, np.abs(self.change).min(0), 0.0)
+        y = (np.arange(height) + 0.5) * self.rows / height - 0.5
+        x = (np.arange(width) + 0.5) * self.columns / width - 0.5
+        i, j = np.floor(y).astype(int), np.floor(x).astype(int)
+        fy, fx = (y - i)[:, None], (x - j)[None, :]
+
+        def at(r, c):
+            return lasting[np.clip(r, 0, self.rows - 1)[:, None], (c % self.columns)[None, :]]
+
+        blend = (at(i, j) * (1 - fx) + at(i, j + 1) * fx) * (1 - fy) + (
+            at(i + 1, j) * (1 - fx) + at(i + 1, j + 1) * fx
+        ) * fy
+        rate = 1 - np.exp(-time_step / self.follow * (1 + (self.haste - 1) * smooth_ramp(0.03, 0.15, blend)))
+        k = self.confidence
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = np.where(k > 0, rate * confidence / (rate * confidence + (1 - rate) * k), 1.0)
+        a = np.where(confidence > 0, share, 0.0)
+        self.environment += a[..., None] * (radiance - self.environment)
+        self.clipped += a[..., None] * (clipped - self.clipped)
+        k = k * np.exp(-time_step / self.forget)
+        self.confidence = k + a * (confidence - k)
+
+
+def _overlap(fine, coarse):
+    """Share of fine cell f within coarse cell c, (coarse, fine), with the interval's ends."""
+    edges = np.arange(coarse + 1) * fine / coarse
+    start = np.maximum(edges[:-1, None], np.arange(fine)[None, :])
+    stop = np.minimum(edges[1:, None], np.arange(1, fine + 1)[None, :])
+    return start, np.maximum(stop, start)
+
+
+def fill(radiance, confidence):
+    """Complete a map by push and pull."""
+    trust = smooth_ramp(0.0, 0.5, confidence)
+    value = np.where(trust[..., None] > 0, np.maximum(radiance, 0), 0)
+    levels = [(value, trust)]
+    while levels[-1][1].shape != (1, 1):
+        value, trust = levels[-1]
+        height, width = trust.shape
+        rows, columns = (height + 1) // 2, (width + 1) // 2
+        start, stop = _overlap(height, rows)
+        bands = np.cos(np.pi * start / height) - np.cos(np.pi * stop / height)
+        start, stop = _overlap(width, columns)
+        spans = stop - start
+        area = bands.sum(1)[:, None] * spans.sum(1)[None, :]
+        weight = bands @ trust @ spans.T
+        total = np.einsum("rh,hw,hwc,kw->rkc", bands, trust, value, spans)
+        mean = np.where(weight[..., None] > 0, total / np.maximum(weight, 1e-300)[..., None], 0)
+        levels.append((mean, np.minimum(1, 4 * weight / area)))
+    complete = levels[-1][0]
+    for value, trust in reversed(levels[:-1]):
+        height, width = trust.shape
+        rows, columns = complete.shape[:2]
+        y, x = np.meshgrid(
+            (np.arange(height) + 0.5) * rows / height - 0.5,
+            (np.arange(width) + 0.5) * columns / width - 0.5,
+            indexing="ij",
+        )
+        coarse = latlong.sample_at(complete, y, x)
+        complete = value + (1 - trust)[..., None] * (coarse - value)
+    return complete
+
+
+def flow(environment):
+    """Vector irradiance and scalar irradiance of the luminance."""
+    height, width = environment.shape[:2]
+    weight = latlong.solid_angles(height, width) * (np.asarray(environment, np.float64) @ [0.2126, 0.7152, 0.0722])
+    return np.einsum("hw,hwc->c", weight, latlong.directions(height, width)), weight.sum()
