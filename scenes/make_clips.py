@@ -3,20 +3,22 @@
     python scenes/make_clips.py [--clip desk] [--variant cuda_ad_rgb] [--frames N] [--spp 512] [--out scenes/clips]
     python scenes/make_clips.py --truth FOLDER [--scene torus] [--frames N]
 
-A clip is what a camera would have seen: one room, one desk, a printed marker, a mirror ball, and clutter that no scene file
-mentions. Everything is made here, in code: geometry, textures, light. Radiance is in camera values throughout (1 clips), so
-no exposure is applied: a frame is clipped at 1, sRGB-encoded and rounded to 8 bit.
+A clip is what a camera would have seen: one room, one desk, a printed marker, a mirror ball, and clutter that no scene
+file mentions. Everything is made here, in code: geometry, textures, light. Radiance is in camera values throughout
+(1 clips), so no exposure is applied: a frame is clipped at 1, sRGB-encoded and rounded to 8 bit.
 
 The virtual things are never in a clip. ``--truth`` reads them from the scene file and renders the same frames with the
-objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's centre.
+objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's
+centre.
 
-Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU in a minute or two
-per frame and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
+Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly, and
+wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import pathlib
 import tempfile
@@ -52,7 +54,7 @@ GUIDE_SPP = 32
 Dict = dict[str, Any]
 
 
-# ---- small geometry ------------------------------------------------------------------------------------------------------
+# ---- small geometry ------------------------------------------------------------------------------
 
 
 def turned(at: tuple[float, ...] = (0, 0, 0), turn: float = 0.0, size: Any = 1.0) -> mi.ScalarTransform4f:
@@ -101,13 +103,15 @@ def lathe(profile: list[tuple[float, float]], sides: int = 48, repeat: int = 4) 
     """Turn a profile of (radius, height) about z; each point is repeated nearby so that corners stay crisp."""
     points = np.array(profile, float)
     steps = [points[0]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in itertools.pairwise(points):
         edge = min(0.1, 0.0006 / max(float(np.linalg.norm(b - a)), 1e-9))
         steps += [a + (b - a) * t for t in (edge, *np.linspace(0, 1, repeat)[1:-1], 1 - edge)]
     radius, height = np.array([*steps, points[-1]]).T
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    return np.concatenate([radius[:, None, None] * ring, np.broadcast_to(height[:, None, None], (len(radius), sides, 1))], -1)
+    return np.concatenate(
+        [radius[:, None, None] * ring, np.broadcast_to(height[:, None, None], (len(radius), sides, 1))], -1
+    )
 
 
 def spline(points: list[tuple[float, ...]], steps: int = 24) -> np.ndarray:
@@ -136,7 +140,7 @@ def tube(path: np.ndarray, radius: float, sides: int = 16) -> np.ndarray:
     return np.concatenate([cap(0), rings, cap(-1)])
 
 
-# ---- materials and textures ----------------------------------------------------------------------------------------------
+# ---- materials and textures ----------------------------------------------------------------------
 
 
 def rgb(value: Any) -> Dict:
@@ -149,7 +153,13 @@ def matte(color: Any) -> Dict:
 
 def glossy(color: Any, roughness: float, metallic: float = 0.0, specular: float = 0.5) -> Dict:
     color = color if isinstance(color, dict) else rgb(color)
-    return {"type": "principled", "base_color": color, "roughness": roughness, "metallic": metallic, "specular": specular}
+    return {
+        "type": "principled",
+        "base_color": color,
+        "roughness": roughness,
+        "metallic": metallic,
+        "specular": specular,
+    }
 
 
 def mirror(color: Any) -> Dict:
@@ -181,7 +191,9 @@ def wood(light: Any, dark: Any, seed: int, boards: int = 9, shape: tuple[int, in
     for _ in range(boards):
         across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
         bend = noise(rng, height, width, (1, 3), 3)
-        rings = 0.5 + 0.5 * np.sin(2 * np.pi * (rng.uniform(1.2, 2.6) * (across + rng.uniform(-1, 1)) ** 2 * 3 + 1.1 * bend))
+        rings = 0.5 + 0.5 * np.sin(
+            2 * np.pi * (rng.uniform(1.2, 2.6) * (across + rng.uniform(-1, 1)) ** 2 * 3 + 1.1 * bend)
+        )
         fibre = noise(rng, height, width, (height // 6, 8), 2)
         pores = np.clip(noise(rng, height, width, (height // 3, 30), 1) - 0.6, 0, 1)
         mix = 0.42 + 0.34 * rings**1.5 + 0.10 * fibre - 0.6 * pores + rng.uniform(-0.16, 0.16)
@@ -211,7 +223,17 @@ def tin() -> np.ndarray:
         cv2.line(image, (0, y), (800, y), ink, 3, cv2.LINE_AA)
     cv2.circle(image, (400, 180), 52, ink, 4, cv2.LINE_AA)
     for k in range(5):  # a leaf
-        cv2.ellipse(image, (400, 190 - 4 * k), (30 - 4 * k, 12 + 2 * k), -90 + 36 * (k - 2), 0, 360, (0.22, 0.38, 0.25), -1, cv2.LINE_AA)
+        cv2.ellipse(
+            image,
+            (400, 190 - 4 * k),
+            (30 - 4 * k, 12 + 2 * k),
+            -90 + 36 * (k - 2),
+            0,
+            360,
+            (0.22, 0.38, 0.25),
+            -1,
+            cv2.LINE_AA,
+        )
     for x in (150, 650):
         for k in range(3):
             cv2.line(image, (x - 80, 160 + 20 * k), (x + 80, 160 + 20 * k), ink, 4 if k == 1 else 2, cv2.LINE_AA)
@@ -251,7 +273,7 @@ def view(seed: int) -> np.ndarray:
     return np.clip(image, 0.02, None)
 
 
-# ---- the room and the desk -----------------------------------------------------------------------------------------------
+# ---- the room and the desk -----------------------------------------------------------------------
 
 
 def window(name: str, center: Any, right: Any, up: Any, radiance: np.ndarray) -> Dict:
@@ -298,7 +320,14 @@ def room(clip: str) -> Dict:
         "chair_back": box((-0.22, -1.26, 0.05), (0.44, 0.05, 0.5), matte((0.12, 0.17, 0.24)), 12),
     }
     rng = np.random.default_rng(8)
-    spines = [(0.45, 0.12, 0.08), (0.1, 0.2, 0.3), (0.6, 0.5, 0.3), (0.12, 0.24, 0.14), (0.68, 0.65, 0.58), (0.5, 0.3, 0.08)]
+    spines = [
+        (0.45, 0.12, 0.08),
+        (0.1, 0.2, 0.3),
+        (0.6, 0.5, 0.3),
+        (0.12, 0.24, 0.14),
+        (0.68, 0.65, 0.58),
+        (0.5, 0.3, 0.08),
+    ]
     for shelf in range(4):  # a bookcase on the near wall
         z = -0.5 + 0.42 * shelf
         shapes[f"shelf{shelf}"] = box((-0.35, y0 + 0.14, z), (1.7, 0.28, 0.03), matte((0.3, 0.19, 0.11)))
@@ -307,7 +336,9 @@ def room(clip: str) -> Dict:
             w, h = rng.uniform(0.05, 0.12), rng.uniform(0.24, 0.35)
             if rng.uniform() < 0.85:
                 color = spines[rng.integers(len(spines))]
-                shapes[f"spine{shelf}_{int(1000 * (x + 2))}"] = box((x + w / 2, y0 + 0.12, z + 0.015 + h / 2), (w, 0.2, h), matte(color))
+                shapes[f"spine{shelf}_{int(1000 * (x + 2))}"] = box(
+                    (x + w / 2, y0 + 0.12, z + 0.015 + h / 2), (w, 0.2, h), matte(color)
+                )
             x += w + 0.005
 
     def lamp(radiance: Any) -> Dict:
@@ -327,13 +358,31 @@ def room(clip: str) -> Dict:
         shapes |= window("window", (-0.55, y1 - 0.01, 0.72), (0.45, 0, 0), (0, 0, 0.66), 9.0 * view(3))
         shapes["globe"] = ball((0.2, 0.24, 0.135), 0.055, {}) | lamp(14.0 * np.array([1.0, 0.8, 0.52]))
         brass = glossy((0.75, 0.55, 0.25), 0.3, 1.0)
-        shapes["globe_foot"] = {"type": "cylinder", "p0": [0.2, 0.24, TABLE], "p1": [0.2, 0.24, 0.014], "radius": 0.04, "bsdf": {"type": "twosided", "bsdf": brass}}
+        shapes["globe_foot"] = {
+            "type": "cylinder",
+            "p0": [0.2, 0.24, TABLE],
+            "p1": [0.2, 0.24, 0.014],
+            "radius": 0.04,
+            "bsdf": {"type": "twosided", "bsdf": brass},
+        }
         shapes["globe_top"] = {"type": "disk", "to_world": turned((0.2, 0.24, 0.014), 0, 0.04), "bsdf": brass}
-        shapes["globe_stem"] = {"type": "cylinder", "p0": [0.2, 0.24, 0.014], "p1": [0.2, 0.24, 0.09], "radius": 0.007, "bsdf": brass}
+        shapes["globe_stem"] = {
+            "type": "cylinder",
+            "p0": [0.2, 0.24, 0.014],
+            "p1": [0.2, 0.24, 0.09],
+            "radius": 0.007,
+            "bsdf": brass,
+        }
     return shapes
 
 
-LAMP_DIRECTION = np.array([np.cos(np.radians(24)) * np.cos(np.radians(28)), np.cos(np.radians(24)) * np.sin(np.radians(28)), np.sin(np.radians(24))])
+LAMP_DIRECTION = np.array(
+    [
+        np.cos(np.radians(24)) * np.cos(np.radians(28)),
+        np.cos(np.radians(24)) * np.sin(np.radians(28)),
+        np.sin(np.radians(24)),
+    ]
+)
 LAMP = tuple(1.5 * LAMP_DIRECTION)
 """The one lamp of the clip ``wire``, low over the table: relief throws long shadows."""
 
@@ -377,7 +426,9 @@ def book(name: str, at: tuple[float, float, float], size: tuple[float, float, fl
 
 def pencil(folder: pathlib.Path, name: str, at: tuple[float, float, float], turn: float, color: Any) -> Dict:
     """A six-sided pencil lying on one of its flats."""
-    lie = turned(at, turn) @ mi.ScalarTransform4f().translate([0, 0, 0.0031]).rotate([0, 1, 0], 90).rotate([0, 0, 1], 30)
+    lie = turned(at, turn) @ mi.ScalarTransform4f().translate([0, 0, 0.0031]).rotate([0, 1, 0], 90).rotate(
+        [0, 0, 1], 30
+    )
     parts = {
         "rubber": ([(0, 0), (0.0033, 0), (0.0035, 0.012)], (0.62, 0.27, 0.24), 24, 0.6, 0.0),
         "ferrule": ([(0.0036, 0.011), (0.0036, 0.024)], (0.75, 0.6, 0.3), 24, 0.3, 1.0),
@@ -401,13 +452,26 @@ def mug(folder: pathlib.Path, at: tuple[float, float], turn: float, color: Any) 
     return {
         "mug": grid_mesh(folder, "mug", lathe(outer + inner), glaze, place),
         "mug_grip": grid_mesh(folder, "mug_grip", tube(grip, 0.0052), glaze, place),
-        "coffee": {"type": "disk", "to_world": turned((*at, 0.066), 0, 0.0356), "bsdf": glossy((0.045, 0.02, 0.01), 0.08)},
+        "coffee": {
+            "type": "disk",
+            "to_world": turned((*at, 0.066), 0, 0.0356),
+            "bsdf": glossy((0.045, 0.02, 0.01), 0.08),
+        },
     }
 
 
 def plant(folder: pathlib.Path, at: tuple[float, float]) -> Dict:
     """A succulent in a clay pot."""
-    clay = [(0, 0), (0.028, 0), (0.037, 0.055), (0.041, 0.055), (0.042, 0.07), (0.038, 0.07), (0.036, 0.058), (0, 0.058)]
+    clay = [
+        (0, 0),
+        (0.028, 0),
+        (0.037, 0.055),
+        (0.041, 0.055),
+        (0.042, 0.07),
+        (0.038, 0.07),
+        (0.036, 0.058),
+        (0, 0.058),
+    ]
     shapes: Dict = {"pot": grid_mesh(folder, "pot", lathe(clay), matte((0.5, 0.22, 0.12)), turned((*at, TABLE)))}
     for k in range(34):
         level = k / 33  # outer leaves first, lying flat; inner ones short and upright
@@ -429,10 +493,36 @@ def cable(folder: pathlib.Path, name: str, points: list[tuple[float, float]], ra
 def clutter(clip: str, folder: pathlib.Path) -> Dict:
     """What stands and lies on the desk. Only the tea tin of ``desk`` is known to the scene files."""
     if clip == "wire":
-        wire = [(-0.3, -0.2), (-0.16, -0.1), (-0.02, -0.14), (0.08, -0.1), (0.14, -0.02), (0.2, 0.06), (0.16, 0.13), (0.07, 0.12), (0.06, 0.2), (0.2, 0.28)]
-        thin = [(0.34, -0.16), (0.24, -0.09), (0.12, -0.15), (0.2, -0.19), (0.27, -0.13), (0.22, -0.04), (0.3, 0.03), (0.42, 0.0)]
-        return cable(folder, "wire", wire, 0.0036, (0.72, 0.7, 0.66)) | cable(folder, "thin", thin, 0.0022, (0.55, 0.2, 0.12))
-    shapes = mug(folder, (0.27, 0.17), -40, (0.62, 0.58, 0.5)) if clip == "desk" else mug(folder, (-0.02, 0.19), 200, (0.14, 0.2, 0.3))
+        wire = [
+            (-0.3, -0.2),
+            (-0.16, -0.1),
+            (-0.02, -0.14),
+            (0.08, -0.1),
+            (0.14, -0.02),
+            (0.2, 0.06),
+            (0.16, 0.13),
+            (0.07, 0.12),
+            (0.06, 0.2),
+            (0.2, 0.28),
+        ]
+        thin = [
+            (0.34, -0.16),
+            (0.24, -0.09),
+            (0.12, -0.15),
+            (0.2, -0.19),
+            (0.27, -0.13),
+            (0.22, -0.04),
+            (0.3, 0.03),
+            (0.42, 0.0),
+        ]
+        return cable(folder, "wire", wire, 0.0036, (0.72, 0.7, 0.66)) | cable(
+            folder, "thin", thin, 0.0022, (0.55, 0.2, 0.12)
+        )
+    shapes = (
+        mug(folder, (0.27, 0.17), -40, (0.62, 0.58, 0.5))
+        if clip == "desk"
+        else mug(folder, (-0.02, 0.19), 200, (0.14, 0.2, 0.3))
+    )
     shapes |= plant(folder, (-0.2, 0.27) if clip == "desk" else (-0.24, 0.22))
     if clip == "desk":
         tin_sides = glossy((0.16, 0.27, 0.22), 0.35)
@@ -440,23 +530,43 @@ def clutter(clip: str, folder: pathlib.Path) -> Dict:
         a = np.radians(PROXY["turn"])
         right, back = np.array([np.cos(a), np.sin(a), 0]), np.array([-np.sin(a), np.cos(a), 0])
         shapes["tin"] = box(PROXY["at"], PROXY["size"], tin_sides, PROXY["turn"])
-        shapes["tin_face"] = quad(at - back * (d / 2 + 1e-4), right * w / 2, (0, 0, h / 2), bsdf=glossy(texture(tin()), 0.35))
+        shapes["tin_face"] = quad(
+            at - back * (d / 2 + 1e-4), right * w / 2, (0, 0, h / 2), bsdf=glossy(texture(tin()), 0.35)
+        )
         shapes |= book("red", (-0.36, 0.13, TABLE), (0.15, 0.21, 0.024), 14, (0.42, 0.09, 0.06))
         shapes |= book("blue", (-0.365, 0.135, TABLE + 0.024), (0.13, 0.19, 0.017), -6, (0.08, 0.15, 0.28))
         shapes["pad"] = box((0.3, -0.1, TABLE + 0.003), (0.14, 0.2, 0.006), matte((0.6, 0.56, 0.48)), -14)
         a = np.radians(-14)
         shapes["pad_page"] = quad(
-            (0.3, -0.1, TABLE + 0.0062), 0.07 * np.array([np.cos(a), np.sin(a), 0]), 0.1 * np.array([-np.sin(a), np.cos(a), 0]), bsdf=matte(texture(page()))
+            (0.3, -0.1, TABLE + 0.0062),
+            0.07 * np.array([np.cos(a), np.sin(a), 0]),
+            0.1 * np.array([-np.sin(a), np.cos(a), 0]),
+            bsdf=matte(texture(page())),
         )
         shapes |= pencil(folder, "pencil", (0.03, -0.12, TABLE), 17, (0.75, 0.42, 0.04))
-        shapes |= cable(folder, "cable", [(-0.6, -0.02), (-0.42, -0.03), (-0.3, -0.1), (-0.2, -0.14), (-0.12, -0.1), (-0.09, -0.15), (-0.16, -0.21), (-0.28, -0.24)], 0.0026, (0.07, 0.07, 0.08))
+        shapes |= cable(
+            folder,
+            "cable",
+            [
+                (-0.6, -0.02),
+                (-0.42, -0.03),
+                (-0.3, -0.1),
+                (-0.2, -0.14),
+                (-0.12, -0.1),
+                (-0.09, -0.15),
+                (-0.16, -0.21),
+                (-0.28, -0.24),
+            ],
+            0.0026,
+            (0.07, 0.07, 0.08),
+        )
     else:
         shapes |= book("red", (0.33, 0.05, TABLE), (0.15, 0.21, 0.024), 24, (0.42, 0.09, 0.06))
         shapes |= pencil(folder, "pencil", (0.04, -0.13, TABLE), 12, (0.75, 0.42, 0.04))
     return shapes
 
 
-# ---- clips ---------------------------------------------------------------------------------------------------------------
+# ---- clips ---------------------------------------------------------------------------------------
 
 
 def ease(t: float, start: float, stop: float) -> float:
@@ -465,7 +575,9 @@ def ease(t: float, start: float, stop: float) -> float:
     return s * s * (3 - 2 * s)
 
 
-def orbit(azimuth: float, distance: float, height: float, target: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+def orbit(
+    azimuth: float, distance: float, height: float, target: tuple[float, float, float]
+) -> tuple[np.ndarray, np.ndarray]:
     """Eye and target of a camera at ``distance`` (in the plane) and ``height``; azimuth 0 looks along +y."""
     a = np.radians(azimuth)
     return np.array([target[0] + distance * np.sin(a), target[1] - distance * np.cos(a), height]), np.array(target)
@@ -473,7 +585,12 @@ def orbit(azimuth: float, distance: float, height: float, target: tuple[float, f
 
 def desk_camera(t: float) -> tuple[np.ndarray, np.ndarray]:
     s = ease(t, 0, 1)
-    return orbit(-16 + 40 * s, 0.62 - 0.05 * np.sin(np.pi * t), 0.42 + 0.05 * np.sin(2 * np.pi * t), (0.03, 0.03 - 0.01 * s, 0.025))
+    return orbit(
+        -16 + 40 * s,
+        0.62 - 0.05 * np.sin(np.pi * t),
+        0.42 + 0.05 * np.sin(2 * np.pi * t),
+        (0.03, 0.03 - 0.01 * s, 0.025),
+    )
 
 
 def wire_camera(t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -499,7 +616,10 @@ class Clip:
 def desk_levels(t: float) -> dict[str, float]:
     """A cloud passes, dusk falls for a moment, the ceiling lamp comes up, daylight returns."""
     cloud = 1 - 0.25 * np.sin(np.pi * ease(t, 0.08, 0.3)) ** 2
-    return {"window": cloud * (1 - 0.8 * ease(t, 0.36, 0.5) + 0.8 * ease(t, 0.82, 0.97)), "ceiling_lamp": ease(t, 0.46, 0.58) * (1 - 0.6 * ease(t, 0.84, 0.98))}
+    return {
+        "window": cloud * (1 - 0.8 * ease(t, 0.36, 0.5) + 0.8 * ease(t, 0.82, 0.97)),
+        "ceiling_lamp": ease(t, 0.46, 0.58) * (1 - 0.6 * ease(t, 0.84, 0.98)),
+    }
 
 
 CLIPS = {
@@ -507,35 +627,52 @@ CLIPS = {
     "wire": Clip(72, wire_camera, lambda t: {"window": 1.0, "table_lamp": 1.0}),
     "darken": Clip(72, darken_camera, lambda t: {"window": 1.0, "globe": 1.0}),
 }
-SCENES = {"desk": "desk", "torus": "desk", "mirror": "desk", "wire_coincident": "wire", "wire_opposing": "wire", "darken": "darken"}
+SCENES = {
+    "desk": "desk",
+    "torus": "desk",
+    "mirror": "desk",
+    "wire_coincident": "wire",
+    "wire_opposing": "wire",
+    "darken": "darken",
+}
 """The clip that each bundled scene plays."""
 
 
-# ---- the virtual things of a scene file, for truth -------------------------------------------------------------------------
+# ---- the virtual things of a scene file, for truth -----------------------------------------------
 
 
 def virtual_material(material: Dict) -> Dict:
     model = material["model"]
     if model == "metallic_roughness":
         return glossy(material["base_color"], material["roughness"], material["metallic"])
-    if model == "phong":
-        return {
-            "type": "phong",
-            "diffuse_reflectance": rgb(material["diffuse"]),
-            "specular_reflectance": rgb(material["specular"]),
-            "exponent": material["shininess"],
-        }
+    if model == "phong":  # Mitsuba 3 has none: a microfacet lobe as wide as cos^n, beside a diffuse one
+        diffuse, specular = np.array(material["diffuse"]), np.array(material["specular"])
+        share = float(np.clip(specular.max() / max(specular.max() + diffuse.max(), 1e-6), 1e-3, 1 - 1e-3))
+        alpha = float(np.sqrt(2 / (material["shininess"] + 2)))
+        lobe = {"type": "roughconductor", "material": "none", "alpha": alpha, "distribution": "ggx"}
+        lobe["specular_reflectance"] = rgb(specular / share)
+        return {"type": "blendbsdf", "weight": share, "a": matte(diffuse / (1 - share)), "b": lobe}
     return mirror(material["base_color"]) if model == "mirror" else matte(material["base_color"])
 
 
 def virtual_object(thing: Dict, folder: pathlib.Path) -> Dict:
     t = mi.ScalarTransform4f()
     rx, ry, rz = thing.get("rotate", (0, 0, 0))
-    place = t.translate(thing.get("at", [0, 0, 0])) @ t.rotate([0, 0, 1], rz) @ t.rotate([0, 1, 0], ry) @ t.rotate([1, 0, 0], rx)
+    place = (
+        t.translate(thing.get("at", [0, 0, 0]))
+        @ t.rotate([0, 0, 1], rz)
+        @ t.rotate([0, 1, 0], ry)
+        @ t.rotate([1, 0, 0], rx)
+    )
     place = place @ t.scale(thing.get("scale", 1.0))
     bsdf = virtual_material(thing["material"])
     if thing["shape"] == "mesh":
-        return {"type": "ply", "filename": str(HERE / thing["file"]), "to_world": place, "bsdf": {"type": "twosided", "bsdf": bsdf}}
+        return {
+            "type": "ply",
+            "filename": str(HERE / thing["file"]),
+            "to_world": place,
+            "bsdf": {"type": "twosided", "bsdf": bsdf},
+        }
     if thing["shape"] == "sphere":
         return {"type": "sphere", "to_world": place @ t.scale(thing["radius"]), "bsdf": bsdf}
     if thing["shape"] == "box":
@@ -544,7 +681,13 @@ def virtual_object(thing: Dict, folder: pathlib.Path) -> Dict:
     v = -v[:, :-1]
     u = u[:, :-1]
     ring = thing["major_radius"] + thing["minor_radius"] * np.cos(v)
-    return grid_mesh(folder, "torus", np.stack([ring * np.cos(u), ring * np.sin(u), thing["minor_radius"] * np.sin(v)], -1), bsdf, place)
+    return grid_mesh(
+        folder,
+        "torus",
+        np.stack([ring * np.cos(u), ring * np.sin(u), thing["minor_radius"] * np.sin(v)], -1),
+        bsdf,
+        place,
+    )
 
 
 def virtual_light(light: Dict) -> Dict:
@@ -553,11 +696,17 @@ def virtual_light(light: Dict) -> Dict:
         return {"type": "point", "position": light["at"], "intensity": power}
     if light["kind"] == "spot":
         aim = mi.ScalarTransform4f().look_at(origin=light["at"], target=light["target"], up=[0.1, 1, 0.2])
-        return {"type": "spot", "to_world": aim, "intensity": power, "cutoff_angle": light["outer_angle"], "beam_width": light["inner_angle"]}
+        return {
+            "type": "spot",
+            "to_world": aim,
+            "intensity": power,
+            "cutoff_angle": light["outer_angle"],
+            "beam_width": light["inner_angle"],
+        }
     raise ValueError(f"truth is not made for lights of kind {light['kind']!r}")
 
 
-# ---- rendering -----------------------------------------------------------------------------------------------------------
+# ---- rendering -----------------------------------------------------------------------------------
 
 
 class Renderer:
@@ -578,7 +727,9 @@ class Renderer:
         self.lamps = mi.traverse(self.scene)
         self.base = {}
         for lamp in CLIPS[clip].levels(0.0):
-            key = next(k for k in (f"{lamp}.emitter.radiance.data", f"{lamp}.emitter.radiance.value") if k in self.lamps)
+            key = next(
+                k for k in (f"{lamp}.emitter.radiance.data", f"{lamp}.emitter.radiance.value") if k in self.lamps
+            )
             self.base[lamp] = (key, type(self.lamps[key])(self.lamps[key]))
 
     def light(self, t: float) -> None:
@@ -599,7 +750,13 @@ class Renderer:
                 "fov_axis": "x",
                 "near_clip": 0.01,
                 "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "pixel_format": "rgb", "rfilter": {"type": "box"}},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": WIDTH,
+                    "height": HEIGHT,
+                    "pixel_format": "rgb",
+                    "rfilter": {"type": "box"},
+                },
                 "sampler": {"type": "independent"},
             }
         )
@@ -609,7 +766,7 @@ class Renderer:
         return pyoidn.denoise(np.array(color), albedo=albedo, normal=np.ascontiguousarray(normal), hdr=True)
 
     def environment(self, t: float, height: int = 256, rounds: int = 64) -> np.ndarray:
-        """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``: the scene must be without the ball."""
+        """Light arriving at the ball's centre, latlong ``(height, 2 height, 3)``; render it without the ball."""
         import drjit as dr
 
         self.light(t)
@@ -701,9 +858,20 @@ def make_truth(name: str, options: argparse.Namespace) -> None:
     (folder / "env").mkdir(exist_ok=True)
     for k in chosen:
         np.save(folder / "env" / f"{k:04d}.npy", renderer.environment(moments[k]).astype(np.float16))
-    poses = [dict(zip(("R", "t"), (p.tolist() for p in pose(clip, t)), strict=True)) | {"frame": k} for k, t in enumerate(moments)]
+    poses = [
+        dict(zip(("R", "t"), (p.tolist() for p in pose(clip, t)), strict=True)) | {"frame": k}
+        for k, t in enumerate(moments)
+    ]
     levels = [CLIPS[clip].levels(t) for t in moments]
-    case = {"name": name, "clip": clip, "frames": len(moments), "truth_frames": chosen, "dark": [0.5], "poses": poses, "levels": levels}
+    case = {
+        "name": name,
+        "clip": clip,
+        "frames": len(moments),
+        "truth_frames": chosen,
+        "dark": [0.5],
+        "poses": poses,
+        "levels": levels,
+    }
     (folder / "case.json").write_text(json.dumps(case, indent=1))
     print(f"{folder}: frames {chosen}", flush=True)
 
@@ -712,7 +880,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", default="cuda_ad_rgb", help="Mitsuba variant: cuda_ad_rgb or llvm_ad_rgb")
     parser.add_argument("--clip", action="append", choices=sorted(CLIPS), help="clip to render (default: all)")
-    parser.add_argument("--scene", action="append", choices=sorted(SCENES), help="with --truth: scene to render (default: all)")
+    parser.add_argument(
+        "--scene", action="append", choices=sorted(SCENES), help="with --truth: scene to render (default: all)"
+    )
     parser.add_argument("--frames", type=int, help="render this many frames, spread over the clip's whole motion")
     parser.add_argument("--spp", type=int, default=512, help="samples per pixel (default 512)")
     parser.add_argument("--crf", type=int, default=17, help="quality of H.264, lower is better (default 17)")

@@ -2,14 +2,14 @@
 
     python scenes/make_teapot.py [--segments 8]
 
-The body, lid and bottom of the teapot are surfaces of revolution in the published data: every ring of control points is a
-quarter circle with the factor 0.56. So four numbers per control point become two: a profile (radius, height), turned by
-`QUARTER`. The handle and the spout are mirror images in y = 0 and are given as one half each. The table below is in
-Newell's units with z up and the bottom at z = 0; the mesh keeps them (the pot is 3.15 high and 6.43 long) and a scene
-scales it. The lid is widened until it meets the rim: in the data a gap of 0.1 shows the empty inside.
+The body, lid and bottom of the teapot are surfaces of revolution in the published data: every ring of control points is
+a quarter circle with the factor 0.56. So a profile of (radius, height), turned by `QUARTER`, holds all of them. The handle
+and the spout are mirror images in y = 0 and are given as one half each. The table below is in Newell's units with z up and
+the bottom at z = 0; the mesh keeps them (the pot is 3.15 high and 6.43 long) and a scene scales it. The lid is widened
+until it meets the rim: in the data a gap of 0.1 shows the empty inside.
 
 References:
-    [Newell75] M. Newell, The Utilization of Procedure Models in Digital Image Synthesis, PhD thesis, University of Utah.
+    [Newell75] M. Newell, The Utilization of Procedure Models in Digital Image Synthesis, PhD thesis, Utah.
     [Crow87] F. Crow, The Origins of the Teapot, IEEE Computer Graphics and Applications 7(1), pp. 8-19.
 """
 
@@ -37,7 +37,7 @@ PROFILES = {  # (radius, height) of four control points each
     "lid": [(0.2, 2.7), (0.4, 2.55), (1.3, 2.55), (1.3, 2.4)],
 }
 
-# Four rows of control points along the part; a row is (x, z) on the seam y = 0, the half width, and (x, z) on the other seam.
+# Four rows of control points along the part: (x, z) on the seam y = 0, the half width, (x, z) on the other seam.
 HALVES = {
     "handle, upper": [
         ((-1.6, 2.025), 0.3, (-1.5, 2.25)),
@@ -142,11 +142,13 @@ def teapot(segments: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         triangles.append(index + count)
         count += len(points[-1])
     point, normal, index = np.concatenate(points), np.concatenate(normals), np.concatenate(triangles)
-    # Weld what lies at one place with one normal (seams between patches); keep true creases such as the lid's edge apart.
+    # Weld what lies at one place with one normal (seams between patches); creases such as the lid's edge stay apart.
     key = np.round(np.concatenate([point * 1e4, normal * 50.0], -1)).astype(np.int64)
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
     point, normal, index = point[first], normal[first], inverse.reshape(-1)[index]
-    area = np.linalg.norm(np.cross(point[index[:, 1]] - point[index[:, 0]], point[index[:, 2]] - point[index[:, 0]]), axis=-1)
+    area = np.linalg.norm(
+        np.cross(point[index[:, 1]] - point[index[:, 0]], point[index[:, 2]] - point[index[:, 0]]), axis=-1
+    )
     return point, normal, index[area > 1e-9]
 
 
