@@ -73,7 +73,7 @@ class World:
     def __init__(self, device: str) -> None:
         self.device = device
         self.bodies: list[reference.Body] = []
-        self._records: list[np.ndarray] = []
+        self.records: list[np.ndarray] = []
         self._meshes: list = []
         self._corners = 0
 
@@ -93,7 +93,7 @@ class World:
             triangles = None
         kinds = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
         record["kind"], record["extent"], record["position"] = kinds[kind], extent, position
-        self._records.append(record)
+        self.records.append(record)
         # The twin sees the rounded numbers that the device sees.
         self.bodies.append(
             reference.Body(
@@ -108,8 +108,8 @@ class World:
         return self
 
     def scene(self, *, proxies: bool = False) -> structs.RayScene:
-        records = np.zeros(len(self._records), self._records[0].dtype)
-        for index, record in enumerate(self._records):
+        records = np.zeros(len(self.records), self.records[0].dtype)
+        for index, record in enumerate(self.records):
             records[index] = record
         shapes = wp.array(records, dtype=structs.Shape, device=self.device)
         nothing = wp.zeros(0, dtype=structs.Shape, device=self.device)

@@ -1,0 +1,296 @@
+"""Reflection models: energy, the float64 twins, and the ends of every range."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import materials as reference
+from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe, sample_texture
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Material, RayScene, Texture
+
+MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
+
+# Unit vectors are rounded to 6e-8. At exponent n the lobe falls by n sin(theta) per radian, so its relative error grows
+# as that; at 1e5 and the angles where the lobe is not yet nothing (0.02) it reaches 1e5 * 0.02 * 1e-7.
+LOBE_TOLERANCE = 5e-4
+# The half vector is rounded to 1e-7, and near mirror roughness (alpha 1e-3) that is a ten-thousandth of the peak's width.
+GGX_TOLERANCE = 2e-3
+# Quadrature of the hemisphere against the table of directional albedos: the table's own bilinear error is about 1e-3.
+ALBEDO_TOLERANCE = 4e-3
+# Sums of a handful of float32 products.
+SUM_TOLERANCE = 1e-5
+
+surface_at = make_surface(MODELS, True)
+reflect_direct = make_reflect_direct(MODELS)
+reflect_lambert = make_reflect_direct((LAMBERT,))
+lambert_at = make_surface((LAMBERT,), False)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def lobes_kernel(
+    # In:
+    wi: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    parameter: wp.float32,
+    # Out:
+    phong_out: wp.array[wp.float32],
+    ggx_out: wp.array[wp.float32],
+):
+    i = wp.tid()
+    normal = wp.vec3(0.0, 0.0, 1.0)
+    phong_out[i] = phong_lobe(wo[i], wi[i], parameter)
+    half = wp.normalize(wi[i] + wo[i])
+    ggx_out[i] = ggx_lobe(normal, half, wi[i][2], wo[i][2], parameter)
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def reflect_kernel(
+    # In:
+    scene: RayScene,
+    dfg: wp.array2d[wp.vec2],
+    wi: wp.array[wp.vec3],
+    wo: wp.array[wp.vec3],
+    # Out:
+    direct_out: wp.array[wp.vec3],
+    diffuse_out: wp.array[wp.vec3],
+    reflectance_out: wp.array[wp.vec3],
+    lambert_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    normal = wp.vec3(0.0, 0.0, 1.0)
+    surface = surface_at(scene, dfg, 0, wp.vec2(0.0), wo[i][2])
+    direct_out[i] = reflect_direct(surface, normal, wo[i], wi[i])
+    diffuse_out[i] = surface.diffuse
+    reflectance_out[i] = surface.reflectance
+    lambert = lambert_at(scene, dfg, 0, wp.vec2(0.0), wo[i][2])
+    lambert_out[i] = reflect_lambert(lambert, normal, wo[i], wi[i])
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def texture_kernel(
+    # In:
+    scene: RayScene,
+    uvs: wp.array[wp.vec2],
+    # Out:
+    color_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    color_out[i] = sample_texture(scene, 1, uvs[i])
+
+
+def vectors(values, device):
+    return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=device)
+
+
+def lobes(wi, wo, parameter, device):
+    outputs = [wp.zeros(len(wi), dtype=wp.float32, device=device) for _ in range(2)]
+    wp.launch(
+        lobes_kernel,
+        dim=len(wi),
+        inputs=[vectors(wi, device), vectors(wo, device), parameter],
+        outputs=outputs,
+        device=device,
+    )
+    return [output.numpy() for output in outputs]
+
+
+def material(**fields):
+    record = np.zeros(1, np.dtype(Material.numpy_dtype()))
+    record["base_texture"] = record["specular_texture"] = -1
+    record["base_color"] = record["specular"] = 1.0
+    for name, value in fields.items():
+        record[name] = value
+    return record
+
+
+@functools.cache
+def dfg_table(device):
+    table = wp.zeros((32, 32), dtype=wp.vec2, device=device)
+    integrate_dfg(table)
+    return table
+
+
+def reflected(record, wi, wo, device):
+    """Direct reflection, diffuse and lobe reflectance, and the direct reflection of a Lambert-only build."""
+    wi, wo = np.broadcast_arrays(wi, wo)
+    scene = RayScene()
+    scene.materials = wp.array(record, dtype=Material, device=device)
+    outputs = [wp.zeros(len(wi), dtype=wp.vec3, device=device) for _ in range(4)]
+    wp.launch(
+        reflect_kernel,
+        dim=len(wi),
+        inputs=[scene, dfg_table(device), vectors(wi, device), vectors(wo, device)],
+        outputs=outputs,
+        device=device,
+    )
+    return [output.numpy() for output in outputs]
+
+
+def hemisphere(count_z, count_phi, *, about, width):
+    """Directions of the sphere and their solid angles; nodes gather within about ``width`` around ``about``."""
+    nodes, weights = np.polynomial.legendre.leggauss(count_z)
+    s, ds = 0.5 * (nodes + 1), 0.5 * weights
+    power = 2.0 + 2.0 * np.log10(1.0 / width)
+    z, dz = 1 - 2 * s**power, 2 * power * s ** (power - 1) * ds
+    phi = 2 * np.pi * (np.arange(count_phi) + 0.5) / count_phi
+    sine = np.sqrt(np.maximum(1 - z * z, 0))[:, None]
+    local = np.stack(np.broadcast_arrays(sine * np.cos(phi), sine * np.sin(phi), z[:, None]), -1).reshape(-1, 3)
+    side = np.cross(about, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    return local @ np.stack([side, np.cross(about, side), about]), np.repeat(dz * 2 * np.pi / count_phi, count_phi)
+
+
+def upper(rng, count):
+    v = rng.normal(size=(count, 3))
+    v[:, 2] = np.abs(v[:, 2]) + 1e-3
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+# --- Closed form ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 32.0, 1e3, 1e5])
+def test_phong_lobe_is_normalised(device, exponent):
+    """Its integral over the hemisphere about the mirror direction is 1 at every exponent."""
+    mirror = np.array([0.6, 0.0, 0.8])
+    wi, solid = hemisphere(400, 64, about=mirror, width=min(1.0, (exponent + 1) ** -0.5))
+    lobe, _ = lobes(wi, np.broadcast_to(mirror, wi.shape), exponent, device)
+    # At exponent 0 the lobe ends in a step, which the quadrature sees to half a node.
+    assert (lobe * solid).sum() == pytest.approx(1.0, abs=6e-3 if exponent == 0.0 else 1e-3)
+    assert np.isfinite(lobe).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("roughness", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_white_furnace(device, model, roughness, metallic):
+    """A white surface in a white room is white, from every side."""
+    record = material(model=model, roughness=roughness, metallic=metallic, shininess=10.0)
+    if model == PHONG:
+        record["base_color"], record["specular"] = 0.25, 0.75
+    wo = upper(np.random.default_rng(0), 200)
+    _, diffuse, reflectance, _ = reflected(record, wo, wo, device)
+    np.testing.assert_allclose(diffuse + reflectance, 1.0, atol=SUM_TOLERANCE)
+
+
+def test_lambert_facing_light(device):
+    """A surface that faces a light of unit irradiance has radiance base / pi, at 60 degrees half of it, behind nothing."""
+    record = material(model=LAMBERT, base_color=(0.2, 0.4, 0.8))
+    wi = np.array([[0, 0, 1], [np.sqrt(0.75), 0, 0.5], [0, 0, -1], [0.6, 0, -0.8], [1, 0, 0]])
+    direct, _, _, special = reflected(record, wi, [(0, 0, 1)], device)
+    expected = np.outer([1, 0.5, 0, 0, 0], [0.2, 0.4, 0.8]) / np.pi
+    np.testing.assert_allclose(direct, expected, atol=1e-7)
+    np.testing.assert_array_equal(special, direct)
+
+
+# --- Twins and integrals ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 32.0, 1e3, 1e5])
+def test_phong_matches_reference(device, exponent):
+    """Across the lobe, also where it underflows."""
+    rng = np.random.default_rng(1)
+    mirror = upper(rng, 4000).astype(np.float32).astype(np.float64)
+    wi = mirror + rng.normal(size=mirror.shape) * rng.choice([1.0, 0.1, 1e-2, 1e-3], size=(4000, 1))
+    wi = (wi / np.linalg.norm(wi, axis=-1, keepdims=True)).astype(np.float32).astype(np.float64)
+    lobe, _ = lobes(wi, mirror, exponent, device)
+    # The kernel measures the angle by the distance of unit vectors; so does the twin, whose vectors are rounded too.
+    cosine = 1 - 0.5 * np.sum((mirror - wi) ** 2, -1)
+    expected = reference.phong_lobe(np.stack([cosine], -1), np.ones((4000, 1)), exponent)
+    np.testing.assert_allclose(lobe, expected, rtol=LOBE_TOLERANCE, atol=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.03, 0.1, 0.35, 0.7, 1.0])
+def test_ggx_matches_reference(device, roughness):
+    """From the peak to grazing, at every roughness."""
+    rng = np.random.default_rng(2)
+    wo = upper(rng, 4000)
+    mirror = wo * [-1, -1, 1]
+    wi = mirror + rng.normal(size=wo.shape) * rng.choice([1.0, 0.1, 1e-2, 1e-3], size=(4000, 1))
+    wi[:, 2] = np.abs(wi[:, 2]) + 1e-3
+    wi = (wi / np.linalg.norm(wi, axis=-1, keepdims=True)).astype(np.float32).astype(np.float64)
+    wo = wo.astype(np.float32).astype(np.float64)
+    half = wi + wo
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    _, lobe = lobes(wi, wo, roughness, device)
+    expected = reference.ggx_lobe(np.array([0.0, 0.0, 1.0]), half, wi, wo, roughness, float(MIN_ALPHA))
+    np.testing.assert_allclose(lobe, expected, rtol=GGX_TOLERANCE, atol=1e-6 * expected.max())
+
+
+@pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("cos_o", [1.0, 0.6, 0.15])
+def test_virtual_lights_from_everywhere_are_a_white_room(device, metallic, roughness, cos_o):
+    """The integral of direct reflection over all lights is the room's reflectance: the two ways of lighting agree."""
+    record = material(model=METALLIC_ROUGHNESS, roughness=roughness, metallic=metallic, base_color=(0.9, 0.5, 0.1))
+    wo = np.array([np.sqrt(1 - cos_o**2), 0.0, cos_o])
+    wi, solid = hemisphere(600, 256, about=wo * [-1, -1, 1] + [1e-9, 0, 0], width=roughness**2)
+    direct, diffuse, reflectance, _ = reflected(record, wi, [wo], device)
+    total = np.sum(direct.astype(np.float64) * solid[:, None], axis=0)
+    np.testing.assert_allclose(total, diffuse[0] + reflectance[0], atol=ALBEDO_TOLERANCE)
+
+
+def test_phong_virtual_lights_keep_energy(device):
+    """Lights from everywhere never give more than the reflectance, and all of it where the lobe is above the horizon."""
+    for shininess in (0.0, 5.0, 500.0):
+        record = material(model=PHONG, base_color=0.0, specular=0.7, shininess=shininess)
+        for cos_o in (1.0, 0.5, 0.05):
+            wo = np.array([np.sqrt(1 - cos_o**2), 0.0, cos_o])
+            wi, solid = hemisphere(400, 128, about=wo * [-1, -1, 1] + [1e-9, 0, 0], width=(shininess + 1) ** -0.5)
+            direct = reflected(record, wi, [wo], device)[0]
+            total = np.sum(direct[:, 0] * solid)
+            assert total < 0.7 + ALBEDO_TOLERANCE
+            if cos_o == 1.0:
+                assert total == pytest.approx(0.7, abs=ALBEDO_TOLERANCE)
+
+
+# --- Textures ---------------------------------------------------------------------------------------------------------
+
+
+def test_texture_matches_reference(device):
+    """A ramp and noise, odd sizes, across the repeat and far outside; a half-texel shift would show."""
+    rng = np.random.default_rng(3)
+    image = rng.random((5, 7, 3)).astype(np.float32)
+    scene = RayScene()
+    records = np.zeros(2, np.dtype(Texture.numpy_dtype()))
+    records["offset"], records["width"], records["height"] = (0, 4), (2, 7), (2, 5)
+    scene.textures = wp.array(records, dtype=Texture, device=device)
+    texels = np.concatenate([np.full((4, 3), 9.0, np.float32), image.reshape(-1, 3)])
+    scene.texels = wp.array(texels, dtype=wp.vec3, device=device)
+    corners = [(0, 0), (1, 1), (1 - 1e-8, 1e-8), (-1e-9, 1 + 1e-9), (0.5 / 7, 1 - 0.5 / 5), (-3.25, 7.75)]
+    uvs = np.concatenate([corners, rng.uniform(-2, 3, (2000, 2))]).astype(np.float32)
+    colors = wp.zeros(len(uvs), dtype=wp.vec3, device=device)
+    wp.launch(
+        texture_kernel,
+        dim=len(uvs),
+        inputs=[scene, wp.array(uvs, dtype=wp.vec2, device=device)],
+        outputs=[colors],
+        device=device,
+    )
+    # uv of 3 is rounded to 2e-7, seven texels wide.
+    np.testing.assert_allclose(colors.numpy(), reference.texture(image, uvs.astype(np.float64)), atol=1e-5)
+    np.testing.assert_allclose(colors.numpy()[4], image[0, 0], atol=1e-6)
+
+
+# --- Hard cases -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("end", [0.0, 1.0])
+def test_ends_of_every_range_are_finite(device, model, end):
+    """Exponent 0 and 1e5, roughness and metallic 0 and 1; grazing view and light; opposed vectors; light below."""
+    record = material(model=model, roughness=end, metallic=end, shininess=1e5 * end)
+    tiny = 1e-7
+    directions = np.array(
+        [[0, 0, 1], [1, 0, tiny], [-1, 0, tiny], [1, 0, 0], [-1, 0, 0], [0, 0, -1], [0, 1, tiny], [0.6, 0, 0.8]]
+    )
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    wi, wo = (grid.reshape(-1, 3) for grid in np.broadcast_arrays(directions[:, None], directions[None, :]))
+    for values in reflected(record, wi, wo, device):
+        assert np.isfinite(values).all()
+        assert (values >= 0).all()

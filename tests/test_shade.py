@@ -1,0 +1,305 @@
+"""Shading: white furnace, closed forms, the float64 twin, edges, and that nothing is compiled in that changes the rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import shade as reference
+from tests.test_visibility import GENERAL, World
+from warp_ar.kernels import structs
+from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
+from warp_ar.kernels.shade import ShadeConfig, shade
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
+from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+
+SIZE = (48, 64)
+FOCAL = 60.0
+LEVEL_HEIGHT = 16
+EVERYTHING = ShadeConfig(
+    trace=GENERAL,
+    models=(LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR),
+    lights=(structs.POINT, structs.SPOT, structs.DIRECTIONAL),
+    textures=True,
+    room_diffuse="sh",
+    room_specular=True,
+    edge_samples=4,
+)
+
+# Nine coefficients and the packed levels each hold a constant to a few roundings.
+FURNACE_TOLERANCE = 1e-5
+# Float32 positions against float64: 1e-6 of the cosine and the distance; a shadow's edge may fall to either side.
+TWIN_TOLERANCE = 2e-5
+TWIN_OUTLIERS = 4e-3
+
+
+def room(device, radiance=1.0):
+    """Irradiance coefficients and levels of a constant room."""
+    sh = np.zeros((9, 3), np.float32)
+    sh[0] = math.pi * radiance / 0.28209479
+    levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), radiance, np.float32)
+    return wp.array(sh, dtype=wp.vec3, device=device), wp.array(levels, dtype=wp.vec3, device=device)
+
+
+def materials(*fields, device):
+    records = np.zeros(len(fields), np.dtype(structs.Material.numpy_dtype()))
+    records["base_texture"] = records["specular_texture"] = -1
+    for record, values in zip(records, fields, strict=True):
+        for name, value in values.items():
+            record[name] = value
+    return wp.array(records, dtype=structs.Material, device=device)
+
+
+def lights(*fields, device):
+    records = np.zeros(len(fields), np.dtype(structs.Light.numpy_dtype()))
+    records["attenuation"] = (0, 0, 1)
+    for record, values in zip(records, fields, strict=True):
+        for name, value in values.items():
+            record[name] = value
+    return wp.array(records, dtype=structs.Light, device=device)
+
+
+def scene_of(world, *fields, device):
+    """The world with a material for each object."""
+    for index, record in enumerate(world.records):
+        record["material"] = index % len(fields)
+    scene = world.scene()
+    scene.materials = materials(*fields, device=device)
+    return scene
+
+
+def render(
+    scene, config, device, *, light_array=None, light_room=1.0, rect=(0, 48, 0, 64), bands=(None,), eye=(0.0, 0.0, 0.0)
+):
+    """Trace and shade a frame of a camera at ``eye`` that looks along +z; (48, 64, 4)."""
+    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+    params["camera_position"], params["world_from_camera"] = eye, np.eye(3)
+    params["focal"], params["object_rect"] = FOCAL, rect
+    params = wp.array(params, dtype=structs.FrameParams, device=device)
+    rays = wp.array(pixel_rays().astype(np.float32), dtype=wp.vec2, device=device)
+    found = wp.zeros(SIZE, dtype=wp.int32, device=device)
+    depth = wp.zeros(SIZE, dtype=wp.float32, device=device)
+    hits = wp.zeros(SIZE, dtype=Hit, device=device)
+    virtual = wp.full(SIZE, wp.vec4(9.0), dtype=wp.vec4, device=device)
+    sh, levels = room(device, light_room)
+    dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
+    if METALLIC_ROUGHNESS in config.models:
+        integrate_dfg(dfg)
+    light_array = lights(device=device) if light_array is None else light_array
+    trace_pixels(config.trace, params, rays, scene, found, depth, hits)
+    for rows in bands:
+        inputs = (params, rays, scene, light_array, sh, None, levels, LEVEL_HEIGHT, dfg, found, hits)
+        shade(config, *inputs, virtual, rows=rows)
+    return virtual.numpy()
+
+
+def pixel_rays(offset=(0.0, 0.0)):
+    x, y = np.meshgrid((np.arange(64) - 31.5 + offset[0]) / FOCAL, (np.arange(48) - 23.5 + offset[1]) / FOCAL)
+    return np.stack([x, y], -1)
+
+
+def ball(device, *, radius=0.5, depth=2.0):
+    return World(device).add("sphere", extent=(radius,) * 3, at=(0, 0, depth))
+
+
+# --- Closed form ------------------------------------------------------------------------------------------------------
+
+WHITE = {
+    "lambert": {"model": LAMBERT, "base_color": 1.0},
+    "phong": {"model": PHONG, "base_color": 0.3, "specular": 0.7, "shininess": 20.0},
+    "plastic": {"model": METALLIC_ROUGHNESS, "base_color": 1.0, "roughness": 0.4},
+    "metal": {"model": METALLIC_ROUGHNESS, "base_color": 1.0, "roughness": 1.0, "metallic": 1.0},
+    "mirror": {"model": MIRROR, "base_color": 1.0},
+}
+
+
+def test_white_furnace(device):
+    """White things of every material in a white room: radiance equals coverage in every pixel, edges included."""
+    for kind, fields in WHITE.items():
+        image = render(scene_of(ball(device), fields, device=device), EVERYTHING, device)
+        assert np.isfinite(image).all()
+        assert image[24, 32, 3] == 1.0
+        np.testing.assert_allclose(
+            image[..., :3], np.repeat(image[..., 3:], 3, -1), atol=FURNACE_TOLERANCE, err_msg=kind
+        )
+
+
+def test_lambert_under_a_point_light(device):
+    """A white box that faces the light at distance d has radiance I / (pi d^2)."""
+    world = World(device).add("box", extent=(5, 5, 0.5), at=(0, 0, 3.5))
+    scene = scene_of(world, {"model": LAMBERT, "base_color": 1.0}, device=device)
+    config = dataclasses.replace(EVERYTHING, room_diffuse="none", room_specular=False)
+    light = {"kind": structs.POINT, "position": (1 / FOCAL * 1.5, 1 / FOCAL * 1.5, 1.0), "intensity": (1, 2, 3)}
+    image = render(scene, config, device, light_array=lights(light, device=device))
+    np.testing.assert_allclose(image[24, 32, :3], np.array([1, 2, 3]) / (math.pi * 4), rtol=1e-4)
+
+
+def test_coverage_of_a_disc(device):
+    """With smooth edges, the sum of coverages is the projected area of a ball."""
+    area = math.pi * (FOCAL * math.tan(math.asin(0.25))) ** 2
+    scene = scene_of(ball(device), WHITE["lambert"], device=device)
+    errors = []
+    for samples in (1, 4, 16):
+        config = dataclasses.replace(EVERYTHING, edge_samples=samples)
+        alpha = render(scene, config, device)[..., 3]
+        errors.append(abs(alpha.sum() - area) / area)
+        assert set(np.unique(np.round(alpha * samples, 4))) <= set(range(samples + 1))
+    # About 100 edge pixels with a quantisation error of 1 / sqrt(12 n) or less each, of an area of 750.
+    assert errors[0] < 0.02
+    assert errors[1] < 0.008
+    assert errors[2] < 0.004
+
+
+def test_near_vertical_edge_has_every_shade(device):
+    """An edge that leans by one pixel over the image passes through all n^2 + 1 shades, not n + 1."""
+    world = World(device).add("box", extent=(5, 5, 0.5), at=(5.1, 0, 3.0), rotate=(0, 0, 1.2))
+    scene = scene_of(world, WHITE["lambert"], device=device)
+    alpha = render(scene, dataclasses.replace(EVERYTHING, edge_samples=16), device)[..., 3]
+    assert len(np.unique(np.round(alpha * 16))) >= 16
+
+
+# --- The float64 twin -------------------------------------------------------------------------------------------------
+
+
+def test_matches_reference(device):
+    """Lambertian shapes that shadow each other, against brute force in double precision, edge samples included."""
+    world = World(device)
+    world.add("sphere", extent=(0.4, 0.4, 0.4), at=(-0.3, 0, 2)).add("box", extent=(0.3, 0.2, 0.4), at=(0.4, 0.2, 2.4))
+    world.add("box", extent=(3, 3, 0.1), at=(0, 0, 3.2), rotate=(20, 10, 0))
+    base = np.array([[0.8, 0.2, 0.1], [0.1, 0.7, 0.2], [0.5, 0.5, 0.5]])
+    scene = scene_of(world, *({"model": LAMBERT, "base_color": color} for color in base), device=device)
+    config = dataclasses.replace(
+        EVERYTHING, room_diffuse="none", room_specular=False, models=(LAMBERT,), textures=False
+    )
+    position, intensity = np.array([-1.2, -0.9, 0.6]), np.array([3.0, 2.0, 1.0])
+    light = lights({"kind": structs.POINT, "position": position, "intensity": intensity}, device=device)
+    image = render(scene, config, device, light_array=light)
+
+    samples = []
+    for b in range(2):
+        for a in range(2):
+            offset = ((a + (b + 0.5) / 2) / 2 - 0.5, (b + (1.5 - a) / 2) / 2 - 0.5)
+            directions = np.concatenate([pixel_rays(offset), np.ones((*SIZE, 1))], -1).reshape(-1, 3)
+            samples.append(
+                np.column_stack(
+                    reference.shade_point_light(world.bodies, base, np.zeros(3), directions, position, intensity)
+                )
+            )
+    directions = np.concatenate([pixel_rays(), np.ones((*SIZE, 1))], -1).reshape(-1, 3)
+    center = np.column_stack(
+        reference.shade_point_light(world.bodies, base, np.zeros(3), directions, position, intensity)
+    )
+    smooth = np.mean(samples, 0).reshape(*SIZE, 4)
+    center = center.reshape(*SIZE, 4)
+    # A pixel is either its centre or the mean of its samples; which of the two is the edge test's business.
+    error = np.minimum(np.abs(image - smooth).max(-1), np.abs(image - center).max(-1))
+    assert (error > TWIN_TOLERANCE).mean() < TWIN_OUTLIERS
+    # Where the object changes between neighbours, it must be the mean.
+    _, which, _ = reference.closest(world.bodies, np.zeros_like(directions), directions)
+    which = which.reshape(SIZE)
+    edge = np.zeros(SIZE, bool)
+    edge[:, 1:] |= which[:, 1:] != which[:, :-1]
+    edge[:, :-1] |= which[:, 1:] != which[:, :-1]
+    assert edge.sum() > 100
+    assert (np.abs(image - smooth).max(-1)[edge] > TWIN_TOLERANCE).mean() < 0.05  # shadow edges beside outlines
+
+
+# --- Structure --------------------------------------------------------------------------------------------------------
+
+
+def crowd(device):
+    world = World(device)
+    for index, at in enumerate([(-0.6, 0, 2), (0, 0.2, 1.8), (0.6, 0, 2.2)]):
+        world.add("sphere", extent=(0.35,) * 3, at=at, scale=1.0 + 0.1 * index)
+    return world
+
+
+@pytest.mark.parametrize("kind", ["lambert", "phong", "metal", "mirror"])
+def test_specialised_equals_general(device, kind):
+    """A build with only what the scene calls for gives the image of the build with everything."""
+    fields = {**WHITE[kind], "base_color": (0.9, 0.5, 0.2)}
+    scene = scene_of(crowd(device), fields, device=device)
+    spot = {"kind": structs.SPOT, "position": (0, -2, 0), "direction": (0, 0.7, 0.7), "intensity": 4.0}
+    spot.update(inner_angle=0.3, outer_angle=0.6)
+    light = lights(spot, device=device)
+    special = ShadeConfig(
+        trace=TraceConfig((structs.SPHERE,), ()),
+        models=(fields["model"],),
+        lights=(structs.SPOT,),
+        textures=False,
+        room_diffuse="none" if kind in ("metal", "mirror") else "sh",
+        room_specular=kind != "lambert",
+        edge_samples=4,
+    )
+    general = render(scene, EVERYTHING, device, light_array=light, light_room=0.5)
+    image = render(scene, special, device, light_array=light, light_room=0.5)
+    # The compiler may fuse other products in another kernel.
+    np.testing.assert_allclose(image, general, atol=1e-6)
+
+
+def test_only_the_rectangle_is_touched_and_bands_make_the_whole(device):
+    """Zero outside the rectangle, the same inside; bands equal one launch bit for bit."""
+    scene = scene_of(crowd(device), WHITE["lambert"], device=device)
+    whole = render(scene, EVERYTHING, device)
+    np.testing.assert_array_equal(render(scene, EVERYTHING, device, bands=((0, 9), (9, 30), (30, 48))), whole)
+    part = render(scene, EVERYTHING, device, rect=(15, 35, 20, 50))
+    outside = np.ones(SIZE, bool)
+    outside[15:35, 20:50] = False
+    assert (part[outside] == 0).all()
+    np.testing.assert_array_equal(part[16:34, 21:49], whole[16:34, 21:49])
+
+
+def test_edge_samples_must_be_a_square(device):
+    """Anything else names the value and what would be right."""
+    scene = scene_of(ball(device), WHITE["lambert"], device=device)
+    with pytest.raises(ValueError, match="edge_samples is 3; expected a square"):
+        render(scene, dataclasses.replace(EVERYTHING, edge_samples=3), device)
+
+
+# --- Hard cases -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", list(WHITE))
+def test_lights_in_hard_places(device, kind):
+    """On the surface, inside the object, behind everything, at the eye, blinding: finite, and dark where it must be."""
+    scene = scene_of(ball(device), WHITE[kind], device=device)
+    places = [(0, 0, 1.5), (0, 0, 2), (0, 0, 9), (0, 0, 0), (0, 0, 1.4999)]
+    for at in places:
+        for intensity in (0.0, 1e6):
+            light = {"kind": structs.POINT, "position": at, "intensity": intensity}
+            image = render(scene, EVERYTHING, device, light_array=lights(light, device=device), light_room=0.0)
+            assert np.isfinite(image).all()
+            assert (image >= 0).all()
+            if at[2] in (2, 9) or intensity == 0.0:
+                assert (image[..., :3] == 0).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("far", [0.0, 1e3])
+def test_shadows_do_not_depend_on_scale_or_place(device, scale, far):
+    """A lit ball scaled with its light, and moved away from the origin: no speckles of self-shadow."""
+    if far / scale > 1e5:
+        pytest.skip("1 mm seen from 1 km away from the origin: float32 positions are 60 micrometres apart there")
+    eye = np.array([far, -far, far])
+    world = World(device).add("sphere", extent=(0.5,) * 3, at=eye + [0, 0, 2 * scale], scale=scale)
+    scene = scene_of(world, WHITE["lambert"], device=device)
+    light = {"kind": structs.POINT, "position": eye - [0, scale, 0], "intensity": scale**2}
+    config = dataclasses.replace(EVERYTHING, edge_samples=1)
+    image = render(scene, config, device, light_array=lights(light, device=device), light_room=0.0, eye=eye)
+    plain = World(device).add("sphere", extent=(0.5,) * 3, at=(0, 0, 2))
+    light = {"kind": structs.POINT, "position": (0, -1, 0), "intensity": 1.0}
+    expected = render(
+        scene_of(plain, WHITE["lambert"], device=device),
+        config,
+        device,
+        light_array=lights(light, device=device),
+        light_room=0.0,
+    )
+    # Relative to the ball, positions are rounded to 6e-8 * far / scale; the outline moves by as much.
+    same = image[..., 3] == expected[..., 3]
+    assert same.mean() > 0.99
+    np.testing.assert_allclose(image[same], expected[same], atol=1e-5 + 1e-6 * far / scale)
