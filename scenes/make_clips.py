@@ -11,8 +11,8 @@ The virtual things are never in a clip. ``--truth`` reads them from the scene fi
 objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's
 centre.
 
-Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly, and
-wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
+Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly,
+and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
 """
 
 from __future__ import annotations
