@@ -4,8 +4,8 @@
 
 The body, lid and bottom of the teapot are surfaces of revolution in the published data: every ring of control points is
 a quarter circle with the factor 0.56. So a profile of (radius, height), turned by `QUARTER`, holds all of them. The
-handle and the spout are mirror images in y = 0 and are given as one half each. The table below is in Newell's units with
-z up and the bottom at z = 0; the mesh keeps them (the pot is 3.15 high and 6.43 long) and a scene scales it. The lid is
+handle and the spout are mirror images in y = 0 and are given as one half each. The table below is in Newell's units, z
+up and the bottom at z = 0; the mesh keeps them (the pot is 3.15 high and 6.43 long) and a scene scales it. The lid is
 widened until it meets the rim: in the data a gap of 0.1 shows the empty inside.
 
 References:
