@@ -14,9 +14,9 @@ of its neighbours. Each threshold is rounded *up* to float32: a float32 number r
 if it reaches the real one, so the codes are those of real arithmetic for every float32 input, and the largest error
 is half a code (ties go up). CPU and CUDA agree bit for bit.
 
-Counting starts from a table of ``ENCODE_KEYS`` cells over sqrt(x), which holds the number of thresholds that lie
-safely below each cell. For the transfers above no cell holds more than one threshold, so one or two comparisons
-finish the count, without a power function.
+Counting starts from a table of ``ENCODE_KEYS`` cells over sqrt(x): how many thresholds lie safely below the cell, and
+the next one. Almost always that comparison ends it, without a branch or a power function. A cell that holds more than
+one threshold (a plateau of a measured response, an exponent above 3) is marked by a half, and counts on.
 """
 
 from __future__ import annotations
@@ -32,10 +32,12 @@ wp.set_module_options({"enable_backward": False})
 
 ENCODE_KEYS = 1024
 """Cells of the encoder's first look-up; up to an exponent of 3, thresholds fall into cells of their own."""
-ENCODE_LENGTH = ENCODE_KEYS + 256
-"""Entries of an encode table: first counts, then thresholds (the last one infinite)."""
+ENCODE_LENGTH = 2 * ENCODE_KEYS + 256
+"""Entries of an encode table: counts of the cells, their next thresholds, all thresholds (the last one infinite)."""
 
 _KEY_SCALE = wp.constant(wp.float32(ENCODE_KEYS - 1))
+_NEXT = wp.constant(ENCODE_KEYS)
+_THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
 
 @wp.func
@@ -47,12 +49,13 @@ def decode(table: wp.array[wp.vec3], code: wp.vec3ub) -> wp.vec3:
 @wp.func
 def encode_channel(table: wp.array[wp.vec3], value: wp.float32, channel: wp.int32) -> wp.uint8:
     """Nearest code of one linear value; below 0 and NaN give 0, above 1 and infinity give 255."""
-    if not value > 0.0:  # true for NaN as well
-        return wp.uint8(0)
-    key = wp.int32(wp.sqrt(wp.min(value, 1.0)) * _KEY_SCALE)
-    code = wp.int32(table[key][channel])
-    while value >= table[ENCODE_KEYS + code][channel] and code < 255:
-        code += 1
+    x = wp.where(value > 0.0, wp.min(value, 1.0), 0.0)  # NaN is not above 0
+    key = wp.int32(wp.sqrt(x) * _KEY_SCALE)
+    count = table[key][channel]
+    code = wp.int32(count) + wp.where(x >= table[_NEXT + key][channel], 1, 0)
+    if count != wp.floor(count):
+        while x >= table[_THRESHOLDS + code][channel]:
+            code += 1
     return wp.uint8(code)
 
 
@@ -99,12 +102,18 @@ def encode_table(transfer: str | pathlib.Path) -> np.ndarray:
     thresholds = exact.astype(np.float32)
     thresholds = np.where(thresholds < exact, np.nextafter(thresholds, np.float32(np.inf)), thresholds)
     table = np.full((ENCODE_LENGTH, 3), np.inf, np.float32)
-    table[ENCODE_KEYS:-1] = thresholds
-    # A threshold counts for a cell only if it lies a safe step below it: no rounding of a device's sqrt can then
-    # count it too early.
-    keys = np.floor(np.sqrt(thresholds.astype(np.float64) * (1.0 + 1e-6)) * (ENCODE_KEYS - 1))
+    table[2 * ENCODE_KEYS : -1] = thresholds
+    # A threshold within rounding of a cell's edge belongs to both cells, whichever way a device's sqrt goes.
+    low, high = (
+        np.floor(np.sqrt(thresholds.astype(np.float64) * (1.0 + margin)) * (ENCODE_KEYS - 1))
+        for margin in (-1e-6, 1e-6)
+    )
+    cells = np.arange(ENCODE_KEYS)
     for channel in range(3):
-        table[:ENCODE_KEYS, channel] = np.searchsorted(keys[:, channel], np.arange(ENCODE_KEYS), side="left")
+        below = np.searchsorted(high[:, channel], cells, side="left")
+        reached = np.searchsorted(low[:, channel], cells, side="right")
+        table[:ENCODE_KEYS, channel] = below + 0.5 * (reached > below + 1)
+        table[ENCODE_KEYS : 2 * ENCODE_KEYS, channel] = table[2 * ENCODE_KEYS + below, channel]
     return table
 
 

@@ -124,7 +124,6 @@ def unit(*v):
 
 
 # --- closed forms
-# -----------------------------------------------------------------------------------------------------
 
 
 def test_white_desk_has_the_value_of_the_scene_format(device):
@@ -238,7 +237,6 @@ def test_relief_keeps_the_mean(device):
 
 
 # --- twins
-# ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rung", relight.RUNGS)
@@ -285,7 +283,6 @@ def test_irradiance_map_is_the_same_as_harmonics(device):
 
 
 # --- geometry
-# ---------------------------------------------------------------------------------------------------------
 
 
 def test_box_is_lit_on_the_side_that_faces_the_light(device):
@@ -357,8 +354,15 @@ def test_hard_lights_stay_finite(device, rung, light, content):
             assert (got == 0.0).all()
 
 
+@pytest.mark.parametrize("irradiance", [np.nan, np.inf, -np.inf, -1.0, 0.0, 1e-30])
+def test_reflectance_is_within_bounds_for_any_room(device, irradiance):
+    room = np.full((8, 16, 3), irradiance, np.float32)
+    got = run("reflectance", [point((0, 0, 0.3))], irradiance_map=room)
+    white = run("flat", [point((0, 0, 0.3))]) / 0.5
+    assert ((got >= 0.0) & (got <= white * (1.0 + FLOAT_ERROR))).all()
+
+
 # --- culling
-# ----------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_is_left_outside_the_rectangle(device):
@@ -384,7 +388,6 @@ def test_same_input_gives_the_same_output(device):
 
 
 # --- the truth
-# --------------------------------------------------------------------------------------------------------
 
 
 def test_nearer_to_the_truth_rung_by_rung(device, shared):
