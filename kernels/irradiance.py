@@ -43,13 +43,13 @@ lobes are a fifth as deep, and where the truth is not negative a clamp never err
 Clusters. The sum over all texels costs texels times directions. Irradiance is smooth, so nearby texels may share a
 direction: a block of texels becomes one distant light with their summed flux and their mean direction m, weighted by
 brightness. As n.w is linear in w, a block that is wholly above the horizon is exact, whatever is in it. On the horizon
-max(n.w, 0) is averaged over the block's spread: |m|^2 = 1 - v with v its variance over two axes, and a box of that
-variance has the half width h = sqrt(3 v / 2), so
+max(n.w, 0) is averaged over the block's spread: with C the covariance of its directions, n.w has the variance n'C n,
+and a box of that variance the half width h = sqrt(3 n'C n), so
 
     mean of max(x, 0) over [c - h, c + h] = (c + h)^2 / (4 h) for |c| < h,  c = n.m.
 
 Never negative, keeps the energy, does not jump as a lamp moves. With one texel to a block this is the reference: the
-texel's own extent is in v, so that a furnace stays white at any size.
+texel's own extent is in C, so that a furnace stays white at any size.
 
 References:
     [RH01] Ramamoorthi, Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.
@@ -333,6 +333,16 @@ def evaluate_sh4_kernel(
     irradiance_map_out[i, j] = wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
 
+@wp.struct
+class Cluster:
+    """A block of texels as one distant light."""
+
+    flux: wp.vec3  # irradiance on a surface that faces it, were it a point
+    direction: wp.vec3  # mean direction, weighted by brightness; shorter than 1
+    variance: wp.vec3  # covariance of its directions: xx, yy, zz
+    covariance: wp.vec3  # yz, xz, xy
+
+
 @wp.kernel(enable_backward=False)
 def gather_clusters_kernel(
     row_start: wp.int32,
@@ -341,8 +351,7 @@ def gather_clusters_kernel(
     blocks_high: wp.int32,
     blocks_wide: wp.int32,
     # Out:
-    flux_out: wp.array[wp.vec3],
-    cluster_out: wp.array[wp.vec4],
+    clusters_out: wp.array[Cluster],
 ):
     """One block of texels as one distant light."""
     bi, bj = wp.tid()
@@ -351,30 +360,72 @@ def gather_clusters_kernel(
     width = environment.shape[1]
     flux = wp.vec3()
     moment = wp.vec3()
+    squares = wp.vec3()
+    products = wp.vec3()
     weight = wp.float32(0.0)
     half_step = 0.5 * PI / wp.float32(height)
     half_column = PI / wp.float32(width)
+    sin_half = wp.sin(half_step)
+    cos_half = wp.cos(half_step)
+    # 2 half_step - sin(2 half_step), as a series where the difference would cancel.
+    step = 2.0 * half_step
+    arc_excess = step - wp.sin(step)
+    if step < 0.5:
+        arc_excess = step * step * step / 6.0 * (1.0 - step * step / 20.0 * (1.0 - step * step / 42.0))
+    # Means of cos phi and cos 2 phi over a column, relative to their centre's.
+    single = wp.sin(half_column) / half_column
+    double = wp.sin(2.0 * half_column) / (2.0 * half_column)
     for i in range(bi * height / blocks_high, (bi + 1) * height / blocks_high):
-        sin_theta = wp.sin((2.0 * wp.float32(i) + 1.0) * half_step)
-        solid_angle = 4.0 * sin_theta * wp.sin(half_step) * half_column
-        # A texel spreads over its own height and width: variance (2 half)^2 / 12 each, which shortens its mean
-        # direction by half of it.
-        spread = (half_step * half_step + sin_theta * sin_theta * half_column * half_column) / 3.0
+        theta = (2.0 * wp.float32(i) + 1.0) * half_step
+        sin_theta = wp.sin(theta)
+        cos_theta = wp.cos(theta)
+        solid_angle = 4.0 * sin_theta * sin_half * half_column
+        # Exact moments of z and of r = sqrt(x^2 + y^2) over the row, from its edges' sines and cosines.
+        s0 = sin_theta * cos_half - cos_theta * sin_half
+        s1 = sin_theta * cos_half + cos_theta * sin_half
+        c0 = cos_theta * cos_half + sin_theta * sin_half
+        c1 = cos_theta * cos_half - sin_theta * sin_half
+        mean_z = cos_theta * cos_half
+        mean_r = sin_theta * cos_half + arc_excess / (4.0 * sin_theta * sin_half)
+        mean_zz = (c0 * c0 + c0 * c1 + c1 * c1) / 3.0
+        mean_rz = cos_theta / sin_theta * (s0 * s0 + s0 * s1 + s1 * s1) / 3.0
+        mean_rr = 0.5 * (1.0 - mean_zz)
         for j in range(bj * width / blocks_wide, (bj + 1) * width / blocks_wide):
+            phi = (2.0 * wp.float32(j) + 1.0) * half_column - PI
+            cos_phi = wp.cos(phi)
+            sin_phi = wp.sin(phi)
+            x = single * cos_phi
+            y = single * sin_phi
+            cos_two = double * (cos_phi * cos_phi - sin_phi * sin_phi)
+            sin_two = double * 2.0 * cos_phi * sin_phi
             radiance = safe_radiance(environment[i, j]) * solid_angle
             brightness = radiance[0] + radiance[1] + radiance[2]
             flux += radiance
-            moment += texel_direction(i, j, height, width) * (brightness * (1.0 - 0.5 * spread))
             weight += brightness
-    at = bi * blocks_wide + bj
-    flux_out[at] = flux
-    mean = moment / wp.max(weight, 1.0e-30)
-    cluster_out[at] = wp.vec4(mean[0], mean[1], mean[2], wp.sqrt(1.5 * wp.max(1.0 - wp.dot(mean, mean), 1.0e-8)))
+            moment += wp.vec3(mean_r * x, mean_r * y, mean_z) * brightness
+            squares += wp.vec3(mean_rr * (1.0 + cos_two), mean_rr * (1.0 - cos_two), mean_zz) * brightness
+            products += wp.vec3(mean_rz * y, mean_rz * x, mean_rr * sin_two) * brightness
+    inverse = 1.0 / wp.max(weight, 1.0e-30)
+    mean = moment * inverse
+    cluster = Cluster()
+    cluster.flux = flux
+    cluster.direction = mean
+    cluster.variance = squares * inverse - wp.cw_mul(mean, mean)
+    cluster.covariance = products * inverse - wp.vec3(mean[1] * mean[2], mean[0] * mean[2], mean[0] * mean[1])
+    clusters_out[bi * blocks_wide + bj] = cluster
 
 
 @wp.func
-def spread_cosine(cosine: wp.float32, half_width: wp.float32) -> wp.float32:
-    """Mean of max(x, 0) over x from ``cosine`` - ``half_width`` to ``cosine`` + ``half_width``."""
+def cluster_cosine(cluster: Cluster, normal: wp.vec3) -> wp.float32:
+    """Mean of max(n.w, 0) over a cluster: exact above the horizon, a box of the same variance on it."""
+    cosine = wp.dot(cluster.direction, normal)
+    total = wp.max(cluster.variance[0] + cluster.variance[1] + cluster.variance[2], 1.0e-8)
+    if cosine * cosine >= 3.0 * total:
+        return wp.max(cosine, 0.0)
+    squares = wp.cw_mul(normal, normal)
+    products = wp.vec3(normal[1] * normal[2], normal[0] * normal[2], normal[0] * normal[1])
+    variance = wp.dot(cluster.variance, squares) + 2.0 * wp.dot(cluster.covariance, products)
+    half_width = wp.sqrt(3.0 * wp.max(variance, 1.0e-10))
     if cosine >= half_width:
         return cosine
     reach = wp.max(cosine + half_width, 0.0)
@@ -385,8 +436,7 @@ def spread_cosine(cosine: wp.float32, half_width: wp.float32) -> wp.float32:
 def sum_clusters_kernel(
     row_start: wp.int32,
     # In:
-    flux: wp.array[wp.vec3],
-    cluster: wp.array[wp.vec4],
+    clusters: wp.array[Cluster],
     # Out:
     irradiance_map_out: wp.array2d[wp.vec3],
 ):
@@ -398,10 +448,8 @@ def sum_clusters_kernel(
     # Sums of sums: float32 stays within 1e-5 over 100,000 terms.
     part = wp.vec3()
     count = wp.int32(0)
-    for k in range(lane, flux.shape[0], wp.block_dim()):
-        light = cluster[k]
-        cosine = light[0] * normal[0] + light[1] * normal[1] + light[2] * normal[2]
-        part += flux[k] * spread_cosine(cosine, light[3])
+    for k in range(lane, clusters.shape[0], wp.block_dim()):
+        part += clusters[k].flux * cluster_cosine(clusters[k], normal)
         count += 1
         if count == 256:
             total += part
@@ -472,8 +520,7 @@ def evaluate_sh4(
 def gather_clusters(
     environment: wp.array2d[wp.vec3],
     blocks: tuple[int, int],
-    flux_out: wp.array[wp.vec3],
-    cluster_out: wp.array[wp.vec4],
+    clusters_out: wp.array[Cluster],
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -482,17 +529,15 @@ def gather_clusters(
     Args:
         environment: (H, W) radiance.
         blocks: Blocks along rows and columns, at most (H, W).
-        flux_out: (blocks[0] blocks[1],) irradiance of each on a surface that faces it.
-        cluster_out: (blocks[0] blocks[1],) mean direction of the flux, half width of its cosines' spread.
+        clusters_out: (blocks[0] blocks[1],).
         rows: Band of block rows; None means all.
     """
     inputs = [environment, *blocks]
-    launch_rows(gather_clusters_kernel, blocks, inputs, [flux_out, cluster_out], rows=rows, device=environment.device)
+    launch_rows(gather_clusters_kernel, blocks, inputs, [clusters_out], rows=rows, device=environment.device)
 
 
 def sum_clusters(
-    flux: wp.array[wp.vec3],
-    cluster: wp.array[wp.vec4],
+    clusters: wp.array[Cluster],
     irradiance_map_out: wp.array2d[wp.vec3],
     *,
     rows: Rows | None = None,
@@ -500,8 +545,7 @@ def sum_clusters(
     """Map of irradiance from distant lights.
 
     Args:
-        flux: (N,) as ``gather_clusters`` writes.
-        cluster: (N,) likewise.
+        clusters: (N,) as ``gather_clusters`` writes.
         irradiance_map_out: (h, w).
         rows: Band of the map's rows; None means all.
     """
@@ -510,8 +554,8 @@ def sum_clusters(
         wp.launch_tiled(
             sum_clusters_kernel,
             dim=(stop - start, irradiance_map_out.shape[1]),
-            inputs=[start, flux, cluster],
+            inputs=[start, clusters],
             outputs=[irradiance_map_out],
             block_dim=BLOCK,
-            device=flux.device,
+            device=clusters.device,
         )

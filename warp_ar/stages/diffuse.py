@@ -15,7 +15,7 @@ from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage
 
 TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
-CLUSTERS = (8, 16)
+CLUSTERS = (10, 20)
 
 
 def diffuse_output(quality: Quality) -> str:
@@ -58,8 +58,7 @@ class Diffuse(Stage):
         count = math.prod(self._blocks())
         return {
             "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
-            "diffuse_flux": ArraySpec((count,), wp.vec3),
-            "diffuse_clusters": ArraySpec((count,), wp.vec4),
+            "diffuse_clusters": ArraySpec((count,), irradiance.Cluster, irradiance.Cluster()),
         }
 
     def _blocks(self) -> tuple[int, int]:
@@ -90,10 +89,8 @@ class Diffuse(Stage):
                 Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
             ]
         blocks = self._blocks()
-        flux, clusters, target = arrays["diffuse_flux"], arrays["diffuse_clusters"], arrays["irradiance_map"]
+        clusters, target = arrays["diffuse_clusters"], arrays["irradiance_map"]
         return [
-            Pass(
-                lambda rows: irradiance.gather_clusters(environment, blocks, flux, clusters, rows=rows), rows=blocks[0]
-            ),
-            Pass(lambda rows: irradiance.sum_clusters(flux, clusters, target, rows=rows), rows=MAP_SIZE[0]),
+            Pass(lambda rows: irradiance.gather_clusters(environment, blocks, clusters, rows=rows), rows=blocks[0]),
+            Pass(lambda rows: irradiance.sum_clusters(clusters, target, rows=rows), rows=MAP_SIZE[0]),
         ]

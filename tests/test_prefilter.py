@@ -1,0 +1,403 @@
+import math
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import latlong
+from tests.reference import prefilter as reference
+from tests.reference import pyramid as reference_pyramid
+from warp_ar.kernels import prefilter, pyramid
+from warp_ar.kernels.latlong import direction_from_latlong
+from warp_ar.quality import PRESETS
+from warp_ar.scene import loads_scene
+from warp_ar.stages.base import Arrays, LeftOut, Request
+from warp_ar.stages.specular import Specular, scene_lobe
+
+# The best public prefilter keeps a white furnace within this.
+FURNACE = 5e-4
+# Float32 sums over a map, relative.
+ROUNDING = 2e-5
+# Energy per level against the environment's. Scaled rungs: rounding. Box mips: bilinear magnification near the poles, worst for a lamp there.
+SCALED_ENERGY = 1e-5
+# The reference sums a lobe at texel centres: measured 0.7 % for a room with a sun in it, at the widest level.
+REFERENCE_ENERGY = 0.02
+# Relative RMS over all levels on real rooms of 32 rows: three quarters above what was measured.
+ERRORS = {"box_mip": 2.0, "energy_mip": 0.6, "fis8": 0.6, "fis32": 0.35, "fis128": 0.2}
+# Split-sum table: 1024 Hammersley directions against quadrature.
+DFG = 4e-3
+
+RUNGS = Specular.rungs
+LOBES = ("ggx", "phong")
+MATERIALS = {
+    "ggx": 'model = "metallic_roughness"\nbase_color = [1.0, 0.8, 0.3]\nmetallic = 1.0\nroughness = 0.4',
+    "phong": 'model = "phong"\nspecular = [0.5, 0.5, 0.5]\nshininess = 30.0',
+    "mirror": 'model = "mirror"',
+    "lambert": 'model = "lambert"',
+}
+
+SCENE = """
+schema = 1
+name = "test"
+[camera]
+width = 64
+height = 48
+fx = 60.0
+fy = 60.0
+cx = 31.5
+cy = 23.5
+[marker]
+size = 0.1
+[probe]
+center = [0.1, 0.0, 0.03]
+radius = 0.03
+"""
+
+
+def scene(*materials):
+    return loads_scene(
+        SCENE
+        + "".join(
+            f'[[object]]\nshape = "sphere"\nradius = 0.05\n[object.material]\n{MATERIALS[m]}\n' for m in materials
+        )
+    )
+
+
+@wp.kernel(enable_backward=False)
+def sample_kernel(
+    levels: wp.array[wp.vec3], level: wp.float32, height: wp.int32, at: wp.array[wp.vec2], out: wp.array[wp.vec3]
+):
+    i = wp.tid()
+    d = direction_from_latlong(at[i][0], at[i][1], height, 2 * height)
+    out[i] = prefilter.sample_levels(levels, d * 3.0, level, height)
+
+
+@wp.kernel(enable_backward=False)
+def level_kernel(values: wp.array[wp.float32], height: wp.int32, out: wp.array2d[wp.float32]):
+    i = wp.tid()
+    out[0, i] = prefilter.level_from_roughness(values[i], height)
+    out[1, i] = prefilter.level_from_shininess(values[i], height)
+
+
+@wp.kernel(enable_backward=False)
+def dfg_kernel(
+    table: wp.array2d[wp.vec2], at: wp.array[wp.vec2], out: wp.array[wp.vec2], factor_out: wp.array[wp.vec3]
+):
+    i = wp.tid()
+    out[i] = prefilter.sample_dfg(table, at[i][0], at[i][1])
+    factor_out[i] = prefilter.energy_compensation(out[i], wp.vec3(1.0, 0.5, 0.0))
+
+
+def run(radiance, rung, lobe="ggx", bands=1):
+    """Packed levels as the stage makes them."""
+    environment = wp.array(np.ascontiguousarray(radiance, np.float32), dtype=wp.vec3)
+    quality = PRESETS["medium"].with_rungs(specular=rung)
+    quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
+    request = Request(scene(lobe), quality, (64, 48))
+    assert scene_lobe(request.scene) == ("ggx" if lobe == "mirror" else lobe)
+    stage = Specular(request, Specular.wire(request))
+    arrays = Arrays()
+    arrays.add("environment", environment)
+    for name, spec in stage.arrays().items():
+        arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
+    for step in stage.build(arrays, environment.device):
+        if bands == 1 or step.rows is None:
+            step.launch(None)
+        else:
+            for band in range(bands):
+                step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
+    return arrays["specular_levels"]
+
+
+def unpack(levels, height):
+    texels = levels.numpy().astype(np.float64)
+    result = []
+    for level in range(prefilter.lobe_count(height)):
+        size, start = prefilter.lobe_size(height, level), prefilter.lobe_offset(height, level)
+        result.append(texels[start : start + size[0] * size[1]].reshape(*size, 3))
+    return result
+
+
+def sample(levels, height, at, level):
+    out = wp.zeros(len(at), dtype=wp.vec3)
+    wp.launch(
+        sample_kernel, len(at), [levels, level, height, wp.array(np.asarray(at, np.float32), dtype=wp.vec2)], [out]
+    )
+    return out.numpy()
+
+
+def sun(height, row, sky=1e-4, value=1e6):
+    radiance = np.full((height, 2 * height, 3), sky)
+    radiance[row, height // 3] = value
+    return radiance
+
+
+# --- Where levels lie -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("height", [1, 2, 3, 4, 5, 7, 8, 16, 33, 64, 100, 128, 256])
+def test_levels_and_widths_fit_the_map(device, height):
+    count = prefilter.lobe_count(height)
+    assert prefilter.lobe_alpha(height, count - 1) == 1.0
+    assert prefilter.lobe_texels(height) == sum(math.prod(prefilter.lobe_size(height, level)) for level in range(count))
+    for level in range(1, count):
+        rows, alpha = prefilter.lobe_size(height, level)[0], prefilter.lobe_alpha(height, level)
+        assert rows >= 1
+        assert rows >= min(height, 8 / alpha - 1)  # eight texels per unit of alpha, or all that there are
+        # The kernels find the same level.
+        out = wp.zeros((2, 1), dtype=wp.float32)
+        wp.launch(level_kernel, 1, [wp.array([math.sqrt(alpha)], dtype=wp.float32), height], [out])
+        assert out.numpy()[0, 0] == pytest.approx(level, abs=1e-5)
+        wp.launch(level_kernel, 1, [wp.array([1 / alpha**2], dtype=wp.float32), height], [out])
+        assert out.numpy()[1, 0] == pytest.approx(level, abs=1e-5)
+
+
+@pytest.mark.parametrize("height", [4, 64, 256])
+def test_levels_grow_with_roughness_and_fall_with_shininess(device, height):
+    # Atlas row 8: all roughnesses, exponents 0 to 1e5.
+    roughness = np.concatenate([np.linspace(0, 1, 200), [1.0]])
+    shininess = np.concatenate([[0.0, 0.5], np.logspace(0, 5, 199)])
+    for row, values, sign in ((0, roughness, 1), (1, shininess, -1)):
+        out = wp.zeros((2, 201), dtype=wp.float32)
+        wp.launch(level_kernel, 201, [wp.array(values, dtype=wp.float32), height], [out])
+        level = out.numpy()[row]
+        assert np.isfinite(level).all()
+        assert (np.diff(level) * sign >= -1e-6).all()
+        assert np.abs(np.diff(level)).max() < 0.5  # no jump where the narrowest lobe meets the mirror
+        assert level.min() >= 0
+        assert level.max() == prefilter.lobe_count(height) - 1
+
+
+# --- Closed forms -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("height", [1, 3, 4, 7, 16, 25])
+def test_a_white_furnace_stays_white(device, rung, lobe, height):
+    for level in unpack(run(np.full((height, 2 * height, 3), (0.2, 1.0, 30.0)), rung, lobe), height):
+        np.testing.assert_allclose(level, np.broadcast_to((0.2, 1.0, 30.0), level.shape), rtol=FURNACE)
+
+
+@pytest.mark.parametrize("rung", [*RUNGS, "mirror"])
+def test_level_0_is_the_mirror(device, rung):
+    radiance = np.random.default_rng(1).random((16, 32, 3)).astype(np.float32)
+    levels = run(radiance, "box_mip", "mirror") if rung == "mirror" else run(radiance, rung)
+    np.testing.assert_array_equal(unpack(levels, 16)[0], radiance)
+
+
+def test_the_widest_lobe_is_irradiance(device):
+    # Order-1 light: the cosine lobe keeps two thirds of it.
+    directions = latlong.directions(32, 64)
+    for axis in range(3):
+        radiance = 1.0 + directions[..., axis : axis + 1].repeat(3, 2)
+        for lobe in LOBES:
+            widest = unpack(run(radiance, "brute_force", lobe), 32)[-1]
+            expected = 1.0 + 2 / 3 * latlong.directions(*widest.shape[:2])[..., axis]
+            np.testing.assert_allclose(widest[..., 0], expected, atol=2e-3)  # 1.5 texels of 5.6 degrees, squared / 12
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_no_light_is_zero(device, rung):
+    assert (run(np.zeros((16, 32, 3)), rung).numpy() == 0).all()
+
+
+# --- Twins ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+@pytest.mark.parametrize("height", [16, 9])
+def test_the_reference_is_the_twin_s(device, lobe, height):
+    radiance = np.random.default_rng(2).random((height, 2 * height, 3)) ** 8
+    for index, level in enumerate(unpack(run(radiance, "brute_force", lobe), height)[1:], 1):
+        directions = latlong.directions(*level.shape[:2]).reshape(-1, 3)
+        twin = reference.integrate_lobe(radiance, directions, prefilter.lobe_alpha(height, index), lobe)
+        np.testing.assert_allclose(level.reshape(-1, 3), twin, rtol=1e-4, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+def test_the_reference_agrees_with_monte_carlo(device, lobe):
+    height, count = 32, 200_000
+    radiance = np.random.default_rng(3).random((height, 2 * height, 3)) ** 4
+    level = prefilter.lobe_count(height) - 2  # alpha 1/2
+    alpha = prefilter.lobe_alpha(height, level)
+    ours = unpack(run(radiance, "brute_force", lobe), height)[level]
+    rng = np.random.default_rng(4)
+    samples = rng.standard_normal((count, 3))
+    samples /= np.linalg.norm(samples, axis=1, keepdims=True)
+    row, column = latlong.coordinates(samples, height, 2 * height)
+    seen = radiance[np.minimum(row.astype(int), height - 1), column.astype(int) % (2 * height)]
+    directions = latlong.directions(*ours.shape[:2])
+    for at in ((0, 0), (3, 7), (ours.shape[0] - 1, 5)):
+        weight = reference.lobe(samples @ directions[at], alpha, lobe)[:, None]
+        estimate = (weight * seen).sum(0) / weight.sum()
+        error = np.sqrt((weight**2 * (seen - estimate) ** 2).sum(0)) / weight.sum()
+        assert (np.abs(estimate - ours[at]) < 5 * error + 1e-3).all()
+
+
+def test_mip_weights_are_a_blend_and_match_a_gaussian(device):
+    for lobe in LOBES:
+        weights = prefilter.mip_weights(64, lobe)
+        assert (weights >= 0).all()
+        np.testing.assert_allclose(weights.sum(1), 1, atol=1e-9)
+    # A narrow Phong lobe is a Gaussian of variance alpha^2 per axis: so is the blend (T^2 / 3 for a mip, T^2 / 12 less).
+    weights = prefilter.mip_weights(256, "phong")
+    texel = np.pi / 256 * 2.0 ** np.arange(weights.shape[1])
+    variance = (texel**2 - texel[0] ** 2) / 12 + texel**2 / 4
+    variance[0] = 0
+    for level in range(2, 6):
+        assert (weights[level] * variance).sum() == pytest.approx(prefilter.lobe_alpha(256, level) ** 2, rel=0.2)
+
+
+def test_samples_of_a_lobe_have_its_mean_cosine(device):
+    for lobe in LOBES:
+        samples = prefilter.make_lobe_samples(64, lobe, 4096, device)
+        cosine = (samples.directions.numpy()[..., 2] * samples.weights.numpy()).sum(1)
+        np.testing.assert_allclose(samples.weights.numpy().sum(1), 1, atol=1e-5)
+        theta = np.linspace(0, np.pi / 2, 20_001)
+        for level in range(1, prefilter.lobe_count(64)):
+            weight = reference.lobe(np.cos(theta), prefilter.lobe_alpha(64, level), lobe) * np.sin(theta)
+            assert cosine[level] == pytest.approx((weight * np.cos(theta)).sum() / weight.sum(), abs=1e-3)
+
+
+# --- Energy, seam, poles, hard cases ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lobe", LOBES)
+@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("row", [2, 7, 12])
+def test_every_level_keeps_the_energy_of_a_lamp(device, rung, lobe, row):
+    # Atlas rows 6 and 18: one texel of 1e6 over 1e-4.
+    height = 32
+    radiance = sun(height, 2 * row)
+    whole = reference_pyramid.energy(radiance)
+    for level in unpack(run(radiance, rung, lobe), height):
+        assert np.isfinite(level).all()
+        assert (level >= 0).all()
+        energy = reference_pyramid.energy(level) / whole
+        # Rungs that scale are exact; the reference and the paper's are as good as their sampling of one texel.
+        np.testing.assert_allclose(energy, 1, rtol={"box_mip": 0.5, "brute_force": 0.03}.get(rung, SCALED_ENERGY))
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_seam_and_poles_are_continuous(device, rung):
+    height = 16
+    levels = run(np.random.default_rng(5).random((height, 2 * height, 3)), rung)
+    step = 1e-3
+    for level in (0.0, 0.4, 1.0, 1.7, 3.0):
+        beside = [[r, c] for r in (0.3, 4.2, 8.0, 15.9) for c in (step, 2 * height - step)]
+        values = sample(levels, height, beside, level).reshape(-1, 2, 3)
+        np.testing.assert_allclose(values[:, 0], values[:, 1], atol=5 * step)
+        across = [[step, c + half] for c in (1.0, 7.3, 15.5) for half in (0, height)]
+        values = sample(levels, height, across, level).reshape(-1, 2, 3)
+        np.testing.assert_allclose(values[:, 0], values[:, 1], atol=5 * step)
+    assert np.isfinite(sample(levels, height, [[0, 0], [height, 0], [height, 2 * height]], 99.0)).all()
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_a_ramp_is_not_shifted_or_turned(device, rung):
+    # Any lobe, being round, keeps the direction of order-1 light: a half-texel shift does not.
+    height = 32
+    directions = latlong.directions(height, 2 * height)
+    for axis in range(3):
+        radiance = 2.0 + directions[..., axis : axis + 1].repeat(3, 2)
+        for level in unpack(run(radiance, rung), height):
+            d, areas = latlong.directions(*level.shape[:2]), latlong.solid_angles(*level.shape[:2])
+            dipole = np.einsum("hw,hw,hwk->k", areas, level[..., 0], d)
+            dipole /= np.linalg.norm(dipole)
+            assert np.degrees(np.arccos(np.clip(dipole[axis], -1, 1))) < 0.5
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_turning_the_room_turns_the_reflection(device, rung):
+    radiance = np.random.default_rng(6).random((16, 32, 3)) ** 4
+    for a, b in zip(unpack(run(radiance, rung), 16), unpack(run(np.roll(radiance, 8, 1), rung), 16), strict=True):
+        np.testing.assert_allclose(np.roll(a, a.shape[1] // 4, 1), b, atol=1e-4)
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_bad_texels_are_contained(device, rung):
+    radiance = np.ones((16, 32, 3))
+    radiance[2, 3], radiance[4, 5], radiance[9, 9] = np.nan, -3281.0, np.inf
+    values = run(radiance, rung).numpy()
+    assert np.isfinite(values).all()
+    assert (values >= 0).all()
+    assert values.max() <= float(pyramid.MAX_RADIANCE) * 4
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_the_same_input_gives_the_same_bits_in_bands_or_not(device, rung):
+    radiance = np.random.default_rng(7).random((16, 32, 3))
+    first = run(radiance, rung).numpy()
+    np.testing.assert_array_equal(run(radiance, rung).numpy(), first)
+    np.testing.assert_array_equal(run(radiance, rung, bands=3).numpy(), first)
+
+
+@pytest.mark.parametrize("name", ["forest", "night", "studio"])
+@pytest.mark.parametrize("lobe", LOBES)
+def test_errors_on_real_rooms(device, shared, lobe, name):
+    image = pytest.importorskip("OpenEXR").File(str(shared / "hdri" / f"{name}.exr")).channels()["RGB"].pixels
+    small = wp.zeros((32, 64), dtype=wp.vec3)
+    pyramid.reduce_latlong(wp.array(np.ascontiguousarray(image, np.float32), dtype=wp.vec3), small)
+    exact = unpack(run(small.numpy(), "brute_force", lobe), 32)[1:]
+    whole = reference_pyramid.energy(small.numpy().astype(np.float64))
+    for level in exact:
+        np.testing.assert_allclose(reference_pyramid.energy(level), whole, rtol=REFERENCE_ENERGY)
+    for rung, limit in ERRORS.items():
+        for ours, truth in zip(unpack(run(small.numpy(), rung, lobe), 32)[1:], exact, strict=True):
+            weight = latlong.solid_angles(*ours.shape[:2])[..., None]
+            error = math.sqrt((weight * (ours - truth) ** 2).sum() / (weight * truth**2).sum())
+            assert error < limit, rung
+
+
+# --- Split sum --------------------------------------------------------------------------------------------------------
+
+
+def test_the_split_sum_is_the_quadrature_s(device):
+    table = wp.zeros((17, 17), dtype=wp.vec2)
+    prefilter.integrate_dfg(table)
+    values = table.numpy()
+    assert np.isfinite(values).all()
+    for i in (6, 8, 12, 16):
+        for j in (2, 5, 9, 16):
+            np.testing.assert_allclose(values[i, j], reference.dfg(j / 16, i / 16), atol=DFG)
+
+
+def test_the_split_sum_of_a_mirror_is_fresnel(device):
+    table = wp.zeros((5, 9), dtype=wp.vec2)
+    prefilter.integrate_dfg(table)
+    cosine = np.arange(1, 9) / 8
+    np.testing.assert_allclose(table.numpy()[0, 1:, 1], (1 - cosine) ** 5, atol=1e-4)
+    np.testing.assert_allclose(table.numpy()[0, 1:].sum(1), 1, atol=1e-4)
+
+
+def test_a_white_metal_keeps_a_white_furnace_white(device):
+    table = wp.zeros((32, 32), dtype=wp.vec2)
+    prefilter.integrate_dfg(table)
+    at = np.array([[a, b] for a in (-0.1, 0.0, 0.3, 1.0, 1.1) for b in (-1.0, 0.0, 0.37, 1.0, 2.0)], np.float32)
+    out, factor = wp.zeros(25, dtype=wp.vec2), wp.zeros(25, dtype=wp.vec3)
+    wp.launch(dfg_kernel, 25, [table, wp.array(at, dtype=wp.vec2)], [out, factor])
+    once = out.numpy().sum(1)
+    assert ((once > 0.3) & (once < 1.0001)).all()
+    np.testing.assert_allclose(once * factor.numpy()[:, 0], 1, atol=FURNACE)
+    assert (factor.numpy()[:, 1] <= factor.numpy()[:, 0] + 1e-6).all()
+    np.testing.assert_array_equal(factor.numpy()[:, 2], 1)
+
+
+# --- Wiring -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_without_gloss_leaves_the_stage_out():
+    left_out = Specular.wire(Request(scene("lambert"), PRESETS["medium"], (64, 48)))
+    assert left_out == LeftOut("no virtual object has a glossy material")
+    assert isinstance(Specular.wire(Request(scene(), PRESETS["medium"], (64, 48))), LeftOut)
+
+
+def test_the_lobe_is_that_of_the_scene():
+    assert scene_lobe(scene("phong", "mirror", "lambert")) == "phong"
+    assert scene_lobe(scene("phong", "ggx")) == "ggx"
+
+
+def test_a_scene_of_mirrors_filters_nothing():
+    request = Request(scene("mirror"), PRESETS["medium"], (64, 48))
+    assert set(Specular(request, Specular.wire(request)).arrays()) == {"specular_levels"}
