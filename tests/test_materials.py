@@ -18,7 +18,8 @@ MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
 # Unit vectors are rounded to 6e-8. At exponent n the lobe falls by n sin(theta) per radian, so its relative error grows
 # as that; at 1e5 and the angles where the lobe is not yet nothing (0.02) it reaches 1e5 * 0.02 * 1e-7.
 LOBE_TOLERANCE = 5e-4
-# The half vector is rounded to 1e-7, and near mirror roughness (alpha 1e-3) that is a ten-thousandth of the peak's width.
+# The half vector is rounded to 1e-7, and near mirror roughness (alpha 1e-3) that is
+# a ten-thousandth of the peak's width.
 GGX_TOLERANCE = 2e-3
 # Quadrature of the hemisphere against the table of directional albedos: the table's own bilinear error is about 1e-3.
 ALBEDO_TOLERANCE = 4e-3
@@ -179,7 +180,7 @@ def test_white_furnace(device, model, roughness, metallic):
 
 
 def test_lambert_facing_light(device):
-    """A surface that faces a light of unit irradiance has radiance base / pi, at 60 degrees half of it, behind nothing."""
+    """A surface that faces a light of unit irradiance has radiance base / pi, at 60 degrees half, behind it nothing."""
     record = material(model=LAMBERT, base_color=(0.2, 0.4, 0.8))
     wi = np.array([[0, 0, 1], [np.sqrt(0.75), 0, 0.5], [0, 0, -1], [0.6, 0, -0.8], [1, 0, 0]])
     direct, _, _, special = reflected(record, wi, [(0, 0, 1)], device)
@@ -236,7 +237,7 @@ def test_virtual_lights_from_everywhere_are_a_white_room(device, metallic, rough
 
 
 def test_phong_virtual_lights_keep_energy(device):
-    """Lights from everywhere never give more than the reflectance, and all of it where the lobe is above the horizon."""
+    """Lights from everywhere never give more than the reflectance, and all of it with the lobe above the horizon."""
     for shininess in (0.0, 5.0, 500.0):
         record = material(model=PHONG, base_color=0.0, specular=0.7, shininess=shininess)
         for cos_o in (1.0, 0.5, 0.05):

@@ -319,6 +319,6 @@ def test_screen_rect_of_a_known_square():
     square = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]])
     # Columns 30.5 -+ 6: centres 25 to 36. Rows 24 -+ 6.2: centres 18 to 30.
     assert screen_rect([square], pose, CAMERA) == (17, 32, 24, 38)
-    assert screen_rect([square + [0, 0, -2]], pose, CAMERA) == EMPTY
-    assert screen_rect([square + [5, 0, 0]], pose, CAMERA) == EMPTY
+    assert screen_rect([square - np.array([0, 0, 2])], pose, CAMERA) == EMPTY
+    assert screen_rect([square + np.array([5, 0, 0])], pose, CAMERA) == EMPTY
     assert screen_rect([], pose, CAMERA) == EMPTY

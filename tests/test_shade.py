@@ -1,4 +1,4 @@
-"""Shading: white furnace, closed forms, the float64 twin, edges, and that nothing is compiled in that changes the rest."""
+"""Shading: white furnace, closed forms, the float64 twin, edges, and builds with less than everything."""
 
 from __future__ import annotations
 
@@ -285,9 +285,9 @@ def test_shadows_do_not_depend_on_scale_or_place(device, scale, far):
     if far / scale > 1e5:
         pytest.skip("1 mm seen from 1 km away from the origin: float32 positions are 60 micrometres apart there")
     eye = np.array([far, -far, far])
-    world = World(device).add("sphere", extent=(0.5,) * 3, at=eye + [0, 0, 2 * scale], scale=scale)
+    world = World(device).add("sphere", extent=(0.5,) * 3, at=eye + np.array([0, 0, 2 * scale]), scale=scale)
     scene = scene_of(world, WHITE["lambert"], device=device)
-    light = {"kind": structs.POINT, "position": eye - [0, scale, 0], "intensity": scale**2}
+    light = {"kind": structs.POINT, "position": eye - np.array([0, scale, 0]), "intensity": scale**2}
     config = dataclasses.replace(EVERYTHING, edge_samples=1)
     image = render(scene, config, device, light_array=lights(light, device=device), light_room=0.0, eye=eye)
     plain = World(device).add("sphere", extent=(0.5,) * 3, at=(0, 0, 2))
