@@ -89,13 +89,14 @@ KEY_LIGHT_COUNT = 4
 CELL_ROWS = wp.constant(8)
 CELL_COLUMNS = wp.constant(16)
 KEY_CELLS = wp.constant(CELL_ROWS * CELL_COLUMNS)
+CELL_SUMS = 2 * CELL_ROWS * CELL_COLUMNS
+"""Length of the scratch array of cells."""
 LOBE_INNER = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 LOBE_OUTER = wp.constant(wp.float32(math.cos(math.radians(40.0))))
 """Cosines of the angles up to which a texel belongs to a light whole, and at all."""
 CORE = wp.constant(wp.float32(0.9))
 """Share of a lobe's peak above which texels say where exactly the light is."""
 LOBE_ANGLE = wp.constant(wp.float32(math.radians(40.0)))
-SEGMENTS = wp.constant(4)
 KEY_BLOCK = 256  # as other launches: another size would compile the whole module a second time
 MAX_KEY_LIGHTS = 4
 
@@ -646,6 +647,7 @@ def sum_cells_kernel(
             moment += area * wp.max(luminance(environment[i, j]) - mean, 0.0) * at
             at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
     cells_out[cell] = moment
+    cells_out[KEY_CELLS + cell] = moment  # what is left over by the lights found so far
 
 
 @wp.func
@@ -671,19 +673,16 @@ def block_sum(value: wp.vec4) -> wp.vec4:
 
 
 @wp.func
-def shift_on_cells(
-    cells: wp.array[wp.vec3], found: mat43, count: wp.int32, direction: wp.vec3, power: wp.int32, thread: wp.int32
-) -> wp.vec3:
+def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32, thread: wp.int32) -> wp.vec3:
     """One mean shift with the kernel cos^power of all that faces the direction; for a whole block, power 0, 2 or 8."""
     sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
     cell = thread
     while cell < KEY_CELLS:
-        moment = cells[cell]
-        cosine = wp.dot(moment, direction)
-        if cosine > 0.0:
-            at = wp.normalize(moment)
-            cosine = wp.dot(at, direction)
-            weight = left_over(at, found, count)
+        moment = cells[KEY_CELLS + cell]
+        facing = wp.dot(moment, direction)
+        if facing > 0.0:
+            cosine = facing / wp.length(moment)
+            weight = wp.float32(1.0)
             if power >= 2:
                 weight *= cosine * cosine
             if power >= 8:
@@ -699,10 +698,11 @@ def shift_on_cells(
 
 
 @wp.func
-def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3) -> wp.float32:
-    """Excess within some 17 degrees of a direction: weighted by cos^16."""
+def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, thread: wp.int32) -> wp.float32:
+    """Excess within some 17 degrees of a direction, weighted by cos^16; for a whole block."""
     sum = wp.float32(0.0)
-    for cell in range(KEY_CELLS):
+    cell = thread
+    while cell < KEY_CELLS:
         facing = wp.dot(cells[cell], direction)
         if facing > 0.0:
             cosine = facing / wp.length(cells[cell])
@@ -710,19 +710,9 @@ def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3) -> wp.float32:
             power *= power
             power *= power
             sum += facing / cosine * power * power
-    return sum
-
-
-@wp.func
-def valley_between(cells: wp.array[wp.vec3], a: wp.vec3, b: wp.vec3) -> wp.float32:
-    """1 if it is dark halfway between two directions, 0 if both look into one window."""
-    middle = a + b
-    if wp.length(middle) < 0.1:
-        return 1.0
-    least = wp.min(excess_around(cells, a), excess_around(cells, b))
-    if least <= 0.0:
-        return 1.0
-    return 1.0 - smooth_ramp(0.3, 0.6, excess_around(cells, wp.normalize(middle)) / least)
+        cell += wp.block_dim()
+    total = wp.tile_sum(wp.tile(sum))
+    return total[0]
 
 
 @wp.kernel(enable_backward=False)
@@ -730,8 +720,8 @@ def find_key_lights_kernel(
     # In:
     environment: wp.array2d[wp.vec3],
     sums: wp.array[wp.vec4],
-    cells: wp.array[wp.vec3],
     # Out:
+    cells_out: wp.array[wp.vec3],
     key_lights_out: wp.array[KeyLight],
 ):
     """One block finds all lights, one after another; thread 0 ranks and writes them."""
@@ -750,6 +740,8 @@ def find_key_lights_kernel(
     greens = wp.vec4(0.0, 0.0, 0.0, 0.0)
     blues = wp.vec4(0.0, 0.0, 0.0, 0.0)
     count = key_lights_out.shape[0]
+    # Runs of texels that share one start of the rotation: long ones where a single thread walks them all.
+    segments = wp.where(threads == 1, 1, 16)
 
     for k in range(count):
         # The cell's direction in which a surface receives most; the first of equals, whatever the number of threads.
@@ -765,10 +757,7 @@ def find_key_lights_kernel(
             )
             received = wp.float32(0.0)
             for cell in range(KEY_CELLS):
-                moment = cells[cell]
-                facing = wp.dot(moment, toward)
-                if facing > 0.0:
-                    received += facing * left_over(wp.normalize(moment), found, k)
+                received += wp.max(wp.dot(cells_out[KEY_CELLS + cell], toward), 0.0)
             if received > best:
                 best = received
                 best_cell = wp.float32(candidate)
@@ -789,7 +778,7 @@ def find_key_lights_kernel(
             )
             for step in range(10):
                 power = wp.where(step < 2, 0, wp.where(step < 4, 2, 8))
-                direction = shift_on_cells(cells, found, k, direction, power, thread)
+                direction = shift_on_cells(cells_out, direction, power, thread)
 
         # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
         # 3: what the lobe gives.
@@ -803,10 +792,10 @@ def find_key_lights_kernel(
             if not lit:
                 last_row = first_row - 1
             item = thread
-            while item < (last_row - first_row + 1) * SEGMENTS:
-                i = first_row + item // SEGMENTS
-                start = item % SEGMENTS * width // SEGMENTS
-                stop = (item % SEGMENTS + 1) * width // SEGMENTS
+            while item < (last_row - first_row + 1) * segments:
+                i = first_row + item // segments
+                start = item % segments * width // segments
+                stop = (item % segments + 1) * width // segments
                 area = texel_solid_angle(i, height, width)
                 at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
                 for j in range(start, stop):
@@ -828,6 +817,15 @@ def find_key_lights_kernel(
                                 sum += wp.vec4(given[0], given[1], given[2], 0.0)
                     at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
                 item += threads
+            if step == 3:
+                # Each thread its own cells; the sums below make all of them wait for that.
+                cell = thread
+                while cell < KEY_CELLS:
+                    moment = cells_out[KEY_CELLS + cell]
+                    if wp.length(moment) > 0.0:
+                        taken = lobe_window(wp.dot(moment, direction) / wp.length(moment))
+                        cells_out[KEY_CELLS + cell] = (1.0 - taken) * moment
+                    cell += threads
             total = block_sum(sum)
             top = wp.tile_max(wp.tile(highest))
             if step < 3:
@@ -843,16 +841,32 @@ def find_key_lights_kernel(
         for axis in range(3):
             found[k, axis] = direction[axis]
 
+    # How far each pair of lights are rivals: 60 degrees apart, with a valley between them.
+    apart = wp.mat44()
+    around = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for k in range(count):
+        a = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
+        around[k] = excess_around(cells_out, a, thread)
+        for j in range(k):
+            b = wp.vec3(found[j, 0], found[j, 1], found[j, 2])
+            middle = excess_around(cells_out, wp.normalize(a + b), thread)
+            least = wp.min(around[j], around[k])
+            rivalry = wp.clamp(2.0 * (1.0 - wp.dot(a, b)), 0.0, 1.0)
+            if least > 0.0:
+                rivalry *= 1.0 - smooth_ramp(0.3, 0.6, middle / least)
+            apart[j, k] = rivalry
+            apart[k, j] = rivalry
+
     if thread == 0:
-        taken = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        placed = wp.vec4(0.0, 0.0, 0.0, 0.0)
         for place in range(count):
             # Brightest first; of equals the one that was found first.
             pick = wp.int32(-1)
             for k in range(count):
-                if taken[k] == 0.0:
+                if placed[k] == 0.0:
                     if pick < 0 or strengths[k] > strengths[wp.max(pick, 0)]:
                         pick = k
-            taken[pick] = 1.0
+            placed[pick] = 1.0
             light = KeyLight()
             light.direction = wp.vec3(found[pick, 0], found[pick, 1], found[pick, 2])
             light.irradiance = wp.vec3(reds[pick], greens[pick], blues[pick])
@@ -860,11 +874,7 @@ def find_key_lights_kernel(
             if strengths[pick] > 0.0:
                 alone = wp.float32(1.0)
                 for k in range(count):
-                    if k != pick and strengths[k] > 0.0:
-                        rival = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
-                        apart = wp.clamp(2.0 * (1.0 - wp.dot(rival, light.direction)), 0.0, 1.0)
-                        apart *= valley_between(cells, rival, light.direction)
-                        alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * apart)
+                    alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * apart[pick, k])
                 light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
             key_lights_out[place] = light
 
@@ -875,7 +885,7 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
     Args:
         environment: ``wp.vec3`` (h, w), finite and not negative.
         sums_out: Scratch, ``wp.vec4`` (h).
-        cells_out: Scratch, ``wp.vec3`` (``KEY_CELLS``).
+        cells_out: Scratch, ``wp.vec3`` (``CELL_SUMS``).
         key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0
             and looks toward +z.
 
@@ -896,8 +906,8 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
     wp.launch_tiled(
         find_key_lights_kernel,
         dim=[1],
-        inputs=[environment, sums_out, cells_out],
-        outputs=[key_lights_out],
+        inputs=[environment, sums_out],
+        outputs=[cells_out, key_lights_out],
         block_dim=KEY_BLOCK,
         device=device,
     )
