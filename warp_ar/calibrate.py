@@ -131,8 +131,8 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
         width, height = height, width
     if card_mm[0] > width - 2 * _MARGIN or card_mm[1] > height - 2 * _MARGIN - foot:
         raise UsageError(
-            f"card of {card_mm[0]:g} x {card_mm[1]:g} mm does not fit on {paper} ({width:g} x {height:g} mm with margins); "
-            "choose smaller lengths or a larger --paper"
+            f"card of {card_mm[0]:g} x {card_mm[1]:g} mm does not fit on {paper} ({width:g} x {height:g} mm "
+            "with margins); choose smaller lengths or a larger --paper"
         )
     mm = per_metre / 1e3
     page = np.full((round(height * mm), round(width * mm)), 255, np.uint8)
@@ -196,7 +196,7 @@ def calibrate_camera(images: Iterable[Image], marker: Marker) -> CameraReport:
             size = (image.shape[1], image.shape[0])
         if size != (image.shape[1], image.shape[0]):
             raise UsageError(
-                f"picture {seen}: {image.shape[1]}x{image.shape[0]}, the first was {size[0]}x{size[1]}; expected one size"
+                f"picture {seen}: {image.shape[1]}x{image.shape[0]}; expected the first one's {size[0]}x{size[1]}"
             )
         seen += 1
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -264,7 +264,12 @@ def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other
 def _calibrate(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> Any:
     pixels = [corners.astype(np.float32) for corners, _, _ in views]
     points = [points.astype(np.float32) for _, _, points in views]
-    return cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5))
+    plain, full = (
+        cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+        for flags in (cv2.CALIB_FIX_K3, 0)
+    )
+    # The sixth-order term bends the corners of the picture wildly where it only fits noise.
+    return full if full[0] < 0.9 * plain[0] else plain
 
 
 def _place(row: int, column: int) -> str:
@@ -371,7 +376,7 @@ def locate_ball(
         total, count = 0.0, 0
         for (dx, dy), (_, pose) in zip(gradients, views, strict=True):
             pixels, normals, above = outline_ball(camera, pose, c, radius)
-            rings = pixels + np.array([0.0, 2.5, 4.5])[:, None, None] * _BLUR * normals
+            rings = pixels + np.array([0.0, 3.5, 5.5])[:, None, None] * _BLUR * normals
             within = above & ((rings >= 1) & (rings <= (w - 2, h - 2))).all((0, 2))
             if not within.any():
                 continue
@@ -387,7 +392,9 @@ def locate_ball(
     best, count = np.array(center, float), _SEARCH
     # Everywhere at 1 mm first: reflections make maxima of their own.
     for step in (1e-3, 4e-4, 2e-4, 1e-4, 5e-5):
-        places = [best + (step * x, step * y, 0.0) for x in range(-count, count + 1) for y in range(-count, count + 1)]
+        places = [
+            best + step * np.array([x, y, 0.0]) for x in range(-count, count + 1) for y in range(-count, count + 1)
+        ]
         scores = [score(place) for place in places]
         best, count = places[int(np.argmax(scores))], 2
     if not math.isfinite(max(scores)):
@@ -550,17 +557,13 @@ def _run_ball(options: argparse.Namespace) -> None:
             if track.state is TrackState.TRACKED and track.pose is not None and track.quality > 0.5:
                 views.append((frame.image, track.pose))
     if not views:
-        raise UsageError(
-            f"{spec}: the marker is in none of the first {options.frames} frames; see [marker] in {options.scene}"
-        )
+        raise UsageError(f"{spec}: no marker in the first {options.frames} frames; see [marker] in {options.scene}")
     views = views[:: -(-len(views) // 12)]
     for index, probe in enumerate(scene.probes):
         report = locate_ball(views, camera, probe.center, probe.radius)
         moved = 1e3 * math.dist(report.center, probe.center)
         x, y, z = report.center
-        print(
-            f"probe {index}: center = [{x:.5f}, {y:.5f}, {z:.5f}]  ({moved:.1f} mm from the scene's; {report.views} frames)"
-        )
+        print(f"probe {index}: center = [{x:.5f}, {y:.5f}, {z:.5f}]  ({moved:.1f} mm off the scene's)")
         if report.contrast < 0.2:
             print(
                 f"warp_ar: probe {index}: little contrast at the ball's rim ({report.contrast:.0%}); check the result",
@@ -578,11 +581,12 @@ def _run(options: argparse.Namespace) -> None:
         write_camera(report, options.output)
         c = report.camera
         print(
-            f"{options.output}: fx {c.fx:.2f}  fy {c.fy:.2f}  cx {c.cx:.2f}  cy {c.cy:.2f}  (focal length +/- {report.focal_deviation:.2f} pixels)"
+            f"{options.output}: fx {c.fx:.2f} fy {c.fy:.2f} (+/- {report.focal_deviation:.2f}) "
+            f"cx {c.cx:.2f} cy {c.cy:.2f}"
         )
         print(
-            f"reprojection error {report.error:.3f} pixels over {len(report.view_errors)} views (worst {max(report.view_errors):.3f}), "
-            f"{report.coverage:.0%} of the picture covered"
+            f"reprojection error {report.error:.3f} pixels over {len(report.view_errors)} views "
+            f"(worst {max(report.view_errors):.3f}), {report.coverage:.0%} of the picture covered"
         )
         for warning in report.warnings:
             print(f"warp_ar: {warning}", file=sys.stderr)

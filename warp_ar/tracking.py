@@ -518,17 +518,21 @@ class Tracker:
 
         Clockwise corners make z point toward the camera in both.
         """
+        # With z into the page a marker seen straight on is not turned at all. With z out of it, it is turned by exactly
+        # half a turn, where OpenCV's solver divides 0 by 0 and returns a pose that is 160 pixels off.
+        facing = np.diag([1.0, -1.0, -1.0])
         try:
             _, rotations, translations, _ = cv2.solvePnPGeneric(
-                points, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
+                points @ facing, corners, self._matrix, self._distortion, flags=cv2.SOLVEPNP_IPPE
             )
         except cv2.error:  # corners on one line
             return []
         poses = []
         for r, t in zip(rotations, translations, strict=True):
-            pose = Pose(_rotation(r), np.asarray(t, float).ravel())
-            ahead = pose.apply(self._pattern.outline)[:, 2].min() > 0 if np.isfinite([r, t]).all() else False
-            if ahead:
+            if not np.isfinite([r, t]).all():
+                continue
+            pose = Pose(_rotation(r) @ facing, np.asarray(t, float).ravel())
+            if pose.apply(self._pattern.outline)[:, 2].min() > 0:
                 residual = self._project(pose.apply(points))[0] - corners
                 poses.append((pose, float(np.sqrt((residual**2).sum(1).mean()))))
         return sorted(poses, key=lambda p: p[1])

@@ -1,0 +1,213 @@
+"""Cards that print at size; cameras, responses and balls that are measured as they were rendered."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import cv2
+import imageio.v3
+import numpy as np
+import pytest
+
+from tests.test_tracking import look, make_camera, render
+from warp_ar import calibrate
+from warp_ar.errors import UsageError
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Camera, CharucoBoard, Marker
+from warp_ar.tracking import Pose, Tracker
+
+BOARD = Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.035, 0.026))
+FOCAL = 0.003
+"""Share of the focal length: 14 views with corners good to a few hundredths of a pixel; measured 0.0005."""
+CURVE = 0.012
+"""Of clipping, linear: quantised codes and OpenCV's smoothing; measured 0.005."""
+BALL_DRAWN_MM = 1.0
+"""A plain disc: what lies just outside the rim pushes it off by half a pixel; measured 0.86."""
+BALL_MM = 1.5
+"""The ball's rim where it stands out from the desk; measured 0.8 to 1.1."""
+BALL_HARD_MM = 10.0
+"""Where a bright band crowds inside the rim, which is taken for the rim; measured 4.5 and 8.6."""
+
+
+def test_card_prints_at_exact_size(tmp_path):
+    path = tmp_path / "card.png"
+    assert calibrate.main(["card", "--output", str(path), "--size", "0.08", "--dpi", "300"]) == 0
+    page = imageio.v3.imread(path)
+    per_metre = round(300 / 0.0254)
+    assert np.allclose(imageio.v3.immeta(path)["dpi"], per_metre * 0.0254, rtol=1e-6)
+    assert page.shape == (round(0.297 * per_metre), round(0.21 * per_metre))
+    corners = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)).detectMarkers(page)[0]
+    low, high = np.min(corners[0][0], axis=0), np.max(corners[0][0], axis=0)
+    black = np.argwhere(page[int(low[1]) - 9 : int(high[1]) + 9, int(low[0]) - 9 : int(high[0]) + 9] == 0)
+    assert np.abs(np.ptp(black, axis=0) + 1 - 0.08 * per_metre).max() <= 1  # each edge at its nearest pixel
+    bar = np.argwhere(page[-round(0.01 * per_metre) - 4, :] == 0)
+    assert abs(np.ptp(bar) + 1 - 0.1 * per_metre) <= 1
+
+
+@pytest.mark.parametrize(
+    "marker", [Marker("DICT_APRILTAG_36h11", 3), BOARD, Marker("DICT_4X4_50", board=CharucoBoard(4, 6, 0.03, 0.02))]
+)
+def test_card_shows_what_is_tracked(marker):
+    """The card seen straight on, a pixel per half millimetre, gives the pose at which a page of its size would look
+    so."""
+    card = calibrate.draw_card(marker, 2000.0)
+    h, w = card.shape
+    camera = Camera(w, h, 1000.0, 1000.0, (w - 1) / 2, (h - 1) / 2)
+    track = Tracker(marker, camera).track(np.repeat(card[..., None], 3, 2), 0.0)
+    assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
+    assert np.allclose(track.pose.rotation, np.diag([1, -1, -1]), atol=0.02)
+
+
+def test_card_does_not_fit(tmp_path, capsys):
+    assert calibrate.main(["card", "--size", "0.25", "--output", str(tmp_path / "card.png")]) == 2
+    assert "does not fit" in capsys.readouterr().err
+
+
+def views(camera: Camera) -> list[np.ndarray]:
+    """The board tilted to every side: one direction of tilt alone leaves focal length and centre uncertain."""
+    images = []
+    for k in range(15):
+        pose = look((5, 25, 40)[k % 3], 24 * k, distance=0.42 + 0.02 * (k % 4))
+        rolled = cv2.Rodrigues(np.array([0.0, 0.0, np.radians(77.0 * k)]))[0] @ pose.rotation
+        at = np.array([0.09 * np.cos(1.3 * k), 0.07 * np.sin(1.3 * k), 0.0])
+        images.append(render((BOARD, Pose(rolled, pose.translation + at)), camera=camera, seed=k))
+    return images
+
+
+def test_camera_is_found_and_read_back(tmp_path, capsys):
+    truth = make_camera(700.0, (-0.2, 0.06, 0.001, -0.0008, 0.0))
+    for k, view in enumerate(views(truth)):
+        imageio.v3.imwrite(tmp_path / f"{k:04d}.png", view)
+    output = tmp_path / "camera.yml"
+    text = str(BOARD.board)
+    assert calibrate.main(["camera", str(tmp_path), "--board", text, "--output", str(output)]) == 0
+    found = Camera.load_calibration(output)
+    assert (found.width, found.height) == (640, 480)
+    assert abs(found.fx / 700 - 1) < FOCAL
+    assert abs(found.fy / 700 - 1) < FOCAL
+    # What matters is where rays go, but for a turn of them all: not how the numbers share it.
+    pixels = np.array([[x, y] for x in (30.0, 320, 610) for y in (30.0, 240, 450)])[:, None]
+    rays = [cv2.undistortPoints(pixels, c.matrix(), np.array(c.distortion)) for c in (truth, found)]
+    bent = rays[0] - rays[1]
+    assert np.abs(bent - bent.mean(0)).max() * 700 < 0.5  # pixels
+    said = capsys.readouterr()
+    assert float(re.search(r"error ([0-9.]+) pixels", said.out)[1]) < 0.2
+
+
+def test_camera_warns_of_poor_views():
+    camera = make_camera()
+    images = [
+        render((BOARD, look(3 + k, distance=0.9, at=(0.05 * k - 0.12, 0.0))), camera=camera, seed=k) for k in range(6)
+    ]
+    report = calibrate.calibrate_camera(images, BOARD)
+    said = " ".join(report.warnings)
+    assert "views" in said
+    assert "never reached" in said
+    assert "tilted" in said
+
+
+def test_camera_needs_views():
+    image = render((BOARD, look(20)))
+    with pytest.raises(UsageError, match="1 different views"):
+        calibrate.calibrate_camera([image, image, image], BOARD)  # the same again does not count
+    with pytest.raises(UsageError, match="0 different views"):
+        calibrate.calibrate_camera([], BOARD)
+    with pytest.raises(UsageError, match="ChArUco"):
+        calibrate.calibrate_camera([image], Marker())
+
+
+def test_response_is_recovered(tmp_path, capsys):
+    """A bracket of a scene with every brightness, encoded as sRGB."""
+    y, x = np.mgrid[0:200, 0:300]
+    scene = np.stack([0.02 * 60 ** (x / 300), 0.02 * 60 ** (y / 200), 0.02 * 60 ** ((x + y) / 500)], -1)
+    exposures = [0.25, 0.5, 1.0, 2.0, 4.0]
+    paths = []
+    for k, exposure in enumerate(exposures):
+        linear = np.clip(scene * exposure, 0, 1)
+        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        paths.append(str(tmp_path / f"{k}.png"))
+        imageio.v3.imwrite(paths[-1], np.round(255 * encoded).astype(np.uint8))
+    output = tmp_path / "response.txt"
+    assert (
+        calibrate.main(["response", *paths, "--exposures", "1/4", "1/2", "1", "2", "4", "--output", str(output)]) == 0
+    )
+    assert np.abs(decode_table(output) - decode_table("srgb")).max() < CURVE
+
+
+@pytest.mark.parametrize("exposures", [[1.0, 2.0], [1.0, 1.1, 1.2], [1.0, 2.0, -4.0], [1.0, 2.0, float("nan")]])
+def test_response_needs_a_bracket(exposures):
+    with pytest.raises(UsageError, match="expected"):
+        calibrate.measure_response([np.zeros((8, 8, 3), np.uint8)] * len(exposures), exposures)
+
+
+def test_outline_of_a_ball():
+    """Tangent rays: every point of the outline is seen exactly one radius from the centre."""
+    camera, pose, center = make_camera(), look(50, 20), np.array([0.06, 0.05, 0.035])
+    pixels, normals, above = calibrate.outline_ball(camera, pose, center, 0.035)
+    rays = np.column_stack([(pixels - (319.5, 239.5)) / 640.0, np.ones(len(pixels))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    c = pose.apply(center)
+    assert np.allclose(np.linalg.norm(np.cross(rays, c), axis=1), 0.035, atol=1e-12)
+    assert (((pixels - pixels.mean(0)) * normals).sum(1) > 0).all()
+    assert above.sum() == pytest.approx(len(above) / 2, abs=2)
+    assert len(calibrate.outline_ball(camera, pose, np.array([0, 0, 5.0]), 0.035)[0]) == 0  # behind the camera
+
+
+def test_ball_stands_where_it_was_drawn():
+    camera, center, frames = make_camera(), np.array([0.05, 0.04, 0.035]), []
+    for k in range(4):
+        pose = look(50, 15 * k - 20)
+        c = pose.apply(center)
+        # Area-sampled 4 x 4: a pixel sees the ball where its ray passes the centre within a radius.
+        y, x = (np.mgrid[0:1920, 0:2560] + 0.5) / 4 - 0.5
+        rays = np.stack([(x - 319.5) / 640, (y - 239.5) / 640, np.ones_like(x)], -1)
+        along = rays @ c / np.sqrt((rays**2).sum(-1))
+        hit = cv2.resize((c @ c - along**2 < 0.035**2).astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
+        image = np.round(120 + hit[..., None] * (80, 70, 60)).astype(np.uint8)
+        frames.append((image, pose))
+    report = calibrate.locate_ball(frames, camera, center + np.array([0.006, -0.004, 0]), 0.035)
+    assert np.linalg.norm(np.subtract(report.center, center)) < BALL_DRAWN_MM / 1e3
+    assert report.contrast > 0.6
+
+
+def test_ball_on_truth(shared):
+    for path in sorted((shared / "truth").glob("*/case.json")):
+        case = json.loads(path.read_text())
+        camera = Camera(*(case["camera"][key] for key in ("width", "height", "fx", "fy", "cx", "cy")))
+        frames = [
+            (
+                imageio.v3.imread(path.parent / "camera" / f"{p['frame']:04d}.png"),
+                Pose(np.array(p["R"]), np.array(p["t"])),
+            )
+            for p in case["poses"][::3]
+        ]
+        truth = np.array(case["probe"]["center"])
+        report = calibrate.locate_ball(frames, camera, truth + np.array([0.004, -0.003, 0]), case["probe"]["radius"])
+        hard = path.parent.name in ("night_desk_lamp", "plastic_bunny_sunset")
+        assert np.linalg.norm(report.center - truth) * 1e3 < (BALL_HARD_MM if hard else BALL_MM), path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "required"),
+        (["paint"], "invalid choice"),
+        (["card", "--dictionary", "DICT_9X9"], "DICT_9X9"),
+        (["card", "--board", "charuco 5x7"], "charuco 5x7"),
+        (["card", "--id", "50"], "50"),
+        (["card", "--size", "-1"], "-1"),
+        (["card", "--paper", "a9"], "letter"),
+        (["card", "--output", "nowhere/card.png"], "nowhere"),
+        (["camera", "nowhere"], "nowhere"),
+        (["ball", "nowhere"], "nowhere"),
+        (["response", "nowhere.png", "--exposures", "fast"], "1/50"),
+    ],
+)
+def test_errors_are_one_line(arguments, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert calibrate.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
