@@ -59,6 +59,20 @@ def test_card_shows_what_is_tracked(marker):
     assert np.allclose(track.pose.rotation, np.diag([1, -1, -1]), atol=0.02)
 
 
+def test_default_board_fits_the_default_paper(tmp_path):
+    options = calibrate.make_parser().parse_args(["camera", "pictures"])
+    card = [
+        "card",
+        "--board",
+        options.board,
+        "--dictionary",
+        options.dictionary,
+        "--output",
+        str(tmp_path / "card.png"),
+    ]
+    assert calibrate.main(card) == 0
+
+
 def test_card_does_not_fit(tmp_path, capsys):
     assert calibrate.main(["card", "--size", "0.25", "--output", str(tmp_path / "card.png")]) == 2
     assert "does not fit" in capsys.readouterr().err
