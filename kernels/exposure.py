@@ -1,7 +1,9 @@
 """Another exposure of the picture: shorter, as if light had been added and the camera had answered; or longer.
 
 A shorter exposure scales linear light by s < 1. Where the camera clipped, the frame does not say how bright the scene
-was, and scaling the clipped value gives flat grey patches. Rungs:
+was, and scaling the clipped value gives flat grey patches. A pixel counts as clipped when all its channels are: one
+that still has a hue is not far above clipping, and lifting it would leave a bright island in a surface that fades.
+Rungs:
 
 ``plain``: scaling alone; a clipped pixel is taken to be just clipped.
 
@@ -64,7 +66,7 @@ MAX_BOX = 1.0 / 8.0
 MAX_GAIN = wp.constant(wp.float32(2.0))
 """How far above clipping a clipped pixel is guessed at most: one stop."""
 KNEE = wp.constant(wp.float32(250.0))
-"""Code from which a pixel begins to count as clipped."""
+"""Code from which a pixel's darkest channel begins to count as clipped."""
 
 CLIPPED_SHARE = wp.constant(wp.float32(0.005))
 """Share of the pixels under virtual light that ``auto`` allows to clip."""
@@ -257,9 +259,9 @@ def make_expose_kernel(config: ExposureConfig) -> wp.Kernel:
         s = scale[0]
         gain = float(1.0)
         if wp.static(config.rung == "box"):
-            peak = wp.float32(wp.max(wp.max(code[0], code[1]), code[2]))
-            if peak > KNEE and s < 1.0:
-                clipped = (peak - KNEE) / (255.0 - KNEE)
+            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
+            if least > KNEE and s < 1.0:
+                clipped = (least - KNEE) / (255.0 - KNEE)
                 gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
         if gain == 1.0 and not is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
             image_out[i, j] = wp.vec3ub(

@@ -90,6 +90,12 @@ def test_centre_stays_bright_and_edge_fades(device):
     np.testing.assert_array_equal(box[unclipped], plain[unclipped])
 
 
+def test_pixel_with_a_hue_is_not_lifted(device):
+    """Orange that clips in red alone fades with its surroundings, however large it is."""
+    frame = np.full((64, 64, 3), (255, 230, 120), np.uint8)
+    np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
+
+
 def test_extreme_darkening_takes_a_small_region_like_the_rest(device):
     """A disc smaller than half the largest box."""
     frame = disc(400, 12)

@@ -24,7 +24,7 @@ def factor(mean, scale):
 def gains(frame, scale, max_box):
     """Factor / scale of every pixel."""
     values = summed_area.intensity(frame)
-    clipped = np.clip((frame.max(-1) - KNEE) / (255.0 - KNEE), 0.0, 1.0)
+    clipped = np.clip((frame.min(-1) - KNEE) / (255.0 - KNEE), 0.0, 1.0)
     out = np.ones(frame.shape[:2])
     if scale < 1.0:
         for i, j in np.argwhere(clipped > 0.0):

@@ -55,13 +55,13 @@ class Expose(Stage):
         exposure.make_expose_kernel(config)
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
-        over = [arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio")]
+        virtual, added, ratio = (arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio"))
         passes: list[Pass] = []
         if self.request.scene.exposure.scale == "auto":
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                exposure.count_levels(layers, params, frame, decode, *over, levels, rows=rows)
+                exposure.count_levels(layers, params, frame, decode, virtual, added, ratio, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
             passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
@@ -70,9 +70,20 @@ class Expose(Stage):
         passes.append(Pass(lambda rows: exposure.expose_codes(decode, encode, scale, codes)))
 
         def launch(rows: Rows | None) -> None:
-            table = arrays.get("summed_area")
             exposure.expose(
-                config, params, frame, decode, encode, *over, table, scale, codes, arrays["image"], rows=rows
+                config,
+                params,
+                frame,
+                decode,
+                encode,
+                virtual,
+                added,
+                ratio,
+                arrays.get("summed_area"),
+                scale,
+                codes,
+                arrays["image"],
+                rows=rows,
             )
 
         passes.append(Pass(launch, rows=self.request.size[1]))
