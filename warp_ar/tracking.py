@@ -191,7 +191,7 @@ class MarkerDetector:
         parameters.perspectiveRemovePixelPerCell = 8
         parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
         parameters.minDistanceToBorder = 0
-        # Measured against path-traced poses, root mean square per coordinate: 0.65 pixel unrefined, 0.75 by contour lines,
+        # Against path-traced poses, root mean square per coordinate: 0.65 pixel unrefined, 0.75 by contour lines,
         # 0.28 by gradients (this one); AprilTag's quads are 0.45 pixel off in x and y. Edges refine the rest.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._parameters = parameters
