@@ -157,6 +157,8 @@ class Pipeline:
         self._light_rows = (0, height)
         add("object_rows", lambda: self._object_rows)
         add("light_rows", lambda: self._light_rows)
+        self._shadow_rows = (0, height)
+        add("shadow_rows", lambda: self._shadow_rows)
         params = self._block.host("params")
         params["focal"] = (self.camera.fx, self.camera.fy)
         params["principal"] = (self.camera.cx, self.camera.cy)
@@ -242,6 +244,9 @@ class Pipeline:
             params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
             self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
             self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
+            if "physical_ratio" in self._arrays:
+                params["shadow_rect"] = self._host_scene.shadow_rect(pose, self.camera)
+                self._shadow_rows = (int(params["shadow_rect"][0][0]), int(params["shadow_rect"][0][1]))
         params["time"] = now - (self._start_time or 0.0)
         params["time_step"] = max(now - self._last_time, 0.0)
         params["frame_index"] = self._index

@@ -10,6 +10,8 @@ from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
 from warp_ar.stages.relight import Relight
+from warp_ar.stages.room_samples import RoomSamples
+from warp_ar.stages.room_shadow import RoomShadow
 from warp_ar.stages.shade import Shade
 from warp_ar.stages.specular import Specular
 from warp_ar.stages.summed_area import SummedArea
@@ -26,6 +28,8 @@ STAGES: tuple[type[Stage], ...] = (
     Visibility,
     SummedArea,
     Relight,
+    RoomSamples,
+    RoomShadow,
     Shade,
     Composite,
     Expose,

@@ -54,9 +54,10 @@ class Composite(Stage):
                 rows=rows,
             )
 
-        if not device.is_cpu or config.ratio:
+        if not device.is_cpu:
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
+        extents += [arrays["shadow_rows"]] * config.ratio
         return [Pass(lambda rows: wp.copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
 
 
@@ -68,7 +69,16 @@ def layer_names(request: Request) -> tuple[str, ...]:
         layers.append("virtual")
     if scene.lights and scene.proxies:
         layers.append("physical_added")
+    if shades_room(request):
+        layers.append("physical_ratio")
     return tuple(layers)
+
+
+def shades_room(request: Request) -> bool:
+    """Whether virtual objects change the room's light on the desk: needs objects, proxies, a ball, and a rung for it."""
+    scene = request.scene
+    wanted = request.quality.rung("room_shadow") not in ("default", "none")
+    return bool(wanted and scene.objects and scene.proxies and scene.probes)
 
 
 def exposes(request: Request) -> bool:

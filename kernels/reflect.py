@@ -1,0 +1,155 @@
+"""What a ray that leaves a surface of the scene sees: the desk in the camera's picture, virtual objects, the distant room.
+
+The real desk is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
+the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
+the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
+looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal
+
+import warp as wp
+
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
+from warp_ar.kernels.probe import project
+from warp_ar.kernels.relight import meets_probe
+from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Probe, RayScene
+from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace
+
+wp.set_module_options({"enable_backward": False})
+
+HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
+"""Share of the camera's distance within which a proxy is the point itself and does not hide it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RoomConfig:
+    """Forms of the room's light that exist, and what the objects make of it."""
+
+    trace: TraceConfig
+    """Kinds of shape."""
+    models: tuple[int, ...]
+    """Sorted material models of the objects."""
+    textures: bool
+    """Whether any material has a texture."""
+    diffuse: Literal["none", "sh", "map"]
+    """Where the room's irradiance comes from."""
+    specular: bool
+    """Whether the prefiltered environment is read."""
+    probes: bool
+    """Whether there are mirror balls, which hide the desk."""
+
+
+@wp.struct
+class Room:
+    """The room's light in all its forms; what a ``RoomConfig`` leaves out may be empty."""
+
+    environment: wp.array2d[wp.vec3]
+    irradiance_sh: wp.array[wp.vec3]
+    irradiance_map: wp.array2d[wp.vec3]
+    levels: wp.array[wp.vec3]
+    level_height: wp.int32
+    dfg: wp.array2d[wp.vec2]
+    probes: wp.array[Probe]
+
+
+@wp.func
+def look_up(frame: wp.array2d[wp.vec3ub], decode_table: wp.array[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
+    """Bilinear sample of a frame's linear radiance; x and y are inside the outermost pixel centres."""
+    j = wp.min(wp.int32(x), frame.shape[1] - 2)
+    i = wp.min(wp.int32(y), frame.shape[0] - 2)
+    fx = x - wp.float32(j)
+    fy = y - wp.float32(i)
+    top = (1.0 - fx) * decode(decode_table, frame[i, j]) + fx * decode(decode_table, frame[i, j + 1])
+    bottom = (1.0 - fx) * decode(decode_table, frame[i + 1, j]) + fx * decode(decode_table, frame[i + 1, j + 1])
+    return (1.0 - fy) * top + fy * bottom
+
+
+@functools.cache
+def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
+    """``find_in_frame(params, height, width, scene, probes, point, geometric_normal) -> vec2``: pixel (x, y) or x = -1."""
+    occluded_by_proxies = make_trace(trace).occluded_by_proxies
+
+    @wp.func(module="unique")
+    def find_in_frame(
+        params: FrameParams,
+        height: wp.int32,
+        width: wp.int32,
+        scene: RayScene,
+        balls: wp.array[Probe],
+        point: wp.vec3,
+        geometric_normal: wp.vec3,
+    ) -> wp.vec2:
+        nowhere = wp.vec2(-1.0, -1.0)
+        from_camera = point - params.camera_position
+        if wp.dot(from_camera, geometric_normal) >= 0.0:
+            return nowhere
+        at = project(params, from_camera)
+        if at[2] <= 0.0:
+            return nowhere
+        if at[0] < 0.0 or at[0] > wp.float32(width - 1) or at[1] < 0.0 or at[1] > wp.float32(height - 1):
+            return nowhere
+        if occluded_by_proxies(scene, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
+            return nowhere
+        if wp.static(probes):
+            if meets_probe(balls, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):
+                return nowhere
+        return wp.vec2(at[0], at[1])
+
+    return find_in_frame
+
+
+@functools.cache
+def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
+    """``shade_unoccluded(scene, room, hit, direction) -> vec3``: an object's radiance under the distant room alone."""
+    surface_at = make_surface(config.models, config.textures)
+    glossy = make_mirrored(config)
+
+    @wp.func(module="unique")
+    def shade_unoccluded(scene: RayScene, room: Room, hit: Hit, direction: wp.vec3) -> wp.vec3:
+        wo = -wp.normalize(direction)
+        normal = hit.normal
+        if wp.dot(hit.geometric_normal, wo) < 0.0:
+            normal = -normal
+        surface = surface_at(
+            scene, room.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
+        )
+        radiance = wp.vec3(0.0)
+        if wp.static(config.diffuse == "sh"):
+            radiance += wp.cw_mul(surface.diffuse, sh_irradiance(room.irradiance_sh, normal)) / wp.pi
+        if wp.static(config.diffuse == "map"):
+            radiance += wp.cw_mul(surface.diffuse, sample_latlong(room.irradiance_map, normal)) / wp.pi
+        if wp.static(config.specular):
+            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, reflect(wo, normal))
+            radiance += wp.cw_mul(surface.reflectance, mirrored)
+        return radiance
+
+    return shade_unoccluded
+
+
+@functools.cache
+def make_mirrored(config: RoomConfig) -> wp.Function:
+    """``mirrored(room, model, roughness, shininess, direction) -> vec3``: the distant room as a lobe sees it."""
+
+    @wp.func(module="unique")
+    def mirrored(
+        room: Room, model: wp.int32, roughness: wp.float32, shininess: wp.float32, direction: wp.vec3
+    ) -> wp.vec3:
+        level = level_from_roughness(roughness, room.level_height)
+        if wp.static(PHONG in config.models):
+            if model == PHONG:
+                level = level_from_shininess(shininess, room.level_height)
+        if wp.static(MIRROR in config.models):
+            if model == MIRROR:
+                level = 0.0
+        return sample_levels(room.levels, direction, level, room.level_height)
+
+    return mirrored

@@ -1,0 +1,477 @@
+"""Shadows that virtual objects cast on the real desk under the room's light, and the light that they bounce onto it.
+
+What a proxy's pixel becomes is a factor on what the camera sees there [Deb98]: reflectance cancels,
+
+    ratio = E_with / E_without,   per channel,
+
+E the irradiance at the pixel's point, without the virtual objects (the proxies and the mirror balls shadow it: they are
+real and in the picture already) and with them. Both are sums over the same samples of the room's light
+(``room_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black object
+0, and an error of the samples cancels to first order.
+
+Sets. The pixels of a tile of ``side x side`` use one set of samples each, and every set in turn; a filter then averages
+over one tile's worth of pixels, with the edge pixels of a window of ``side + 1`` at half weight, so that each set
+counts the same and the window is centred [KH01]. Neighbours on another surface do not count. All of it is a function of
+the frame alone: nothing flickers and nothing lags.
+
+Culling. A sample matters only if its direction meets the bounding sphere of an object; a dot product tells. Only those
+rays are traced, and pixels that have none are done.
+
+Bounce. What a ray meets is not black: an object reflects one of its two lobes, picked by their reflectance. Its rough
+lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an object, that object's own colour; the desk,
+whether a ray from there leaves the scene, so that the light between an object and the ground that it stands on dies
+out. Its glossy lobe gives what is in the mirror direction.
+
+References:
+    [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
+    [KH01] Keller, Heidrich 2001, Interleaved Sampling.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_mirrored, make_shade_unoccluded
+from warp_ar.kernels.relight import meets_probe
+from warp_ar.kernels.room_samples import RoomSample, sample_toward
+from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
+from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset_origin
+
+wp.set_module_options({"enable_backward": False})
+
+CHUNK = 64
+"""Samples that are culled together: the bits of a mask."""
+MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
+"""Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
+MAX_RATIO = wp.constant(wp.float32(4.0))
+"""Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
+MESH_KEY = wp.constant(7)
+"""``surface_key`` modulo 8 of a mesh."""
+DEPTH_STEP = wp.constant(wp.float32(0.03))
+"""Relative change of depth from which neighbours on a mesh belong to different parts of it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RoomShadowConfig:
+    """What is compiled into the kernel."""
+
+    room: RoomConfig
+    """Kinds of shape and forms of light."""
+    count: int
+    """Samples per set: up to 64, or a multiple of it."""
+    side: int
+    """Pixels along a tile; there are side^2 sets."""
+    bounce: bool
+    """Whether objects reflect light onto the desk."""
+
+
+@wp.func
+def bounding_radius(shape: Shape) -> wp.float32:
+    """Radius of a sphere around a shape's position that holds it, metres."""
+    if shape.kind == SPHERE:
+        return shape.scale * shape.extent[0]
+    return shape.scale * wp.length(shape.extent)
+
+
+@wp.func
+def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
+    """Unit directions w with w . to_center above this meet the sphere; from inside, all do."""
+    squared = wp.dot(to_center, to_center) - radius * radius
+    if squared <= 0.0:
+        return -FAR
+    return wp.sqrt(squared)
+
+
+@wp.func
+def mask_cone(
+    directions: wp.array[wp.vec3], first: wp.int32, count: wp.int32, to_center: wp.vec3, radius: wp.float32
+) -> wp.uint64:
+    """Which of up to 64 directions point at a sphere."""
+    threshold = cone_threshold(to_center, radius)
+    mask = wp.uint64(0)
+    for k in range(count):
+        if wp.dot(directions[first + k], to_center) >= threshold:
+            mask = mask | (wp.uint64(1) << wp.uint64(k))
+    return mask
+
+
+@functools.cache
+def make_bounced(config: RoomConfig) -> wp.Function:
+    """``bounced(params, frame, decode_table, scene, room, hit, direction, seed) -> vec3``.
+
+    Radiance that an object sends back along a ray that met it at ``hit``: one lobe, one ray; a Monte-Carlo estimate.
+    """
+    trace = make_trace(config.trace)
+    closest_object, closest_proxy, occluded_by_objects = (
+        trace.closest_object,
+        trace.closest_proxy,
+        trace.occluded_by_objects,
+    )
+    surface_at = make_surface(config.models, config.textures)
+    find_in_frame = make_find_in_frame(config.trace, config.probes)
+    shade_unoccluded = make_shade_unoccluded(config)
+    mirrored = make_mirrored(config)
+
+    @wp.func(module="unique")
+    def bounced(
+        params: FrameParams,
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        hit: Hit,
+        direction: wp.vec3,
+        seed: wp.vec3ui,
+    ) -> wp.vec3:
+        wo = -direction
+        normal = hit.normal
+        geometric = hit.geometric_normal
+        if wp.dot(geometric, wo) < 0.0:
+            normal = -normal
+            geometric = -geometric
+        surface = surface_at(
+            scene, room.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
+        )
+        rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
+        glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+        if wp.static(config.diffuse == "none"):
+            rough = float(0.0)
+        if wp.static(not config.specular):
+            glossy = float(0.0)
+        if rough + glossy <= 0.0:
+            return wp.vec3(0.0)
+        rough_share = rough / (rough + glossy)
+        u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
+        is_rough = uniform_from_bits(seed[2]) < rough_share
+        weight = surface.reflectance / wp.max(1.0 - rough_share, 1.0e-6)
+        outward = reflect(wo, normal)
+        if is_rough:
+            weight = surface.diffuse / rough_share
+            outward = frame_from_normal(normal) * sample_cosine_hemisphere(u)
+        if wp.dot(outward, geometric) <= 0.0:
+            return wp.vec3(0.0)
+
+        received = wp.vec3(0.0)
+        origin = offset_origin(hit.point, geometric, outward, hit.error)
+        other = closest_object(scene, origin, outward, FAR)
+        proxy = closest_proxy(scene, origin, outward, other.t)
+        if proxy.shape >= 0:
+            # Light of the desk, as far as a ray from there leaves the scene.
+            up = proxy.geometric_normal
+            if wp.dot(up, outward) > 0.0:
+                up = -up
+            leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
+            start = offset_origin(proxy.point, up, leaving, proxy.error)
+            if not occluded_by_objects(scene, start, leaving, FAR):
+                at = find_in_frame(
+                    params, frame.shape[0], frame.shape[1], scene, room.probes, proxy.point, proxy.geometric_normal
+                )
+                if at[0] >= 0.0:
+                    received = look_up(frame, decode_table, at[0], at[1])
+                else:
+                    received = sample_latlong(room.environment, outward)
+                if is_rough:
+                    if wp.static(config.diffuse == "sh"):
+                        received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
+                    if wp.static(config.diffuse == "map"):
+                        received = sample_latlong(room.irradiance_map, normal) / wp.pi
+        elif other.shape >= 0:
+            received = shade_unoccluded(scene, room, other, outward)
+        elif is_rough:
+            if wp.static(config.diffuse == "sh"):
+                received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
+            if wp.static(config.diffuse == "map"):
+                received = sample_latlong(room.irradiance_map, normal) / wp.pi
+        else:
+            if wp.static(config.specular):
+                received = mirrored(room, surface.model, surface.roughness, surface.shininess, outward)
+        return wp.cw_mul(weight, received)
+
+    return bounced
+
+
+@wp.func
+def surface_key(scene: RayScene, hit: Hit) -> wp.int32:
+    """Number that neighbours on one surface share: the proxy, and the face of a box."""
+    shape = scene.proxies[hit.shape]
+    key = 8 * hit.shape
+    if shape.kind == MESH:
+        key += MESH_KEY
+    if shape.kind == BOX:
+        local = wp.transpose(shape.rotation) * hit.geometric_normal
+        for axis in range(3):
+            if wp.abs(local[axis]) > 0.7:
+                key += 2 * axis + wp.where(local[axis] > 0.0, 1, 0)
+    return key
+
+
+@functools.cache
+def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    if config.count > CHUNK and config.count % CHUNK:
+        raise ValueError(f"count is {config.count}; expected up to {CHUNK} or a multiple of it")
+    trace = make_trace(config.room.trace)
+    closest_proxy, closest_object = trace.closest_proxy, trace.closest_object
+    occluded_by_objects, occluded_by_proxies = trace.occluded_by_objects, trace.occluded_by_proxies
+    bounced = make_bounced(config.room)
+    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
+    side = config.side
+    chunk = min(config.count, CHUNK)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def room_shadow_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        stride: wp.int32,
+        # Out:
+        ratio_out: wp.array2d[wp.vec4],
+        surface_out: wp.array2d[wp.int32],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        row = wp.min(i * stride + stride / 2, rays.shape[0] - 1)
+        column = wp.min(j * stride + stride / 2, rays.shape[1] - 1)
+        surface_out[i, j] = -1
+        rect = params[0].shadow_rect
+        # The filter looks half a tile beyond the pixels that it writes.
+        margin = stride * wp.static(config.side)
+        wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
+        if rect[0] >= rect[1] or not inside_rect(row, column, wide):
+            return
+        ray = rays[row, column]
+        direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+            return
+        if wp.static(config.room.probes):
+            if meets_probe(room.probes, params[0].camera_position, direction, hit.t):
+                return
+        surface_out[i, j] = surface_key(scene, hit)
+        ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+
+        point = hit.point
+        own = hit.shape
+        everywhere = wp.uint64(0) - wp.uint64(1)
+        without = wp.vec3(0.0)
+        with_objects = wp.vec3(0.0)
+        first = wp.static(config.count) * ((i % side) * side + j % side)
+        for part in range(wp.static(config.count // chunk)):
+            at = first + part * wp.static(chunk)
+            virtual_mask = wp.uint64(0)
+            for index in range(scene.objects.shape[0]):
+                shape = scene.objects[index]
+                virtual_mask = virtual_mask | mask_cone(
+                    directions, at, wp.static(chunk), shape.position - point, bounding_radius(shape)
+                )
+            if wp.static(config.count == chunk):
+                if virtual_mask == wp.uint64(0):
+                    return
+            proxy_mask = wp.uint64(0)
+            for index in range(scene.proxies.shape[0]):
+                shape = scene.proxies[index]
+                if shape.kind == PLANE:
+                    if index != own:
+                        proxy_mask = everywhere
+                elif shape.kind != BOX or index != own:
+                    proxy_mask = proxy_mask | mask_cone(
+                        directions, at, wp.static(chunk), shape.position - point, bounding_radius(shape)
+                    )
+            ball_mask = wp.uint64(0)
+            if wp.static(config.room.probes):
+                for index in range(room.probes.shape[0]):
+                    probe = room.probes[index]
+                    ball_mask = ball_mask | mask_cone(
+                        directions, at, wp.static(chunk), probe.center - point, probe.radius
+                    )
+
+            for k in range(wp.static(chunk)):
+                sample = samples[at + k]
+                toward = sample_toward(sample, point)
+                cosine = wp.dot(hit.normal, toward.direction)
+                if cosine > 0.0 and wp.dot(hit.geometric_normal, toward.direction) > 0.0:
+                    weight = cosine * toward.measure
+                    bit = wp.uint64(1) << wp.uint64(k)
+                    origin = offset_origin(point, hit.geometric_normal, toward.direction, hit.error)
+                    reach = toward.distance
+                    radiance = sample.radiance
+                    if (ball_mask & bit) != wp.uint64(0):
+                        radiance = wp.vec3(0.0)
+                    elif (proxy_mask & bit) != wp.uint64(0):
+                        if wp.static(config.bounce):
+                            proxy = closest_proxy(scene, origin, toward.direction, reach)
+                            if proxy.shape >= 0:
+                                reach = proxy.t
+                                radiance = wp.vec3(0.0)
+                                pixel = find_in_frame(
+                                    params[0],
+                                    frame.shape[0],
+                                    frame.shape[1],
+                                    scene,
+                                    room.probes,
+                                    proxy.point,
+                                    proxy.geometric_normal,
+                                )
+                                if pixel[0] >= 0.0:
+                                    radiance = look_up(frame, decode_table, pixel[0], pixel[1])
+                        else:
+                            if occluded_by_proxies(scene, origin, toward.direction, reach):
+                                radiance = wp.vec3(0.0)
+                    without += weight * radiance
+                    if (virtual_mask & bit) != wp.uint64(0):
+                        if wp.static(config.bounce):
+                            other = closest_object(scene, origin, toward.direction, reach)
+                            if other.shape >= 0:
+                                seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
+                                radiance = bounced(
+                                    params[0], frame, decode_table, scene, room, other, toward.direction, seed
+                                )
+                        else:
+                            if occluded_by_objects(scene, origin, toward.direction, reach):
+                                radiance = wp.vec3(0.0)
+                    with_objects += weight * radiance
+        ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
+        for channel in range(3):
+            if without[channel] > MIN_IRRADIANCE:
+                ratio[channel] = wp.min(with_objects[channel] / without[channel], MAX_RATIO)
+        ratio_out[i, j] = ratio
+
+    return room_shadow_kernel
+
+
+@wp.kernel(enable_backward=False)
+def filter_ratio_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    ratio: wp.array2d[wp.vec4],
+    surface: wp.array2d[wp.int32],
+    side: wp.int32,
+    stride: wp.int32,
+    # Out:
+    physical_ratio_out: wp.array2d[wp.vec3],
+):
+    """Mean over one tile's worth of neighbours on the same surface."""
+    i, j = wp.tid()
+    i += row_start
+    one = wp.vec3(1.0, 1.0, 1.0)
+    physical_ratio_out[i, j] = one
+    if not inside_rect(i, j, params[0].shadow_rect):
+        return
+    ci = wp.min(i / stride, ratio.shape[0] - 1)
+    cj = wp.min(j / stride, ratio.shape[1] - 1)
+    key = surface[ci, cj]
+    if key < 0:
+        return
+    # Continuous coordinates in cells. The window is a box of `side` cells with soft ends: a cell at distance d counts
+    # clamp(side / 2 + 1/2 - d, 0, 1), so that every set has the same weight wherever the window lies.
+    y = (wp.float32(i) - wp.float32(stride / 2)) / wp.float32(stride)
+    x = (wp.float32(j) - wp.float32(stride / 2)) / wp.float32(stride)
+    half = 0.5 * wp.float32(side) + 0.5
+    depth = ratio[ci, cj][3]
+    total = wp.vec3(0.0)
+    weights = float(0.0)
+    for ni in range(wp.max(wp.int32(wp.ceil(y - half)), 0), wp.min(wp.int32(wp.floor(y + half)) + 1, ratio.shape[0])):
+        vertical = wp.min(half - wp.abs(wp.float32(ni) - y), 1.0)
+        for nj in range(
+            wp.max(wp.int32(wp.ceil(x - half)), 0), wp.min(wp.int32(wp.floor(x + half)) + 1, ratio.shape[1])
+        ):
+            if surface[ni, nj] == key:
+                value = ratio[ni, nj]
+                weight = vertical * wp.min(half - wp.abs(wp.float32(nj) - x), 1.0)
+                # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
+                if key % 8 == MESH_KEY and wp.abs(value[3] - depth) > DEPTH_STEP * depth:
+                    weight = 0.0
+                total += weight * wp.vec3(value[0], value[1], value[2])
+                weights += weight
+    if weights > 0.0:
+        physical_ratio_out[i, j] = total / weights
+
+
+def shade_room(
+    config: RoomShadowConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    scene: RayScene,
+    room: Room,
+    directions: wp.array[wp.vec3],
+    samples: wp.array[RoomSample],
+    stride: int,
+    ratio_out: wp.array2d[wp.vec4],
+    surface_out: wp.array2d[wp.int32],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
+
+    Args:
+        config: What the scene calls for.
+        params: (1,) FrameParams: camera and shadow_rect.
+        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+        frame: (H, W) the camera's frame, RGB.
+        decode_table: (256,) of ``color.decode_table``.
+        scene: Objects and proxies.
+        room: The room's light; what ``config.room`` leaves out may be empty.
+        directions: (config.side^2 * config.count,) directions of the samples, set after set.
+        samples: (the same) the samples.
+        stride: Pixels from one estimate to the next.
+        ratio_out: (ceil(H / stride), ceil(W / stride)) RGB ratio and depth.
+        surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
+        rows: Band of rows of the outputs; None means all.
+    """
+    launch_rows(
+        make_room_shadow_kernel(config),
+        ratio_out.shape,
+        [params, rays, frame, decode_table, scene, room, directions, samples, stride],
+        [ratio_out, surface_out],
+        rows=rows,
+        device=rays.device,
+    )
+
+
+def filter_ratio(
+    params: wp.array[FrameParams],
+    ratio: wp.array2d[wp.vec4],
+    surface: wp.array2d[wp.int32],
+    side: int,
+    stride: int,
+    physical_ratio_out: wp.array2d[wp.vec3],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded.
+
+    Args:
+        params: (1,) FrameParams: shadow_rect.
+        ratio: From ``shade_room``.
+        surface: From ``shade_room``.
+        side: Cells along a tile.
+        stride: Pixels per cell.
+        physical_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        filter_ratio_kernel,
+        physical_ratio_out.shape,
+        [params, ratio, surface, side, stride],
+        [physical_ratio_out],
+        rows=rows,
+        device=ratio.device,
+    )

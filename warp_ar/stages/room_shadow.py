@@ -1,0 +1,163 @@
+"""What virtual objects do to the room's light on the desk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import room_shadow
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.composite import shades_room
+from warp_ar.stages.room_samples import REFERENCE_SIZE
+from warp_ar.stages.shade import DFG_SIZE, shade_config
+from warp_ar.stages.visibility import GrowingRows
+
+
+@dataclasses.dataclass(frozen=True)
+class Rung:
+    """How many rays, for how many pixels."""
+
+    count: int
+    """Samples of the room per estimate."""
+    side: int
+    """Estimates along a tile."""
+    stride: int
+    """Pixels from one estimate to the next."""
+    bounce: bool
+    """Whether objects reflect light onto the desk."""
+
+
+RUNGS: Mapping[str, Rung] = {
+    "half": Rung(64, 4, 2, False),
+    "sampled": Rung(64, 4, 1, False),
+    "bounce": Rung(64, 4, 1, True),
+    "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),
+}
+"""Cheapest first, after ``none``."""
+
+
+def room_config(request: Request) -> RoomConfig:
+    """Forms of the room's light that exist for the objects of a request."""
+    shading = shade_config(request)
+    return RoomConfig(
+        trace=shading.trace,
+        models=shading.models,
+        textures=shading.textures,
+        diffuse=shading.room_diffuse,
+        specular=shading.room_specular,
+        probes=bool(request.scene.probes),
+    )
+
+
+def room_reads(config: RoomConfig) -> tuple[str, ...]:
+    """Resources that hold the forms of a ``RoomConfig``."""
+    reads = ["environment"]
+    if config.diffuse != "none":
+        reads.append(f"irradiance_{config.diffuse}")
+    if config.specular:
+        reads.append("specular_levels")
+    return tuple(reads)
+
+
+def make_room(config: RoomConfig, request: Request, arrays: Arrays, dfg: Any) -> Room:
+    """The room's light as kernels read it."""
+    room = Room()
+    room.environment = arrays["environment"]
+    if config.diffuse == "sh":
+        room.irradiance_sh = arrays["irradiance_sh"]
+    if config.diffuse == "map":
+        room.irradiance_map = arrays["irradiance_map"]
+    if config.specular:
+        room.levels = arrays["specular_levels"]
+    room.level_height = request.quality.environment_height
+    if dfg is not None:
+        room.dfg = dfg
+    room.probes = arrays["probes"]
+    return room
+
+
+class RoomShadow(Stage):
+    """A factor on the frame: the room's light with the virtual objects over that without them."""
+
+    name: ClassVar[str] = "room_shadow"
+    rungs: ClassVar[tuple[str, ...]] = ("none", *RUNGS)
+    summary: ClassVar[str] = "shadows of virtual objects on the desk under the room's light"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Needs something that throws a shadow, something that it falls on, and light."""
+        scene = request.scene
+        if not scene.objects:
+            return LeftOut("the scene has no virtual object")
+        if not scene.proxies:
+            return LeftOut("the scene has no proxy for a shadow to fall on")
+        if not scene.probes:
+            return LeftOut("the scene has no probe, so the room's light is unknown")
+        if not shades_room(request):
+            return LeftOut(f"the quality {request.quality.name!r} leaves out shadows of the room's light")
+        reads = ["pose", "objects", "room_samples"]
+        if RUNGS[request.quality.rung(cls.name)].bounce:
+            reads += ["frame", *room_reads(room_config(request))]
+        return Wiring(tuple(reads), ("physical_ratio",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The ratio, and the estimates that it is averaged from."""
+        width, height = self.request.size
+        stride = RUNGS[self.rung].stride
+        cells = -(-height // stride), -(-width // stride)
+        specs = {
+            "physical_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
+            "room_shadow_ratio": ArraySpec(cells, wp.vec4),
+            "room_shadow_surface": ArraySpec(cells, wp.int32, -1),
+        }
+        if METALLIC_ROUGHNESS in room_config(self.request).models:
+            specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Estimates, then their mean."""
+        rung = RUNGS[self.rung]
+        forms = room_config(self.request)
+        if not rung.bounce:
+            forms = dataclasses.replace(forms, diffuse="none", specular=False)
+        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce)
+        room_shadow.make_room_shadow_kernel(config)
+        dfg = arrays.get("room_shadow_dfg")
+        if dfg is not None:
+            integrate_dfg(dfg)
+        room = make_room(forms, self.request, arrays, dfg)
+        ratio, surface, out = (arrays[name] for name in ("room_shadow_ratio", "room_shadow_surface", "physical_ratio"))
+        inputs = [arrays[name] for name in ("params", "rays", "frame", "decode", "ray_scene")]
+        shadow_rows = arrays["shadow_rows"]
+
+        def cells() -> Rows:
+            start, stop = shadow_rows()
+            reach = rung.side  # the filter looks beyond the rows that it writes
+            return max(start // rung.stride - reach, 0), min(-(-stop // rung.stride) + reach, ratio.shape[0])
+
+        def estimate(rows: Rows | None) -> None:
+            room_shadow.shade_room(
+                config,
+                *inputs,
+                room,
+                arrays["room_samples_directions"],
+                arrays["room_samples"],
+                rung.stride,
+                ratio,
+                surface,
+                rows=rows,
+            )
+
+        def average(rows: Rows | None) -> None:
+            room_shadow.filter_ratio(arrays["params"], ratio, surface, rung.side, rung.stride, out, rows=rows)
+
+        return [
+            Pass(estimate, rows=ratio.shape[0], extent=cells),
+            Pass(average, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
+        ]
