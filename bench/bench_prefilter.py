@@ -1,0 +1,103 @@
+"""Prefiltered reflections: the time of every rung, and its error on a made-up room of a window, a lamp and a sun.
+
+``WARP_AR_SHARED=FOLDER`` adds the real rooms in ``FOLDER/hdri``. The error is the relative RMS of each level against
+``brute_force``, averaged over the levels after the mirror.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from bench.common import measure, report
+from bench.rooms import rooms
+from warp_ar.kernels import prefilter, pyramid
+
+HEIGHTS = (32, 64)
+SAMPLES = (8, 32, 128)
+
+
+def rungs(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str, tuple[Any, wp.array]]:
+    """Work and output of every rung."""
+    height = environment.shape[0]
+
+    def levels() -> wp.array:
+        return wp.zeros(prefilter.lobe_texels(height), dtype=wp.vec3, device=device)
+
+    box = wp.zeros(pyramid.packed_texels(height, 2 * height), dtype=wp.vec3, device=device)
+    row_energy = wp.zeros(prefilter.lobe_rows(height), dtype=wp.vec3, device=device)
+    energy = wp.zeros(prefilter.lobe_count(height), dtype=wp.vec3, device=device)
+
+    def mix(numbers: np.ndarray, smooth: bool) -> tuple[Any, wp.array]:
+        out, weights = levels(), wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
+
+        def function() -> None:
+            pyramid.build_pyramid(environment, box, isotropic=smooth)
+            prefilter.mix_mips(box, weights, height, out, smooth=smooth)
+            if smooth:
+                prefilter.measure_energy(out, height, row_energy, energy)
+                prefilter.scale_levels(energy, height, out)
+
+        return function, out
+
+    def sample(count: int) -> tuple[Any, wp.array]:
+        out, samples = levels(), prefilter.make_lobe_samples(height, lobe, count, device)
+
+        def function() -> None:
+            pyramid.build_pyramid(environment, box, isotropic=True)
+            prefilter.sample_lobes(box, samples, height, out)
+            prefilter.measure_energy(out, height, row_energy, energy)
+            prefilter.scale_levels(energy, height, out)
+
+        return function, out
+
+    exact = levels()
+    return {
+        "box_mip": mix(prefilter.box_weights(height), False),
+        "energy_mip": mix(prefilter.mip_weights(height, lobe), True),
+        **{f"fis{count}": sample(count) for count in SAMPLES},
+        "brute_force": (lambda: prefilter.integrate_lobes(environment, lobe, exact), exact),
+    }
+
+
+def mean_error(values: np.ndarray, exact: np.ndarray, height: int) -> float:
+    """Relative RMS error, averaged over the levels after the mirror."""
+    errors = []
+    for level in range(1, prefilter.lobe_count(height)):
+        rows, columns = prefilter.lobe_size(height, level)
+        start = prefilter.lobe_offset(height, level)
+        ours, truth = (a[start : start + rows * columns].reshape(rows, columns, 3) for a in (values, exact))
+        weight = np.sin(np.pi * (np.arange(rows) + 0.5) / rows)[:, None, None]
+        errors.append(math.sqrt((weight * (ours - truth) ** 2).sum() / (weight * truth**2).sum()))
+    return round(float(np.mean(errors)), 4)
+
+
+def main(device: str) -> None:
+    for height in HEIGHTS:
+        for lobe in ("ggx", "phong"):
+            errors: dict[str, dict[str, float]] = {}
+            work: dict[str, tuple[Any, wp.array]] = {}
+            for room, environment in rooms(height, device).items():
+                work = rungs(environment, lobe, device)
+                results = {}
+                for name, (function, output) in work.items():
+                    function()
+                    results[name] = output.numpy().astype(np.float64)
+                for name, values in results.items():
+                    errors.setdefault(name, {})[room] = mean_error(values, results["brute_force"], height)
+            assert all(error < 0.3 for error in errors["fis128"].values())
+            contenders = {name: function for name, (function, _) in work.items()}
+            if wp.get_device(device).is_cpu:
+                # Seconds a run: its error is known to be none, its time is taken once.
+                times = {
+                    "brute_force": measure({"brute_force": contenders.pop("brute_force")}, device, 3)["brute_force"]
+                }
+            else:
+                times = {}
+            for name, milliseconds in (measure(contenders, device) | times).items():
+                report(
+                    f"prefilter {lobe} {name} {height}x{2 * height}", milliseconds, device, relative_rms=errors[name]
+                )
