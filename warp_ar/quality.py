@@ -40,9 +40,9 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
         for preset in (
             _preset("paper", 64, 4, diffuse="top_mip", specular="box_mip", relight="relief"),
             _preset("low", 32, 1, diffuse="sh2", specular="box_mip", relight="relief"),
-            _preset("medium", 64, 4, diffuse="sh2", specular="box_mip", relight="relief"),
-            _preset("high", 128, 16, diffuse="sh2", specular="box_mip", relight="relief"),
-            _preset("reference", 256, 16, diffuse="sh2", specular="box_mip", relight="relief"),
+            _preset("medium", 64, 4, diffuse="sh2", specular="box_mip", relight="reflectance"),
+            _preset("high", 128, 16, diffuse="sh2", specular="box_mip", relight="reflectance"),
+            _preset("reference", 256, 16, diffuse="sh2", specular="box_mip", relight="reflectance"),
         )
     }
 )

@@ -12,6 +12,7 @@ from warp_ar.kernels import irradiance, pyramid
 from warp_ar.quality import Quality
 from warp_ar.ray_scene import reflects_diffusely
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.unwrap import NO_PROBE
 
 TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
@@ -33,12 +34,11 @@ class Diffuse(Stage):
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Read the environment, write irradiance in the form of the rung."""
-        if not request.scene.objects:
-            return LeftOut("the scene has no virtual object")
-        if not request.scene.probes:
+        scene = request.scene
+        if not scene.probes:
             return LeftOut("the scene has no probe, so the room's light is unknown")
-        if not any(reflects_diffusely(item.material) for item in request.scene.objects):
-            return LeftOut("no virtual object has a diffuse material")
+        if not scene.lights and not any(reflects_diffusely(item.material) for item in scene.objects):
+            return LeftOut("no virtual object is diffuse, and no virtual light asks for the desk's reflectance")
         return Wiring(("environment",), (diffuse_output(request.quality),))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -26,7 +26,7 @@ class Relight(Stage):
             return LeftOut("the scene has no virtual light")
         if not request.scene.proxies:
             return LeftOut("the scene has no proxy for virtual light to fall on")
-        rung = request.quality.rung(cls.name)
+        rung = relight_rung(request)
         reads = ["pose", "lights", "objects"]
         if rung != "flat":
             reads += ["frame", "key_lights"]
@@ -45,7 +45,7 @@ class Relight(Stage):
         """One pass over the rows that light can reach."""
         form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
         scene = self.request.scene
-        config = relight.RelightConfig(self.rung, trace_config(scene), form, bool(scene.probes))  # type: ignore[arg-type]
+        config = relight.RelightConfig(relight_rung(self.request), trace_config(scene), form, bool(scene.probes))  # type: ignore[arg-type]
         relight.make_relight_kernel(config)
 
         def launch(rows: Rows | None) -> None:
@@ -66,6 +66,11 @@ class Relight(Stage):
             )
 
         return [Pass(launch, rows=self.request.size[1], extent=_with_previous(arrays["light_rows"]))]
+
+
+def relight_rung(request: Request) -> str:
+    """The quality's rung, or ``flat`` where no ball tells anything of the room."""
+    return request.quality.rung(Relight.name) if request.scene.probes else relight.RUNGS[0]
 
 
 def irradiance_name(request: Request) -> str:
