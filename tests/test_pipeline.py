@@ -72,7 +72,10 @@ def run(pipeline: Pipeline, images: Frames) -> list[Result]:
 
 def test_numpy_and_warp_frames_give_the_same(frames: Frames, device: str) -> None:
     scene = make_scene()
-    with Pipeline(scene, device=device, quality="low") as first, Pipeline(scene, device=device, quality="low") as second:
+    with (
+        Pipeline(scene, device=device, quality="low") as first,
+        Pipeline(scene, device=device, quality="low") as second,
+    ):
         for image in frames:
             array = wp.array(image, dtype=wp.vec3ub, device=device)
             np.testing.assert_array_equal(first(image).image, second(array).image)
@@ -162,13 +165,80 @@ def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected
 
 
 def test_wrong_warp_frame_is_refused() -> None:
-    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline, pytest.raises(UsageError, match="of vec3ub on cpu"):
+    with (
+        Pipeline(make_scene(), device="cpu", quality="low") as pipeline,
+        pytest.raises(UsageError, match="of vec3ub on cpu"),
+    ):
         pipeline(wp.zeros((240, 320), dtype=wp.vec3, device="cpu"))
 
 
 def test_captured_graph_equals_eager(frames: Frames, device: str) -> None:
     """On CUDA the scheduler replays graphs; the same stages launched one by one must give the same bits."""
-    with Pipeline(make_scene(), device=device, quality="low") as replayed, Pipeline(make_scene(), device=device, quality="low") as eager:
+    with (
+        Pipeline(make_scene(), device=device, quality="low") as replayed,
+        Pipeline(make_scene(), device=device, quality="low") as eager,
+    ):
         eager._scheduler.run = eager._scheduler._run_eager  # type: ignore[method-assign]
         for one, other in zip(run(replayed, frames * 2), run(eager, frames * 2), strict=True):
             np.testing.assert_array_equal(one.image, other.image)
+
+
+def edited(scene: Scene) -> Scene:
+    """Other numbers everywhere, the same structure."""
+    sphere, torus = scene.objects
+    return dataclasses.replace(
+        scene,
+        objects=(
+            dataclasses.replace(sphere, at=(0.07, 0.04, 0.04), radius=0.04, material=LambertMaterial((0.1, 0.9, 0.2))),
+            dataclasses.replace(
+                torus, rotate=(40.0, 0.0, 0.0), material=MetallicRoughnessMaterial((0.9, 0.9, 0.9), 1.0, 0.1)
+            ),
+        ),
+        lights=(dataclasses.replace(scene.lights[0], at=(0.1, 0.1, 0.2), color=(1.0, 0.2, 0.1)),),
+        exposure=Exposure(0.5),
+    )
+
+
+def test_update_equals_a_new_pipeline(frames: Frames, device: str) -> None:
+    """After numbers are edited in place, the picture is the one that a pipeline built for them gives, bit for bit."""
+    scene = make_scene()
+    with (
+        Pipeline(scene, device=device, quality="low") as live,
+        Pipeline(edited(scene), device=device, quality="low") as new,
+    ):
+        before, expected = run(live, frames[:2]), run(new, frames[:2])
+        assert (before[1].image != expected[1].image).any()
+        assert live.update(edited(scene))
+        np.testing.assert_array_equal(live(frames[2], time_seconds=0.1).image, new(frames[2], time_seconds=0.1).image)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"lights": ()},
+        {"objects": ()},
+        {"probes": ()},
+        {"exposure": Exposure(1.0)},
+        {"lights": (Light("directional", 1.0, direction=(0.0, 0.0, -1.0)),)},
+        {"marker": Marker(size=0.05)},
+    ],
+)
+def test_update_refuses_what_needs_other_kernels_or_arrays(changes: dict[str, object], frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
+        before = pipeline(frames[0], time_seconds=0.0).image
+        assert not pipeline.update(make_scene(**changes))
+        np.testing.assert_array_equal(pipeline(frames[0], time_seconds=0.0).image, before)
+
+
+def test_a_new_pipeline_continues_with_the_light(frames: Frames) -> None:
+    outputs = ("image", "environment")
+    with (
+        Pipeline(make_scene(), device="cpu", quality="low", outputs=outputs) as old,
+        Pipeline(make_scene(lights=()), device="cpu", quality="low", outputs=outputs) as new,
+    ):
+        run(old, frames)
+        light = old.arrays["environment_radiance"].numpy().copy()
+        new.continue_from(old)
+        np.testing.assert_array_equal(new.arrays["environment_radiance"].numpy(), light)
+        result = new(np.full_like(frames[0], 90), time_seconds=9.0)  # no marker in sight: the kept light is still there
+        assert result.environment_array is not None

@@ -17,15 +17,18 @@ import warp as wp
 from warp_ar.device import resolve_device
 from warp_ar.errors import UsageError
 from warp_ar.frame_block import FrameBlock
-from warp_ar.graph import Plan, make_plan
+from warp_ar.graph import make_plan
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.ray_scene import HostScene
+from warp_ar.ray_scene import HostScene, skeleton
 from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
 from warp_ar.stages.base import Arrays, Request
 from warp_ar.tracking import Pose, Tracker, TrackState
+
+LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
+"""What is remembered of the room's light from frame to frame."""
 
 TRACK = "track"
 """Name of the host's own stage in reports: the marker's pose."""
@@ -39,9 +42,9 @@ class Result:
     """What one frame became."""
 
     image_array: Any
-    """The lit frame, (height, width) of three 8-bit RGB values, on the pipeline's device; valid until the next call."""
+    """The lit frame, (height, width) of 8-bit RGB, on the pipeline's device; valid until the next call."""
     environment_array: Any
-    """The room's light, a latlong map of linear RGB radiance (rows, columns), or None if it was not asked for or not seen yet."""
+    """The room's light, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
     pose: Pose | None
     """From marker to camera; None while the marker is lost or when nothing needed it."""
     state: TrackState | None
@@ -95,7 +98,7 @@ class Pipeline:
             scene: What to show.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name or a value of one's own.
-            size: Width and height of the frames; None means the scene's. Another size must scale the scene's camera exactly.
+            size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
             bands: Bands of rows per CPU pass; None means one per core.
 
@@ -122,7 +125,9 @@ class Pipeline:
     def __enter__(self) -> Pipeline:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -163,8 +168,53 @@ class Pipeline:
         params["focal"] = (self.camera.fx, self.camera.fy)
         params["principal"] = (self.camera.cx, self.camera.cy)
         params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
-        scale = self.scene.exposure.scale
-        params["exposure_scale"] = 1.0 if isinstance(scale, str) else scale
+        self._write_exposure(self.scene)
+
+    def update(self, scene: Scene) -> bool:
+        """Show another scene from the next frame on, if it differs in numbers alone.
+
+        Positions, sizes, colours, intensities, the values of materials and the scale of the exposure are numbers. What
+        adds or drops a stage or calls for another kernel is not: build a new pipeline, which can ``continue_from`` this
+        one.
+
+        Args:
+            scene: The new scene; its camera is scaled as it was in the constructor.
+
+        Returns:
+            False if the scene needs a new pipeline; nothing has changed then.
+
+        Raises:
+            SceneError: The scene's camera does not fit the size of the frames.
+        """
+        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
+        request = dataclasses.replace(self.plan.request, scene=scene)
+        if skeleton(scene) != skeleton(self.scene):
+            return False
+        plan = make_plan(request)
+        if plan.stages != self.plan.stages:
+            return False
+        if scene.exposure != self.scene.exposure:
+            self._write_exposure(scene)
+        if scene.objects != self.scene.objects or scene.lights != self.scene.lights:
+            self._host_scene.update(scene)
+            self._arrays.touch("objects")
+        self.scene, self.plan = scene, plan
+        return True
+
+    def continue_from(self, other: Pipeline) -> None:
+        """Go on where another pipeline stopped: its clock and, where they fit, its track of the marker and its light."""
+        self._start_time, self._last_time = other._start_time, other._last_time
+        if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
+            self._tracker = other._tracker
+        kept = [name for name in LIGHT_ARRAYS if name in self._arrays and name in other._arrays]
+        if other._has_light and kept and self._arrays[kept[0]].shape == other._arrays[kept[0]].shape:
+            for name in kept:
+                wp.copy(self._arrays[name], other._arrays[name])
+            self._has_light = True
+
+    def _write_exposure(self, scene: Scene) -> None:
+        scale = scene.exposure.scale
+        self._block.host("params")["exposure_scale"] = 1.0 if isinstance(scale, str) else scale
         self._arrays.touch("exposure")
 
     def _probe_values(self) -> npt.NDArray[Any]:
@@ -230,13 +280,21 @@ class Pipeline:
             inverse = pose.inverse()
             params["camera_position"] = inverse.translation
             params["world_from_camera"] = inverse.rotation
-        if self._host_scene.write_lights(self._block.host("lights"), now - (self._start_time or 0.0)) or self._index == 0:
+        if (
+            self._host_scene.write_lights(self._block.host("lights"), now - (self._start_time or 0.0))
+            or self._index == 0
+        ):
             touched.append("lights")
-        if self._host_scene.write_objects(self._block.host("objects"), now - (self._start_time or 0.0)) or self._index == 0:
+        if (
+            self._host_scene.write_objects(self._block.host("objects"), now - (self._start_time or 0.0))
+            or self._index == 0
+        ):
             touched.append("objects")
-        moved = pose is not None and (params["camera_position"] != before["camera_position"]).any() | (
-            params["world_from_camera"] != before["world_from_camera"]
-        ).any()
+        moved = (
+            pose is not None
+            and (params["camera_position"] != before["camera_position"]).any()
+            | (params["world_from_camera"] != before["world_from_camera"]).any()
+        )
         if moved or self._arrays.version("pose") == 0:
             touched.append("pose")
         if pose is not None:
@@ -270,7 +328,7 @@ class Pipeline:
 
 
 def pixel_rays(camera: Camera) -> npt.NDArray[np.float32]:
-    """Normalised image coordinates (x / z, y / z) of every pixel centre with the lens distortion undone, (height, width, 2)."""
+    """Normalised coordinates (x / z, y / z) of every pixel centre, lens distortion undone, (height, width, 2)."""
     columns, rows = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)

@@ -125,6 +125,23 @@ def has_textures(scene: scenes.Scene) -> bool:
     )
 
 
+def skeleton(scene: scenes.Scene) -> Any:
+    """What of a scene arrays and kernels are made for; scenes that share it differ in numbers alone."""
+    objects = tuple(
+        (
+            thing.shape,
+            _mesh_key(thing),
+            type(thing.material),
+            tuple(value for value in vars(thing.material).values() if isinstance(value, Path)),
+            reflects_diffusely(thing.material),
+            reflects_glossily(thing.material),
+        )
+        for thing in scene.objects
+    )
+    lights = tuple(light.kind for light in scene.lights)
+    return scene.camera, scene.marker, scene.probes, scene.proxies, objects, lights
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class RayMesh:
     """A mesh that rays can meet, moved so that the centre of its bounding box is its origin."""
@@ -216,17 +233,12 @@ class HostScene:
         textures = _Textures()
         self._objects = self._shape_records(scene.objects, device)
         self._proxies = self._shape_records(scene.proxies, device)
-        materials = np.zeros(len(scene.objects), _dtype(structs.Material))
-        for index, thing in enumerate(scene.objects):
-            self._fill_material(materials[index], thing, textures)
-        self._objects["material"] = np.arange(len(scene.objects))
-        # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
-        self._centers = [
-            record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
-            for record, key in zip(self._objects, map(_mesh_key, scene.objects), strict=True)
-        ]
+        self._textures = textures
+        materials = self._material_records()
+        self._place_objects()
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: list[FloatArray] | None = None
+        self._lights_edited = False
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_lights(np.zeros_like(self._lights), 0.0)
 
@@ -243,6 +255,29 @@ class HostScene:
         ray_scene.vertex_normals = _vectors([mesh.normals for mesh in meshes], 3, wp.vec3, device)
         ray_scene.vertex_uvs = _vectors([mesh.uvs for mesh in meshes], 2, wp.vec2, device)
         self.ray_scene = ray_scene
+
+    def update(self, scene: scenes.Scene) -> None:
+        """Take the numbers of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
+        self.scene = scene
+        self._objects = self._shape_records(scene.objects, self.ray_scene.materials.device)
+        self._place_objects()
+        self.ray_scene.materials.assign(self._material_records())
+        self._lit = None
+        self._lights_edited = True
+
+    def _place_objects(self) -> None:
+        self._objects["material"] = np.arange(len(self.scene.objects))
+        # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
+        self._centers = [
+            record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
+            for record, key in zip(self._objects, map(_mesh_key, self.scene.objects), strict=True)
+        ]
+
+    def _material_records(self) -> npt.NDArray[Any]:
+        records = np.zeros(len(self.scene.objects), _dtype(structs.Material))
+        for record, thing in zip(records, self.scene.objects, strict=True):
+            self._fill_material(record, thing, self._textures)
+        return records
 
     def _shape_records(self, things: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
         """Records of ``structs.Shape`` with all that does not move."""
@@ -315,7 +350,7 @@ class HostScene:
     def write_lights(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
         """Write the virtual lights as they stand ``seconds`` after the first frame; arguments as ``write_objects``."""
         for record, light in zip(self._lights, self.scene.lights, strict=True):
-            if light.animate is None and seconds != 0.0:
+            if light.animate is None and seconds != 0.0 and not self._lights_edited:
                 continue
             self._lit = None
             record["position"], record["direction"] = light.pose_at(seconds)
@@ -323,6 +358,7 @@ class HostScene:
             record["intensity"] = light.intensity * np.array(light.color)
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius
+        self._lights_edited = False
         return _update(records_out, self._lights)
 
     def object_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
