@@ -14,7 +14,7 @@ from warp_ar.kernels.pyramid import reduce_latlong
 
 
 def made_up_room(height: int) -> np.ndarray:
-    """Dim walls, a window, a lamp of four degrees and a sun of half a degree, at 512 rows or more; (rows, 2 rows, 3)."""
+    """Dim walls, a window, a lamp of four degrees and a sun of half a degree, 512 rows or more, (rows, 2 rows, 3)."""
     fine = max(height, 512)
     theta = np.pi * (np.arange(fine)[:, None] + 0.5) / fine
     phi = (np.arange(2 * fine)[None, :] + 0.5) * np.pi / fine - np.pi

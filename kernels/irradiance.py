@@ -229,6 +229,12 @@ def sphere_minimum(q: wp.vec3, b: wp.vec3, c: wp.float32) -> wp.float32:
     return value
 
 
+@wp.func
+def sh_window(strength: wp.float32) -> wp.vec2:
+    """Factors on the coefficients of l = 1 and l = 2."""
+    return wp.vec2(1.0 / (1.0 + strength), 1.0 / (1.0 + 0.7 * strength))
+
+
 @wp.kernel(enable_backward=False)
 def window_sh_kernel(
     # Out (and in: coefficients as projected):
@@ -252,27 +258,23 @@ def window_sh_kernel(
             ) * (0.5 * 0.48860251 * inverse)
             axes, q = wp.eig3(quadratic)
             b = wp.transpose(axes) * linear
-            w1 = 1.0 / (1.0 + strength)
-            w2 = 1.0 / (1.0 + 0.7 * strength)
-            if sphere_minimum(q * w2, b * w1, 1.0) < 0.0:
+            w = sh_window(strength)
+            if sphere_minimum(q * w[1], b * w[0], 1.0) < 0.0:
                 # The previous channels' strength is not enough: the answer lies between it and one that leaves only the
                 # mean.
                 low = strength
                 high = wp.float32(16.0)
                 for _ in range(WINDOW_STEPS):
                     middle = 0.5 * (low + high)
-                    w1 = 1.0 / (1.0 + middle)
-                    w2 = 1.0 / (1.0 + 0.7 * middle)
-                    if sphere_minimum(q * w2, b * w1, 1.0) < 0.0:
+                    w = sh_window(middle)
+                    if sphere_minimum(q * w[1], b * w[0], 1.0) < 0.0:
                         low = middle
                     else:
                         high = middle
                 strength = high
+    w = sh_window(strength)
     for i in range(1, 9):
-        w = 1.0 / (1.0 + strength)
-        if i > 3:
-            w = 1.0 / (1.0 + 0.7 * strength)
-        irradiance_sh_out[i] = irradiance_sh_out[i] * w
+        irradiance_sh_out[i] = irradiance_sh_out[i] * w[wp.where(i > 3, 1, 0)]
 
 
 @wp.func
