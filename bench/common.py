@@ -23,7 +23,9 @@ def commit() -> str:
     """Short hash of the checkout, with a + where it has uncommitted changes; ``unknown`` outside one."""
     root = Path(__file__).resolve().parent
     try:
-        out = subprocess.run(["git", "describe", "--always", "--dirty=+"], cwd=root, capture_output=True, text=True, check=True)
+        out = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+"], cwd=root, capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return out.stdout.strip()
@@ -41,7 +43,8 @@ def time_once(function: Callable[[], object], device: Any) -> float:
 def measure(functions: Mapping[str, Callable[[], object]], device: Any, runs: int = RUNS) -> dict[str, list[float]]:
     """Time contenders in turn, A B A B ..., after a warm-up; milliseconds of every run.
 
-    On CUDA each function is captured in a graph and the replay is timed with events, so launch overhead in Python does not count.
+    On CUDA each function is captured in a graph and the replay is timed with events: launching from Python does not
+    count.
     """
     device = wp.get_device(device)
     if device.is_cuda:

@@ -1,7 +1,8 @@
 """How every launcher starts its kernel: over all rows, or over one band of them.
 
-A Warp CPU launch uses one thread and releases the interpreter lock, so the scheduler splits a pass into bands of rows and launches them
-side by side. Every per-row kernel therefore takes ``row_start`` as its first input and adds it to its first thread index.
+A Warp CPU launch uses one thread and releases the interpreter lock, so the scheduler splits a pass into bands of rows
+and launches them side by side. Every per-row kernel therefore takes ``row_start`` as its first input and adds it to
+its first thread index.
 """
 
 from __future__ import annotations

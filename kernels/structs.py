@@ -1,4 +1,4 @@
-"""Structures that stages share. Everything that may change from frame to frame lives in one of the four arrays of ``FrameBlock``.
+"""Structures that stages share. What may change from frame to frame lives in the arrays of ``FrameBlock``.
 
 Lengths are metres in the world (marker) frame, angles radians, colours linear RGB.
 """
@@ -78,7 +78,9 @@ class Shape:
     rotation: wp.mat33
     position: wp.vec3
     scale: wp.float32
-    extent: wp.vec3  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
+    extent: (
+        wp.vec3
+    )  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
     mesh: wp.uint64  # id of the wp.Mesh in local space, for MESH
     first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
     material: wp.int32  # index into the materials; -1 for proxies

@@ -35,7 +35,10 @@ def render(name: str, device: str) -> npt.NDArray[np.uint8]:
     scene = load_scene(name)
     assert scene.source is not None
     assert scene.source.path is not None
-    with open_source(scene.source.path) as source, Pipeline(scene, device=device, quality=QUALITY, size=SIZE) as pipeline:
+    with (
+        open_source(scene.source.path) as source,
+        Pipeline(scene, device=device, quality=QUALITY, size=SIZE) as pipeline,
+    ):
         for frame in itertools.islice(source, FRAMES):
             small = cv2.resize(frame.image, SIZE, interpolation=cv2.INTER_AREA)
             result = pipeline(small.astype(np.uint8), time_seconds=frame.time)

@@ -56,7 +56,14 @@ base_color = [0.5, 0.5, 0.5]
 def write_scene(folder: Path, body: str = PROBE + OBJECT, source: str = 'synthetic = "card"', **changes: float) -> Path:
     with Synthetic("card") as card:
         matrix, (width, height) = card.camera_matrix, card.size
-    values = {"width": width, "height": height, "fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    values = {
+        "width": width,
+        "height": height,
+        "fx": matrix[0, 0],
+        "fy": matrix[1, 1],
+        "cx": matrix[0, 2],
+        "cy": matrix[1, 2],
+    }
     path = folder / "scene.toml"
     path.write_text(SCENE.format(body=body, source=source, marker=Synthetic.MARKER_SIZE, **{**values, **changes}))
     return path
@@ -77,7 +84,10 @@ def message(capsys: pytest.CaptureFixture[str]) -> str:
 def test_folder_report_and_environment(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     out, light, report = tmp_path / "out", tmp_path / "light", tmp_path / "reports" / "run.json"
-    assert run(scene, "--headless", "--frames", FRAMES, "--output", out, "--save-environment", light, "--report", report) == 0
+    assert (
+        run(scene, "--headless", "--frames", FRAMES, "--output", out, "--save-environment", light, "--report", report)
+        == 0
+    )
     assert sorted(path.name for path in out.iterdir()) == [f"{index:04d}.png" for index in range(FRAMES)]
     assert sorted(path.name for path in light.iterdir()) == [f"{index:04d}.exr" for index in range(FRAMES)]
     assert read_environment(light / "0000.exr").shape == (32, 64, 3)
@@ -87,7 +97,9 @@ def test_folder_report_and_environment(tmp_path: Path) -> None:
     assert data["warp"]
     assert [frame["index"] for frame in data["frames"]] == list(range(FRAMES))
     assert data["stages_run"][:2] == ["track", "unwrap"]
-    assert {"key_lights", "specular", "summed_area", "relight", "expose"} <= {entry["stage"] for entry in data["stages_left_out"]}
+    assert {"key_lights", "specular", "summed_area", "relight", "expose"} <= {
+        entry["stage"] for entry in data["stages_left_out"]
+    }
     with Synthetic("card") as card:
         for frame in data["frames"]:
             rotation, translation = card.pose(frame["index"])
@@ -136,7 +148,11 @@ def test_list_names_every_bundled_scene(capsys: pytest.CaptureFixture[str]) -> N
     ],
 )
 def test_bad_usage_is_one_line_and_exit_code_2(
-    arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert live.main([*arguments, "--headless"]) == 2
@@ -184,10 +200,27 @@ def test_a_source_that_breaks_leaves_a_valid_video(tmp_path: Path, capsys: pytes
 def test_interrupt_finishes_the_file_and_exits_130(tmp_path: Path) -> None:
     video = tmp_path / "out.mp4"
     scene = write_scene(tmp_path)
-    command = [sys.executable, "-m", "warp_ar.live", str(scene), "--device", "cpu", "--quality", "low", "--loop", "--headless", "--output", str(video)]
+    command = [
+        sys.executable,
+        "-m",
+        "warp_ar.live",
+        str(scene),
+        "--device",
+        "cpu",
+        "--quality",
+        "low",
+        "--loop",
+        "--headless",
+        "--output",
+        str(video),
+    ]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
-        while not (video.exists() and video.stat().st_size > 1000) and time.monotonic() < deadline and process.poll() is None:
+        while (
+            not (video.exists() and video.stat().st_size > 1000)
+            and time.monotonic() < deadline
+            and process.poll() is None
+        ):
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=60)

@@ -8,8 +8,29 @@ import sys
 import warp_ar
 
 PUBLIC = {
-    *("PRESETS", "Frame", "Pipeline", "Plan", "Pose", "Quality", "Result", "Scene", "SceneError", "Session", "SinkError"),
-    *("SourceError", "TrackState", "Tracker", "UsageError", "WarpArError", "bundled_scenes", "dumps_scene", "load_scene"),
+    *(
+        "PRESETS",
+        "Frame",
+        "Pipeline",
+        "Plan",
+        "Pose",
+        "Quality",
+        "Result",
+        "Scene",
+        "SceneError",
+        "Session",
+        "SinkError",
+    ),
+    *(
+        "SourceError",
+        "TrackState",
+        "Tracker",
+        "UsageError",
+        "WarpArError",
+        "bundled_scenes",
+        "dumps_scene",
+        "load_scene",
+    ),
     *("make_plan", "open_sink", "open_source", "read_environment", "write_environment"),
 }
 

@@ -60,7 +60,9 @@ def chain(*names: str) -> tuple[type[Stage], ...]:
     )
 
 
-def plan_of(monkeypatch: pytest.MonkeyPatch, stages: tuple[type[Stage], ...], outputs: tuple[str, ...], **scene: Any) -> Plan:
+def plan_of(
+    monkeypatch: pytest.MonkeyPatch, stages: tuple[type[Stage], ...], outputs: tuple[str, ...], **scene: Any
+) -> Plan:
     monkeypatch.setattr(graph, "STAGES", stages)
     values = types.SimpleNamespace(**{"unwanted": (), "still": False, **scene})
     return make_plan(Request(values, PRESETS["medium"], (4, 4), outputs))  # type: ignore[arg-type]

@@ -15,7 +15,10 @@ from warp_ar.errors import UsageError
 
 @contextlib.contextmanager
 def _native_stderr_silenced() -> Iterator[None]:
-    """Keep what native code prints to stderr off the terminal: without an NVIDIA driver Warp's start warns there, past its own log level."""
+    """Keep what native code prints to stderr off the terminal.
+
+    Without an NVIDIA driver Warp's start warns there, past its own log level.
+    """
     sys.stderr.flush()
     saved = os.dup(2)
     with open(os.devnull, "wb") as sink:

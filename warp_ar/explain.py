@@ -1,4 +1,7 @@
-"""``python -m warp_ar.explain SCENE`` prints which stages a scene calls for, and why the others are left out, without running a frame."""
+"""``python -m warp_ar.explain SCENE`` prints which stages a scene calls for, and why the others are left out.
+
+No frame is run for it.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,15 @@ from warp_ar.stages.base import Request
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    parser = Parser(prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out.")
-    parser.add_argument("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name")
-    parser.add_argument("--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})")
+    parser = Parser(
+        prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out."
+    )
+    parser.add_argument(
+        "scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name"
+    )
+    parser.add_argument(
+        "--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
+    )
     try:
         options: argparse.Namespace = parser.parse_args(arguments)
         scene = load_scene(options.scene)

@@ -1,6 +1,7 @@
 """What changes per frame, in one small block of memory: camera, virtual lights, virtual objects.
 
-The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being captured again.
+The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being
+captured again.
 """
 
 from __future__ import annotations

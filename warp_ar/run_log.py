@@ -93,8 +93,9 @@ def left_out(plan: Plan) -> list[tuple[str, str]]:
 
 
 def print_plan(plan: Plan, log: RunLog | None = None) -> None:
-    """Print the table of stages: what runs (with median times, if ``log`` has them) and what is left out and why."""
-    table = Table(title=f"{plan.request.scene.name}, quality {plan.request.quality.name}, {plan.request.size[0]}x{plan.request.size[1]}")
+    """Print the table of stages: what runs, with ``log`` its median times too, and what is left out and why."""
+    request = plan.request
+    table = Table(title=f"{request.scene.name}, quality {request.quality.name}, {request.size[0]}x{request.size[1]}")
     table.add_column("stage")
     table.add_column("rung")
     table.add_column("state")
@@ -104,7 +105,9 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     for name in stage_names(plan):
         milliseconds = log.median_ms(name) if log is not None else None
         skipped = log.skipped(name) if log is not None else 0
-        state = "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
+        state = (
+            "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
+        )
         time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
         table.add_row(name, plan.request.quality.rung(name), state, time_text, summaries[name])
     for name, reason in left_out(plan):

@@ -1,6 +1,7 @@
 """Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
 
-On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different graph.
+On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
+graph.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ class Scheduler:
         self.plan = plan
         self.arrays = arrays
         self.device = device
-        self.bands = bands or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+        self.bands = bands or (
+            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        )
         self._pool = ThreadPoolExecutor(self.bands, "warp_ar") if device.is_cpu and self.bands > 1 else None
         self._stages: list[tuple[Stage, list[Pass]]] = []
         self._seen: dict[str, tuple[int, ...]] = {}

@@ -67,9 +67,7 @@ class Session:
         fps = self.scene.source.fps if self.scene.source is not None and source is None else None
         self.source: Source = open_source(chosen, fps=fps, loop=loop)
         try:
-            self.pipeline = Pipeline(
-                self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs
-            )
+            self.pipeline = Pipeline(self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs)
         except BaseException:
             self.source.close()
             raise
@@ -77,7 +75,9 @@ class Session:
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:

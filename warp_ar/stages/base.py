@@ -1,8 +1,8 @@
 """What a stage is: what it reads and writes, the rungs it has, and the passes that do its work.
 
-A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the scene and the quality alone, what it would
-read and write, or why the scene does not call for it. Nothing of Warp is touched then. When a pipeline is built, ``build`` turns a wired
-stage into passes over arrays that have been allocated from what ``arrays`` declared.
+A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the scene and the quality alone,
+what it would read and write, or why the scene does not call for it. Nothing of Warp is touched then. When a pipeline is
+built, ``build`` turns a wired stage into passes over arrays that have been allocated from what ``arrays`` declared.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Relight(Stage):
         """One pass over the rows that light can reach."""
         form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
         scene = self.request.scene
-        config = relight.RelightConfig(relight_rung(self.request), trace_config(scene), form, bool(scene.probes))  # type: ignore[arg-type]
+        config = relight.RelightConfig(relight_rung(self.request), trace_config(scene), form, bool(scene.probes))
         relight.make_relight_kernel(config)
 
         def launch(rows: Rows | None) -> None:
