@@ -67,7 +67,7 @@ class Incidence:
 
 @wp.func
 def sample_toward(sample: RoomSample, point: wp.vec3) -> Incidence:
-    """A room sample as ``point`` sees it: a lamp at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
+    """A sample as ``point`` sees it: a lamp at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
     result = Incidence()
     result.direction = sample.direction
     result.distance = FAR_AWAY

@@ -27,6 +27,7 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
+from warp_ar.kernels.reflect import nearest_of_object
 from warp_ar.kernels.shadow import make_sample_light, make_shadow
 from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import Hit, TraceConfig, inside_rect, make_primary
@@ -61,13 +62,15 @@ class ShadeConfig:
     """Whether the prefiltered environment is read."""
     edge_samples: int
     """Samples per pixel along edges: a square number; 1 leaves edges hard."""
+    near: bool = False
+    """Whether ``object_light`` says what surrounds the objects at close range."""
 
 
 @functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
-    """``shade_hit(scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction) -> vec3``.
+    """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
-    Radiance that leaves a hit against the ray's ``direction`` (not unit).
+    ``pixel`` is where ``object_light`` has seen the object, or negative.
     """
     surface_at = make_surface(config.models, config.textures)
     reflect_direct = make_reflect_direct(config.models)
@@ -85,6 +88,9 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         dfg: wp.array2d[wp.vec2],
         hit: Hit,
         direction: wp.vec3,
+        near_irradiance: wp.array2d[wp.vec3],
+        near_mirrored: wp.array2d[wp.vec4],
+        pixel: wp.vec2i,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
         normal = hit.normal
@@ -99,10 +105,16 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         surface = surface_at(scene, dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
 
         radiance = wp.vec3(0.0)
-        if wp.static(config.room_diffuse == "sh"):
-            radiance += wp.cw_mul(surface.diffuse, sh_irradiance(irradiance_sh, normal)) / wp.pi
-        if wp.static(config.room_diffuse == "map"):
-            radiance += wp.cw_mul(surface.diffuse, sample_latlong(irradiance_map, normal)) / wp.pi
+        if wp.static(config.room_diffuse != "none"):
+            irradiance = wp.vec3(0.0)
+            if wp.static(config.room_diffuse == "sh"):
+                irradiance = sh_irradiance(irradiance_sh, normal)
+            if wp.static(config.room_diffuse == "map"):
+                irradiance = sample_latlong(irradiance_map, normal)
+            if wp.static(config.near):
+                if pixel[0] >= 0:
+                    irradiance = near_irradiance[pixel[0], pixel[1]]
+            radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(config.room_specular):
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 level = level_from_roughness(surface.roughness, level_height)
@@ -113,6 +125,10 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                     if surface.model == MIRROR:
                         level = 0.0
                 mirrored = sample_levels(levels, reflect(wo, normal), level, level_height)
+                if wp.static(config.near):
+                    if pixel[0] >= 0:
+                        near = near_mirrored[pixel[0], pixel[1]]
+                        mirrored = (1.0 - near[3]) * mirrored + wp.vec3(near[0], near[1], near[2])
                 radiance += wp.cw_mul(surface.reflectance, mirrored)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
@@ -173,6 +189,8 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
         dfg: wp.array2d[wp.vec2],
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
+        near_irradiance: wp.array2d[wp.vec3],
+        near_mirrored: wp.array2d[wp.vec4],
         # Out:
         virtual_out: wp.array2d[wp.vec4],
     ):
@@ -209,8 +227,22 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
                     if samples > 1:
                         hit = closest_visible(scene, origin, direction)
                 if hit.shape >= 0:
+                    pixel = wp.vec2i(-1, -1)
+                    if wp.static(config.near):
+                        pixel = nearest_of_object(hit_object, i, j, hit.shape)
                     radiance = shade_hit(
-                        scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit, direction
+                        scene,
+                        lights,
+                        irradiance_sh,
+                        irradiance_map,
+                        levels,
+                        level_height,
+                        dfg,
+                        hit,
+                        direction,
+                        near_irradiance,
+                        near_mirrored,
+                        pixel,
                     )
                     result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
             if samples > 1:
@@ -235,6 +267,8 @@ def shade(
     hits: wp.array2d[Hit],
     virtual_out: wp.array2d[wp.vec4],
     *,
+    near_irradiance: wp.array2d[wp.vec3] | None = None,
+    near_mirrored: wp.array2d[wp.vec4] | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Shade what ``trace_pixels`` found.
@@ -253,6 +287,8 @@ def shade(
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
+        near_irradiance: (H, W) as ``filter_object_light`` writes; needed if ``config.near``.
+        near_mirrored: (H, W) likewise.
         rows: Band of rows; None means all.
     """
     launch_rows(
@@ -270,6 +306,8 @@ def shade(
             dfg,
             hit_object,
             hits,
+            near_irradiance,
+            near_mirrored,
         ],
         [virtual_out],
         rows=rows,

@@ -9,6 +9,7 @@ from warp_ar.stages.diffuse import Diffuse
 from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
+from warp_ar.stages.object_light import ObjectLight
 from warp_ar.stages.relight import Relight
 from warp_ar.stages.room_samples import RoomSamples
 from warp_ar.stages.room_shadow import RoomShadow
@@ -30,6 +31,7 @@ STAGES: tuple[type[Stage], ...] = (
     Relight,
     RoomSamples,
     RoomShadow,
+    ObjectLight,
     Shade,
     Composite,
     Expose,

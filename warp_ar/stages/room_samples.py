@@ -11,6 +11,7 @@ from warp_ar.kernels import pyramid, room_samples
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 from warp_ar.stages.composite import shades_room
+from warp_ar.stages.shade import sees_near, shade_config
 
 SAMPLES = 1024
 """Of all sets together: what an 8-bit picture of their mean can tell apart, four times over."""
@@ -34,7 +35,8 @@ class RoomSamples(Stage):
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Read the environment, write samples."""
-        if not shades_room(request):
+        gathers = sees_near(request) and shade_config(request).room_diffuse != "none"
+        if not shades_room(request) and not gathers:
             return LeftOut("nothing traces rays to the room's light")
         return Wiring(("environment",), ("room_samples",))
 

@@ -40,14 +40,25 @@ def shade_config(request: Request) -> ShadeConfig:
         room_diffuse=diffuse,
         room_specular=bool(scene.probes) and any(map(reflects_glossily, materials)),
         edge_samples=request.quality.edge_samples,
+        near=bool(scene.probes) and sees_near(request),
     )
+
+
+def sees_near(request: Request) -> bool:
+    """Whether the quality asks for what surrounds the objects at close range."""
+    return request.quality.rung("shade") == "one_bounce"
+
+
+def near_names(config: ShadeConfig) -> tuple[tuple[str, bool], ...]:
+    """Resources of what surrounds the objects, and whether their materials show them."""
+    return ("object_irradiance", config.room_diffuse != "none"), ("object_mirrored", config.room_specular)
 
 
 class Shade(Stage):
     """Radiance and coverage of virtual objects, with smooth edges."""
 
     name = "shade"
-    rungs = ("default",)
+    rungs = ("environment", "one_bounce")
     summary = "shade virtual objects by the room's light and virtual lights, shadowed and anti-aliased"
 
     @classmethod
@@ -63,6 +74,8 @@ class Shade(Stage):
             reads.append(f"irradiance_{config.room_diffuse}")
         if config.room_specular:
             reads.append("specular_levels")
+        if config.near and (config.room_diffuse != "none" or config.room_specular):
+            reads += [name for name, used in near_names(config) if used]
         return Wiring(tuple(reads), ("virtual",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -96,6 +109,13 @@ class Shade(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            shade(config, *inputs, arrays["virtual"], rows=rows)
+            shade(
+                config,
+                *inputs,
+                arrays["virtual"],
+                near_irradiance=arrays.get("object_irradiance"),
+                near_mirrored=arrays.get("object_mirrored"),
+                rows=rows,
+            )
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]

@@ -1,0 +1,379 @@
+"""What surrounds a virtual object at close range: the desk that it stands on, other objects, itself.
+
+Per pixel of an object, two things replace what the distant environment alone would give ``shade``:
+
+*Irradiance*, the sum over one set of the room's samples, each traced: a proxy in the way shows the camera's picture of
+it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the way shows
+what the distant room makes of it. So an object's underside sees the shadow that it stands in, not an empty desk.
+
+*Mirrored*, premultiplied radiance of what is near and its share of the lobe; ``shade`` fills the rest with the
+prefiltered environment. A mirror sends one ray. A glossy lobe sends a few, another few from each pixel of a tile; only
+the near part carries their noise, since what misses everything reads the environment prefiltered with the whole lobe.
+
+Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``room_shadow`` does;
+mirrors are not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_shade_unoccluded
+from warp_ar.kernels.room_samples import RoomSample, sample_toward, sobol_second
+from warp_ar.kernels.sampling import (
+    frame_from_normal,
+    radical_inverse,
+    sample_ggx_visible,
+    sample_phong_lobe,
+)
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, RayScene
+from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset_origin
+
+wp.set_module_options({"enable_backward": False})
+
+SHARP = wp.constant(wp.float32(0.02))
+"""Width alpha of a lobe below which it is a mirror: one ray, not averaged."""
+SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
+"""Cosine of the angle up to which neighbours' normals are those of one surface."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectLightConfig:
+    """What is compiled into the kernel."""
+
+    room: RoomConfig
+    """Kinds of shape and forms of light."""
+    count: int
+    """Samples of the room per pixel, of each set."""
+    lobe_count: int
+    """Rays per pixel into a glossy lobe."""
+    side: int
+    """Pixels along a tile."""
+    ratio: bool
+    """Whether objects shade the desk."""
+    added: bool
+    """Whether virtual lights light the desk."""
+
+
+@wp.func
+def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) -> wp.float32:
+    """Width of a surface's lobe; 0 for a mirror."""
+    if model == METALLIC_ROUGHNESS:
+        return roughness * roughness
+    if model == PHONG:
+        return 1.0 / wp.sqrt(wp.max(shininess, 1.0))
+    return 0.0
+
+
+@functools.cache
+def make_look_near(config: ObjectLightConfig) -> wp.Function:
+    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the room is.
+
+    The desk's radiance is that of the picture so far: its shadows and its virtual light included.
+    """
+    trace = make_trace(config.room.trace)
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
+    shade_unoccluded = make_shade_unoccluded(config.room)
+
+    @wp.func(module="unique")
+    def look_near(
+        params: FrameParams,
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        physical_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        origin: wp.vec3,
+        direction: wp.vec3,
+        t_max: wp.float32,
+    ) -> wp.vec4:
+        other = closest_object(scene, origin, direction, t_max)
+        proxy = closest_proxy(scene, origin, direction, other.t)
+        if proxy.shape >= 0:
+            height = frame.shape[0]
+            width = frame.shape[1]
+            at = find_in_frame(params, height, width, scene, room.probes, proxy.point, proxy.geometric_normal)
+            if at[0] < 0.0:
+                return wp.vec4(0.0)
+            radiance = look_up(frame, decode_table, at[0], at[1])
+            row = wp.int32(at[1] + 0.5)
+            column = wp.int32(at[0] + 0.5)
+            if wp.static(config.ratio):
+                radiance = wp.cw_mul(radiance, physical_ratio[row, column])
+            if wp.static(config.added):
+                if inside_rect(row, column, params.light_rect):
+                    radiance += physical_added[row, column]
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        if other.shape >= 0:
+            radiance = shade_unoccluded(scene, room, other, direction)
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        return wp.vec4(0.0)
+
+    return look_near
+
+
+@functools.cache
+def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    look_near = make_look_near(config)
+    surface_at = make_surface(config.room.models, config.room.textures)
+    side = config.side
+    lobes = config.lobe_count
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def object_light_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        physical_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        samples: wp.array[RoomSample],
+        stride: wp.int32,
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        # Out:
+        irradiance_out: wp.array2d[wp.vec3],
+        mirrored_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        if not inside_rect(i, j, params[0].object_rect):
+            return
+        if hit_object[i, j] < 0:
+            return
+        hit = hits[i, j]
+        ray = rays[i, j]
+        direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+        wo = -direction
+        normal = hit.normal
+        geometric = hit.geometric_normal
+        if wp.dot(geometric, wo) < 0.0:
+            normal = -normal
+            geometric = -geometric
+        cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
+        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        set_index = (i % side) * side + j % side
+
+        if wp.static(config.room.diffuse != "none"):
+            total = wp.vec3(0.0)
+            if surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2] > 0.0:
+                first = set_index * stride
+                # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part
+                # of it is a smaller set.
+                share = wp.float32(stride * side * side) / wp.static(float(config.count))
+                for k in range(wp.static(config.count)):
+                    sample = samples[first + k]
+                    toward = sample_toward(sample, hit.point)
+                    cosine = wp.dot(normal, toward.direction)
+                    if cosine > 0.0:
+                        radiance = sample.radiance
+                        if wp.dot(geometric, toward.direction) <= 0.0:
+                            radiance = wp.vec3(0.0)
+                        else:
+                            origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
+                            near = look_near(
+                                params[0],
+                                frame,
+                                decode_table,
+                                physical_ratio,
+                                physical_added,
+                                scene,
+                                room,
+                                origin,
+                                toward.direction,
+                                toward.distance,
+                            )
+                            if near[3] > 0.0:
+                                radiance = wp.vec3(near[0], near[1], near[2])
+                        total += share * cosine * toward.measure * radiance
+            irradiance_out[i, j] = total
+
+        if wp.static(config.room.specular):
+            mirrored = wp.vec4(0.0)
+            if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
+                alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
+                count = wp.where(alpha < SHARP, 1, wp.static(lobes))
+                basis = frame_from_normal(normal)
+                center = reflect(wo, normal)
+                for k in range(count):
+                    outward = center
+                    if alpha >= SHARP:
+                        index = wp.uint32(set_index * wp.static(lobes) + k)
+                        shift = wp.static(0.5 / (lobes * side * side))
+                        u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
+                        if surface.model == PHONG:
+                            outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+                        else:
+                            half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
+                            outward = reflect(wo, half)
+                    if wp.dot(outward, geometric) > 0.0:
+                        origin = offset_origin(hit.point, geometric, outward, hit.error)
+                        mirrored += look_near(
+                            params[0],
+                            frame,
+                            decode_table,
+                            physical_ratio,
+                            physical_added,
+                            scene,
+                            room,
+                            origin,
+                            outward,
+                            FAR,
+                        )
+                mirrored = mirrored / wp.float32(count)
+            mirrored_out[i, j] = mirrored
+
+    return object_light_kernel
+
+
+@functools.cache
+def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
+    """Kernel of ``filter_object_light``."""
+    side = config.side
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_object_light_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        irradiance: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec4],
+        # Out:
+        irradiance_out: wp.array2d[wp.vec3],
+        mirrored_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        rect = params[0].object_rect
+        if not inside_rect(i, j, rect):
+            return
+        found = hit_object[i, j]
+        if found < 0:
+            return
+        normal = hits[i, j].normal
+        material = scene.materials[scene.objects[found].material]
+        sharp = lobe_alpha(material.model, material.roughness, material.shininess) < SHARP
+        light = wp.vec3(0.0)
+        glossy = wp.vec4(0.0)
+        weights = float(0.0)
+        reach = wp.static(side // 2)
+        for a in range(-reach, reach + 1):
+            for b in range(-reach, reach + 1):
+                if inside_rect(i + a, j + b, rect):
+                    if hit_object[i + a, j + b] == found and wp.dot(hits[i + a, j + b].normal, normal) > SAME_NORMAL:
+                        weight = wp.where(a == reach or a == -reach, 0.5, 1.0)
+                        weight *= wp.where(b == reach or b == -reach, 0.5, 1.0)
+                        weights += weight
+                        if wp.static(config.room.diffuse != "none"):
+                            light += weight * irradiance[i + a, j + b]
+                        if wp.static(config.room.specular):
+                            glossy += weight * mirrored[i + a, j + b]
+        if wp.static(config.room.diffuse != "none"):
+            irradiance_out[i, j] = light / weights
+        if wp.static(config.room.specular):
+            mirrored_out[i, j] = glossy / weights
+            if sharp:
+                mirrored_out[i, j] = mirrored[i, j]
+
+    return filter_object_light_kernel
+
+
+def light_objects(
+    config: ObjectLightConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    physical_ratio: wp.array2d[wp.vec3] | None,
+    physical_added: wp.array2d[wp.vec3] | None,
+    scene: RayScene,
+    room: Room,
+    samples: wp.array[RoomSample] | None,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    irradiance_out: wp.array2d[wp.vec3] | None,
+    mirrored_out: wp.array2d[wp.vec4] | None,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Estimate what surrounds the objects, each pixel with one set of samples.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: (1,) FrameParams: camera, object_rect and light_rect.
+        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+        frame: (H, W) the camera's frame, RGB.
+        decode_table: (256,) of ``color.decode_table``.
+        physical_ratio: (H, W) factor on the frame.
+        physical_added: (H, W) virtual light on the desk.
+        scene: Objects and proxies.
+        room: The room's light.
+        samples: Samples of the room, set after set.
+        hit_object: (H, W) as ``trace_pixels`` writes.
+        hits: (H, W) likewise.
+        irradiance_out: (H, W) irradiance; written only where an object is seen.
+        mirrored_out: (H, W) premultiplied near radiance and its share of the lobe; likewise.
+        rows: Band of rows; None means all.
+    """
+    stride = 0 if samples is None else samples.shape[0] // config.side**2
+    launch_rows(
+        make_object_light_kernel(config),
+        rays.shape,
+        [
+            params,
+            rays,
+            frame,
+            decode_table,
+            physical_ratio,
+            physical_added,
+            scene,
+            room,
+            samples,
+            stride,
+            hit_object,
+            hits,
+        ],
+        [irradiance_out, mirrored_out],
+        rows=rows,
+        device=rays.device,
+    )
+
+
+def filter_object_light(
+    config: ObjectLightConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    irradiance: wp.array2d[wp.vec3] | None,
+    mirrored: wp.array2d[wp.vec4] | None,
+    irradiance_out: wp.array2d[wp.vec3] | None,
+    mirrored_out: wp.array2d[wp.vec4] | None,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Average the estimates over tiles, along objects only; arguments as ``light_objects``."""
+    launch_rows(
+        make_filter_kernel(config),
+        hit_object.shape,
+        [params, scene, hit_object, hits, irradiance, mirrored],
+        [irradiance_out, mirrored_out],
+        rows=rows,
+        device=hit_object.device,
+    )

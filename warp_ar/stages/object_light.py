@@ -1,0 +1,98 @@
+"""What surrounds virtual objects at close range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import object_light
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.composite import layer_names
+from warp_ar.stages.room_shadow import make_room, room_config, room_reads
+from warp_ar.stages.shade import DFG_SIZE, near_names, sees_near, shade_config
+
+SIDE = 4
+"""Pixels along a tile."""
+COUNT = 32
+"""Samples of the room per pixel."""
+LOBE_COUNT = 4
+"""Rays per pixel into a glossy lobe."""
+
+
+class ObjectLight(Stage):
+    """Light that reaches objects past each other, and what they mirror of the desk and of each other."""
+
+    name: ClassVar[str] = "object_light"
+    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "what of the desk and of other objects virtual objects show"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Needs objects, a room that lights them, and a quality that asks for it."""
+        if not request.scene.objects:
+            return LeftOut("the scene has no virtual object")
+        if not request.scene.probes:
+            return LeftOut("the scene has no probe, so the room's light is unknown")
+        if not sees_near(request):
+            return LeftOut(f"the quality {request.quality.name!r} reflects the environment only")
+        config = room_config(request)
+        reads = ["frame", "pose", "objects", "hit_object", "hits", *room_reads(config)]
+        if config.diffuse != "none":
+            reads.append("room_samples")
+        reads += [name for name in layer_names(request) if name != "virtual"]
+        return Wiring(tuple(reads), tuple(name for name, used in near_names(shade_config(request)) if used))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Irradiance and what is mirrored, before and after averaging."""
+        width, height = self.request.size
+        config = room_config(self.request)
+        specs = {}
+        if config.diffuse != "none":
+            specs["object_irradiance"] = specs["object_light_irradiance"] = ArraySpec((height, width), wp.vec3)
+        if config.specular:
+            specs["object_mirrored"] = specs["object_light_mirrored"] = ArraySpec((height, width), wp.vec4)
+        if METALLIC_ROUGHNESS in config.models:
+            specs["object_light_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Estimates, then their mean."""
+        layers = layer_names(self.request)
+        forms = room_config(self.request)
+        config = object_light.ObjectLightConfig(
+            forms, COUNT, LOBE_COUNT, SIDE, "physical_ratio" in layers, "physical_added" in layers
+        )
+        object_light.make_object_light_kernel(config)
+        object_light.make_filter_kernel(config)
+        dfg = arrays.get("object_light_dfg")
+        if dfg is not None:
+            integrate_dfg(dfg)
+        room = make_room(forms, self.request, arrays, dfg)
+        inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
+        inputs += [arrays.get("physical_ratio"), arrays.get("physical_added"), arrays["ray_scene"], room]
+        inputs += [arrays.get("room_samples"), arrays["hit_object"], arrays["hits"]]
+        raw = arrays.get("object_light_irradiance"), arrays.get("object_light_mirrored")
+        out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
+
+        def estimate(rows: Rows | None) -> None:
+            object_light.light_objects(config, *inputs, *raw, rows=rows)
+
+        def average(rows: Rows | None) -> None:
+            object_light.filter_object_light(
+                config,
+                arrays["params"],
+                arrays["ray_scene"],
+                arrays["hit_object"],
+                arrays["hits"],
+                *raw,
+                *out,
+                rows=rows,
+            )
+
+        height = self.request.size[1]
+        extent = arrays["object_rows"]
+        return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
