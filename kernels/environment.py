@@ -139,6 +139,14 @@ def usable_confidence(value: wp.vec3, confidence: wp.float32) -> wp.float32:
 # ---- accumulation ----
 
 
+@wp.func
+def light_confidence(radiance: wp.vec3, confidence: wp.float32) -> wp.float32:
+    """Confidence of what a frame says of a texel; 0 where that is no light: negative, or not a number."""
+    if wp.min(radiance) < 0.0:
+        return 0.0
+    return usable_confidence(radiance, confidence)
+
+
 @wp.kernel(enable_backward=False)
 def measure_change_kernel(
     # In:
@@ -163,7 +171,7 @@ def measure_change_kernel(
             x = radiance[i, j]
             m = environment[i, j]
             weight = area * wp.min(
-                usable_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j])
+                light_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j])
             )
             if weight > 0.0:
                 new = brightness(x)
@@ -206,7 +214,9 @@ def accumulate_environment_kernel(
     band_row, j = wp.tid()
     i = row_start + band_row
     x = radiance[i, j]
-    c = usable_confidence(x, confidence[i, j])
+    c = light_confidence(x, confidence[i, j])
+    if wp.min(clipped[i, j]) < 0.0 or not is_finite(clipped[i, j]):
+        c = 0.0
     m = environment_out[i, j]
     share = clipped_out[i, j]
     k = usable_confidence(m, confidence_out[i, j])

@@ -6,15 +6,39 @@ import os
 import pathlib
 from collections.abc import Iterator
 
+import hypothesis
 import pytest
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
 
+# Every run tries the same few examples; ``--hypothesis-profile deep`` searches for new ones.
+_PROFILE = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
+hypothesis.settings.register_profile("ci", derandomize=True, max_examples=15, **_PROFILE)
+hypothesis.settings.register_profile("deep", max_examples=2000, **_PROFILE)
+hypothesis.settings.load_profile("ci")
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of this suite."""
     parser.addoption("--update-golden", action="store_true", help="write the golden frames anew instead of comparing")
+    parser.addoption("--long", action="store_true", help="hard cases at full length: millions of rays, 10,000 frames")
+    parser.addoption("--atlas", type=pathlib.Path, metavar="FILE", help="write which tests cover which hard cases, as JSON")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the marker by which tests say what they cover."""
+    config.addinivalue_line("markers", "atlas(row, stage, rung): the hard case that a test covers; see tests/hard_cases/atlas.py")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Note in every report which hard cases a test covers."""
+    from tests.hard_cases import atlas
+
+    for item in items:
+        item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
+    if config.getoption("--atlas"):
+        atlas.write_collection(items, config.getoption("--atlas"))
 
 
 def _devices() -> list[str]:

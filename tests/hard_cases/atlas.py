@@ -1,0 +1,180 @@
+"""The atlas of numerically hard cases: its rows, the stages that each concerns, and the tests that cover them.
+
+A test says what it covers by ``@pytest.mark.atlas(row, stage, rung)``. ``stage`` and ``rung`` may be left out where the
+test is parametrised by them; ``rung="*"`` says that the test exercises what all rungs of the stage share. Tests that
+stand beside the kernel they test are listed in ``ELSEWHERE`` instead. ``tests/hard_cases/test_atlas.py`` sees to it
+that no cell is empty.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Iterable
+from typing import Any
+
+from tests.hard_cases.rig import RUNGS
+
+ROWS = {
+    1: "straight back through the ball, the blind cone behind it, the silhouette",
+    2: "perspective unwrapping of a ball that is near",
+    3: "ball partly outside, hidden, 8 pixels across, touching the near plane",
+    4: "poles and seam of latlong maps; odd, 1xN and other sizes",
+    5: "acos and sqrt fed 1 + ulp; normals exactly +/-z",
+    6: "suns, outliers, black maps, NaN, Inf, negative and denormal pixels",
+    7: "accumulation over 10,000 frames: no drift, no decay, bad frames",
+    8: "materials at their ends, grazing view and light",
+    9: "lights on surfaces, inside objects, behind all; cones and intensities at their ends",
+    10: "relief weighting at alpha = -1, 0, 1; no or no single dominant light",
+    11: "summed-area tables at 4K and 8K; boxes in corners and beyond the image",
+    12: "exposure 0, 1, just below 1, above 1; saturated and black frames",
+    13: "rays along axes, edges and vertices; broken meshes",
+    14: "self-shadowing at 1 mm and 1 km, and 1 km from the origin",
+    15: "marker edge-on, tiny, cut, mirrored, doubled, flipping, lost and found",
+    16: "frames of wrong size, type or content; sources that break",
+    17: "same answer: bands, replayed graphs, run to run, CPU and CUDA",
+    18: "energy: constant under any mask, kept at every level and rung",
+}
+
+TRACK, SOURCE, PIPELINE = "track", "source", "pipeline"
+"""What is no stage of a plan: finding the marker, reading frames, and the frame's way as a whole."""
+
+_RAYS = ("visibility", "shade", "relight", "room_shadow", "object_light")
+CONCERNS: dict[int, tuple[str, ...]] = {
+    1: ("unwrap",),
+    2: ("unwrap",),
+    3: ("unwrap", "fill"),
+    4: ("unwrap", "fill", "key_lights", "diffuse", "specular", "room_samples"),
+    5: ("unwrap", "diffuse", "specular", "visibility", "shade", "relight"),
+    6: (*(stage for stage in RUNGS if stage != "visibility"), PIPELINE),
+    7: ("accumulate", "expose", PIPELINE),
+    8: ("specular", "shade", "room_shadow"),
+    9: ("relight", "shade"),
+    10: ("key_lights", "relight"),
+    11: ("summed_area", "expose"),
+    12: ("summed_area", "expose", "composite"),
+    13: ("unwrap", *_RAYS),
+    14: _RAYS,
+    15: (TRACK, PIPELINE),
+    16: (SOURCE, PIPELINE),
+    17: (*RUNGS, PIPELINE),
+    18: ("unwrap", "accumulate", "fill", "diffuse", "specular", "room_samples", "shade"),
+}
+
+ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
+    "test_probe.py::test_straight_back_and_blind": ((1, "unwrap", "*"),),
+    "test_probe.py::test_normals_reflect_every_direction_to_the_camera": ((1, "unwrap", "*"), (5, "unwrap", "*")),
+    "test_probe.py::test_nothing_of_the_background_bleeds_in": ((1, "unwrap", "area"),),
+    "test_probe.py::test_corners_match_twin": ((2, "unwrap", "*"),),
+    "test_probe.py::test_ramp_is_where_it_belongs": ((2, "unwrap", ""),),
+    "test_probe.py::test_orthographic_unwrapping_would_fail_here": ((2, "unwrap", "*"),),
+    "test_probe.py::test_partly_outside_the_frame": ((3, "unwrap", "area"),),
+    "test_probe.py::test_hidden_by_a_proxy": ((3, "unwrap", "*"), (13, "unwrap", "*")),
+    "test_probe.py::test_near_plane": ((3, "unwrap", "*"),),
+    "test_probe.py::test_a_ball_eight_pixels_across": ((3, "unwrap", "area"),),
+    "test_probe.py::test_furnace_to_the_bit": ((18, "unwrap", ""),),
+    "test_environment.py::test_a_hole_in_a_ramp_is_bridged_without_shift": ((3, "fill", "*"), (4, "fill", "*")),
+    "test_environment.py::test_nothing_known_is_no_light": ((3, "fill", "*"),),
+    "test_environment.py::test_rotating_the_room_rotates_the_fill": ((4, "fill", "*"),),
+    "test_environment.py::test_every_size_gives_finite_lights": ((4, "key_lights", "*"),),
+    "test_environment.py::test_not_a_number_never_enters": ((6, "accumulate", "*"), (7, "accumulate", "*")),
+    "test_environment.py::test_extreme_values_stay_finite_and_not_negative": ((6, "fill", "*"),),
+    "test_environment.py::test_no_drift_over_ten_thousand_frames": ((7, "accumulate", "*"),),
+    "test_environment.py::test_one_corrupt_frame_neither_enters_fast_nor_stays": ((7, "accumulate", "*"),),
+    "test_environment.py::test_two_opposite_lights": ((10, "key_lights", "*"),),
+    "test_environment.py::test_a_uniform_room_has_no_key_light": ((10, "key_lights", "*"),),
+    "test_environment.py::test_a_constant_room_stays_constant_under_any_mask": ((18, "fill", "*"),),
+    "test_irradiance.py::test_a_white_furnace_stays_white": ((18, "diffuse", ""),),
+    "test_irradiance.py::test_turning_the_room_turns_the_irradiance": ((4, "diffuse", ""),),
+    "test_irradiance.py::test_bad_texels_are_contained": ((6, "diffuse", ""),),
+    "test_irradiance.py::test_a_small_lamp_gives_no_negative_light": ((6, "diffuse", "sh2"),),
+    "test_prefilter.py::test_a_white_furnace_stays_white": ((18, "specular", ""),),
+    "test_prefilter.py::test_every_level_keeps_the_energy_of_a_lamp": ((18, "specular", ""), (6, "specular", "")),
+    "test_prefilter.py::test_seam_and_poles_are_continuous": ((4, "specular", ""),),
+    "test_prefilter.py::test_bad_texels_are_contained": ((6, "specular", ""),),
+    "test_prefilter.py::test_levels_grow_with_roughness_and_fall_with_shininess": ((8, "specular", "*"),),
+    "test_pyramid.py::test_any_direction_of_any_map_is_finite_and_within_its_range": ((4, "specular", "*"), (5, "specular", "*")),
+    "test_latlong.py::test_coordinates_of_poles_and_of_more_than_unit_length": ((5, "specular", "*"), (5, "diffuse", "*")),
+    "test_materials.py::test_ends_of_every_range_are_finite": ((8, "shade", "*"),),
+    "test_materials.py::test_white_furnace": ((8, "shade", "*"), (18, "shade", "*")),
+    "test_relight.py::test_hard_lights_stay_finite": ((9, "relight", ""),),
+    "test_shade.py::test_lights_in_hard_places": ((9, "shade", "*"),),
+    "test_shadow.py::test_cone_angles_at_their_ends": ((9, "relight", "*"), (9, "shade", "*")),
+    "test_relight.py::test_paper_is_exact_at_its_three_cases": ((10, "relight", "paper"),),
+    "test_relight.py::test_responses_are_continuous_and_never_negative": ((10, "relight", "*"),),
+    "test_relight.py::test_ambient_room_says_nothing_about_relief": ((10, "relight", ""),),
+    "test_summed_area.py::test_large_frames_are_exact": ((11, "summed_area", "*"),),
+    "test_summed_area.py::test_empty_and_outside_boxes_are_zero": ((11, "summed_area", "*"),),
+    "test_exposure.py::test_scale_one_is_the_identity": ((12, "expose", ""),),
+    "test_exposure.py::test_scale_zero_is_black": ((12, "expose", ""),),
+    "test_exposure.py::test_one_saturated_pixel_fades_with_the_rest": ((12, "expose", "box"),),
+    "test_visibility.py::test_no_leak_through_shared_edges_and_vertices": ((13, "visibility", "*"),),
+    "test_visibility.py::test_axis_aligned_rays_from_a_face": ((13, "visibility", "*"),),
+    "test_visibility.py::test_degenerate_triangles": ((13, "visibility", "*"),),
+    "test_visibility.py::test_rays_that_leave_do_not_come_back": ((14, "visibility", "*"),),
+    "test_shade.py::test_shadows_do_not_depend_on_scale_or_place": ((14, "shade", "*"),),
+    "test_tracking.py::test_edge_on_loses_quality_and_never_breaks": ((15, TRACK, "*"),),
+    "test_tracking.py::test_twelve_pixel_marker": ((15, TRACK, "*"),),
+    "test_tracking.py::test_leaving_the_frame": ((15, TRACK, "*"),),
+    "test_tracking.py::test_mirrored_marker_is_not_accepted": ((15, TRACK, "*"),),
+    "test_tracking.py::test_two_with_one_id": ((15, TRACK, "*"),),
+    "test_tracking.py::test_pose_does_not_flip": ((15, TRACK, "*"),),
+    "test_tracking.py::test_found_held_lost_found": ((15, TRACK, "*"),),
+    "test_pipeline.py::test_lost_marker_passes_the_frame_and_keeps_the_light": ((15, PIPELINE, "*"),),
+    "test_sources.py::test_grey_alpha_and_16_bit_become_rgb": ((16, SOURCE, "*"),),
+    "test_sources.py::test_float_image_is_an_error": ((16, SOURCE, "*"),),
+    "test_sources.py::test_damaged_image_is_named_after_the_frames_before_it": ((16, SOURCE, "*"),),
+    "test_sources.py::test_size_that_changes_is_named": ((16, SOURCE, "*"),),
+    "test_sources.py::test_empty_and_foreign_files": ((16, SOURCE, "*"),),
+    "test_sources.py::test_truncated_video_gives_what_is_whole_and_names_the_frame": ((16, SOURCE, "*"),),
+    "test_sources.py::test_device_drops_to_the_newest_and_reports_being_unplugged": ((16, SOURCE, "*"),),
+    "test_pipeline.py::test_wrong_frames_are_refused_and_the_next_one_works": ((16, PIPELINE, "*"),),
+    "test_pipeline.py::test_bands_give_the_same_bits": ((17, PIPELINE, "*"),),
+    "test_pipeline.py::test_captured_graph_equals_eager": ((17, PIPELINE, "*"),),
+}
+"""(row, stage, rung) of tests beside their kernels; an empty rung is the test's own ``rung`` parameter."""
+
+Cell = tuple[int, str, str]
+
+
+def rungs_of(stage: str) -> tuple[str, ...]:
+    """Rungs of a stage on which it does something; ``default`` for what is no stage."""
+    return RUNGS.get(stage, ("default",))
+
+
+def cells() -> list[Cell]:
+    """Every (row, stage, rung) that must be covered; stages that do not exist yet concern no row."""
+    known = {*RUNGS, TRACK, SOURCE, PIPELINE}
+    return [(row, stage, rung) for row, stages in CONCERNS.items() for stage in stages if stage in known for rung in rungs_of(stage)]
+
+
+def cells_of(item: Any) -> list[Cell]:
+    """Cells that a collected test covers."""
+    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    function = getattr(item, "originalname", None) or item.name
+    claims: list[tuple[int, str | None, str | None]] = []
+    for mark in item.iter_markers("atlas"):
+        claims.append((mark.kwargs["row"], mark.kwargs.get("stage"), mark.kwargs.get("rung")))
+    claims += [(row, stage, rung or None) for row, stage, rung in ELSEWHERE.get(f"{item.path.name}::{function}", ())]
+    found: list[Cell] = []
+    for row, stage, rung in claims:
+        stage = stage or parameters.get("stage")
+        if stage not in CONCERNS[row]:
+            if "stage" in parameters:
+                continue  # a test over all stages, of a row that does not concern this one
+            raise ValueError(f"{item.nodeid}: row {row} of the atlas does not concern {stage!r}")
+        rungs = rungs_of(stage)
+        rung = rung or parameters.get("rung") or (rungs[0] if len(rungs) == 1 else None)
+        if rung is None:
+            raise ValueError(f"{item.nodeid}: say which rung of {stage} it covers, or '*' for what all share")
+        found += [(row, stage, one) for one in rungs if rung in ("*", one)]
+    return found
+
+
+def write_collection(items: Iterable[Any], path: pathlib.Path) -> None:
+    """Write which tests cover which cells, as JSON {"row/stage/rung": [test, ...]}."""
+    table: dict[str, list[str]] = {}
+    for item in items:
+        for row, stage, rung in cells_of(item):
+            table.setdefault(f"{row}/{stage}/{rung}", []).append(item.nodeid)
+    path.write_text(json.dumps(table, indent=1))

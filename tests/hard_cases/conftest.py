@@ -1,0 +1,39 @@
+"""Rigs that tests of hard cases share: built once per stage and rung, put back into their first state for every test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tests.hard_cases.generators import frames
+from tests.hard_cases.rig import SIZE, Rig
+
+_RIGS: dict[tuple[str, str, str], tuple[Rig, dict[str, np.ndarray]]] = {}
+
+
+@pytest.fixture
+def rig_for(device: str) -> Callable[[str, str], Rig]:
+    """A rig whose plan holds a stage on a rung, as it was after two frames of noise."""
+
+    def made(stage: str, rung: str) -> Rig:
+        key = device, stage, rung
+        if key not in _RIGS:
+            rig = Rig(device, stage, rung)
+            for name in ("noise", "torn"):  # two: the first has no time step
+                rig.frame(frames(SIZE[1], SIZE[0])[name])
+            _RIGS[key] = rig, rig.state()
+        rig, state = _RIGS[key]
+        rig.restore(state)
+        return rig
+
+    return made
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _close_rigs():
+    yield
+    for rig, _ in _RIGS.values():
+        rig.pipeline.close()
+    _RIGS.clear()

@@ -1,0 +1,251 @@
+"""A pipeline of every effect at a small size, whose stages can be fed by hand: what the hard cases are tried on.
+
+The pose is given, not tracked, so that any picture can be a frame. Stages and rungs come from ``warp_ar.stages``: a new
+one is tried without a line here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_ar.graph import Plan, make_plan
+from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS, Quality
+from warp_ar.scene import (
+    Camera,
+    Exposure,
+    LambertMaterial,
+    Light,
+    Marker,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    Object,
+    PhongMaterial,
+    Probe,
+    Proxy,
+    Scene,
+)
+from warp_ar.stages import STAGES
+from warp_ar.stages.base import Pass, Request, Stage
+from warp_ar.tracking import Pose, Track, TrackState
+
+SIZE = (48, 36)
+"""Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""
+ENVIRONMENT_HEIGHT = 16
+MAY_BE_INFINITE = ("hit_depth",)
+"""Outputs that are documented to be infinite where there is nothing."""
+
+
+def look_at(eye: Any, target: Any = (0.0, 0.0, 0.02)) -> Pose:
+    """Pose of a camera at ``eye`` whose axis goes through ``target``, its x axis level."""
+    forward = np.subtract(target, eye).astype(np.float64)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0) if abs(forward[2]) < 0.99 else (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Pose(rotation, -rotation @ np.asarray(eye, np.float64))
+
+
+POSE = look_at((0.02, -0.3, 0.35))
+
+
+def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any) -> Scene:
+    """Every effect: four materials, sphere, box and mesh, two kinds of proxy, three kinds of light, a ball, an exposure.
+
+    Args:
+        scale: Metres per unit: everything is that much larger and farther.
+        shift: Where the scene's middle lies, metres.
+        changes: Fields of the scene to replace.
+    """
+
+    def at(*point: float) -> tuple[float, float, float]:
+        x, y, z = (scale * p + s for p, s in zip(point, shift, strict=True))
+        return x, y, z
+
+    def metres(*lengths: float) -> tuple[Any, ...]:
+        return tuple(scale * length for length in lengths)
+
+    rough = MetallicRoughnessMaterial((0.9, 0.8, 0.4), 0.5, 0.3)
+    scene = Scene(
+        camera=Camera(*SIZE, 50.0, 50.0, 23.5, 17.5),
+        marker=Marker(size=0.08),
+        probes=(Probe(at(-0.09, 0.02, 0.04), scale * 0.04),),
+        proxies=(Proxy("plane", at=at(0, 0, 0), size=metres(1.0, 1.0)), Proxy("box", at=at(0.0, 0.13, 0.03), size=metres(0.1, 0.05, 0.06))),
+        objects=(
+            Object("sphere", radius=scale * 0.03, at=at(0.09, 0.0, 0.03), material=PhongMaterial((0.5, 0.4, 0.3), (0.3, 0.3, 0.3), 40.0)),
+            Object("box", size=metres(0.04, 0.04, 0.04), at=at(0.0, -0.08, 0.02), rotate=(0.0, 0.0, 30.0), material=LambertMaterial((0.7, 0.7, 0.7))),
+            Object("torus", major_radius=scale * 0.03, minor_radius=scale * 0.01, at=at(0.05, 0.08, 0.02), material=rough),
+            Object("sphere", radius=scale * 0.02, at=at(-0.02, 0.03, 0.02), material=MirrorMaterial((0.9, 0.9, 0.9))),
+        ),
+        lights=(
+            Light("point", 0.1 * scale**2, at=at(0.0, -0.1, 0.3)),
+            Light("spot", 0.1 * scale**2, at=at(0.2, 0.1, 0.3), target=at(0, 0, 0), inner_angle=10.0, outer_angle=30.0),
+            Light("directional", 0.3, direction=(0.3, 0.2, -1.0)),
+        ),
+        exposure=Exposure(0.7),
+    )
+    return dataclasses.replace(scene, **changes)
+
+
+def make_quality(**rungs: str) -> Quality:
+    """The default preset at a small size, with every stage that a rung can switch off switched on."""
+    base = dataclasses.replace(PRESETS["medium"], environment_height=ENVIRONMENT_HEIGHT, edge_samples=4)
+    switched = {stage.name: stage.rungs[1] for stage in STAGES if stage.rungs[0] == "none"}
+    return base.with_rungs(**{**switched, **rungs})
+
+
+@functools.cache
+def request_for(stage: str, rung: str) -> Request | None:
+    """A request whose plan holds ``stage`` on ``rung``; None if that rung means that the stage does not run."""
+    rungs = {} if rung == "default" else {stage: rung}
+    # Some stages run only where another one is on its best rung, some only without a change of exposure.
+    for others in ({}, {one.name: one.rungs[-1] for one in STAGES if len(one.rungs) > 1}):
+        for exposure in (0.7, 1.0):
+            quality = make_quality(**{**others, **rungs})
+            request = Request(make_scene(exposure=Exposure(exposure)), quality, SIZE, ("image", "environment"))
+            if stage in plan_names(make_plan(request)):
+                return request
+    return None
+
+
+def plan_names(plan: Plan) -> tuple[str, ...]:
+    """Names of the stages that run."""
+    return tuple(stage.name for stage, _ in plan.stages)
+
+
+RUNGS: dict[str, tuple[str, ...]] = {
+    stage.name: tuple(rung for rung in stage.rungs if request_for(stage.name, rung) is not None) for stage in STAGES
+}
+"""Every rung on which a stage does something, by stage."""
+STAGE_RUNGS = [(stage, rung) for stage, rungs in RUNGS.items() for rung in rungs]
+
+
+class FixedPose:
+    """A tracker that knows the pose; None is a lost marker."""
+
+    def __init__(self, pose: Pose | None = POSE) -> None:
+        self.pose = pose
+
+    def track(self, image: Any, time: float) -> Track:
+        """The pose, whatever the picture shows."""
+        state = TrackState.LOST if self.pose is None else TrackState.TRACKED
+        return Track(self.pose, state, 1.0, None, 0.0)
+
+
+class Rig:
+    """One pipeline, and its stages one by one."""
+
+    def __init__(self, device: str, stage: str | None = None, rung: str = "default", *, bands: int = 1, pose: Pose = POSE, **changes: Any) -> None:
+        request = request_for(stage, rung) if stage is not None else None
+        if request is None:
+            request = Request(make_scene(), make_quality(), SIZE)
+        if changes:
+            request = dataclasses.replace(request, scene=dataclasses.replace(request.scene, **changes))
+        self.device = device
+        self.pipeline = Pipeline(request.scene, device=device, quality=request.quality, outputs=("image", "environment"), bands=bands)
+        self.tracker = FixedPose(pose)
+        self.pipeline._tracker = self.tracker  # type: ignore[assignment]
+        self.arrays = self.pipeline.arrays
+        self.count = 0
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pipeline.close()
+
+    def frame(self, image: np.ndarray) -> np.ndarray:
+        """One frame through all stages; returns the picture."""
+        result = self.pipeline(np.ascontiguousarray(image), time_seconds=self.count / 30.0)
+        self.count += 1
+        return result.image
+
+    def stage(self, name: str) -> tuple[Stage, list[Pass]]:
+        """A stage and its passes."""
+        return next((stage, passes) for stage, passes in self.pipeline._scheduler._stages if stage.name == name)
+
+    def poke(self, name: str, values: Any) -> None:
+        """Write the contents of an array; a single value fills it."""
+        array = self.arrays[name]
+        if np.ndim(values) == 0:
+            values = np.full((*array.shape, *_lanes(array)), values, np.float32)
+        array.assign(np.ascontiguousarray(values))
+        self.arrays.touch(name)
+
+    def get(self, name: str) -> np.ndarray:
+        """A copy of an array's contents."""
+        return np.array(self.arrays[name].numpy())
+
+    def run(self, name: str, *, bands: int = 1) -> dict[str, np.ndarray]:
+        """Run one stage, its passes cut into bands; returns copies of what it writes."""
+        stage, passes = self.stage(name)
+        for step in passes:
+            for rows in _bands(step.rows, bands):
+                step.launch(rows)
+        return self.written(name, stage)
+
+    def written(self, name: str, stage: Stage | None = None) -> dict[str, np.ndarray]:
+        """Copies of what a stage writes."""
+        stage = stage or self.stage(name)[0]
+        return {output: self.get(output) for output in stage.wiring.writes}
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Copies of all arrays, to be put back with ``restore``."""
+        return {name: self.get(name) for name, array in self.arrays.items() if isinstance(array, wp.array)}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Put back what ``state`` returned."""
+        for name, values in state.items():
+            if values.size:
+                self.arrays[name].assign(values)
+
+
+def _lanes(array: Any) -> tuple[int, ...]:
+    return tuple(getattr(array.dtype, "_shape_", ()))
+
+
+def _bands(rows: int | None, bands: int) -> list[tuple[int, int] | None]:
+    if rows is None or bands == 1:
+        return [None]
+    edges = [rows * band // bands for band in range(bands + 1)]
+    return [(start, stop) for start, stop in zip(edges, edges[1:], strict=False) if stop > start]
+
+
+def numbers(values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """The numeric parts of an array, those of a structure by name."""
+    if values.dtype.names is None:
+        yield "", values
+        return
+    for name in values.dtype.names:
+        for inner, part in numbers(values[name]):
+            yield f".{name}{inner}", part
+
+
+def assert_finite(outputs: dict[str, np.ndarray], cause: str = "") -> None:
+    """Every number that a stage wrote is one; those that are documented to be infinite are not NaN."""
+    for name, values in outputs.items():
+        for part, found in numbers(values):
+            if found.dtype.kind == "f":
+                good = ~np.isnan(found) & ~np.isneginf(found) if name in MAY_BE_INFINITE else np.isfinite(found)
+                assert good.all(), f"{name}{part}: {(~good).sum()} of {good.size} values are not finite {cause}"
+
+
+def assert_same_bits(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
+    """Outputs are equal bit for bit."""
+    assert one.keys() == other.keys()
+    for name, values in one.items():
+        for (part, a), (_, b) in zip(numbers(values), numbers(other[name]), strict=True):
+            np.testing.assert_array_equal(a.view(f"u{a.itemsize}") if a.dtype.kind == "f" else a, b.view(f"u{b.itemsize}") if b.dtype.kind == "f" else b, err_msg=name + part)
+
+
+def solid_angles(height: int, width: int) -> np.ndarray:
+    """Solid angle of every texel of a row, (height, 1)."""
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return ((edges[:-1] - edges[1:]) * 2.0 * math.pi / width)[:, None]

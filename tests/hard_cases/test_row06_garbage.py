@@ -1,0 +1,247 @@
+"""Row 6: suns over dark skies, outliers, black maps, NaN, Inf, negative and denormal pixels; and what garbage may reach.
+
+Bounds: a finite answer everywhere, no light below zero, and no pixel or texel changed that the bad one cannot reach.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.hard_cases import generators
+from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, RUNGS, SIZE, STAGE_RUNGS, assert_finite, numbers
+from warp_ar.kernels.probe import RIM_START
+
+MAP = (ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT)
+FRAMES = generators.frames(SIZE[1], SIZE[0])
+FINITE = generators.finite_maps(*MAP)
+BROKEN = generators.broken_maps(*MAP)
+# Light that a stage may read as a whole map.
+MAPS = ("probe_radiance", "environment_radiance", "environment_recovered", "environment")
+# What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
+GUARDED = ("accumulate", "fill", "recover", "diffuse", "specular", "room_samples")
+# Signed by nature: directions, positions, coefficients of spherical harmonics.
+SIGNED = ("hits", "hit_object", "irradiance_sh", "key_lights", "room_samples", "virtual", "object_mirrored")
+MAP_READERS = [(stage, rung) for stage, rung in STAGE_RUNGS if stage not in ("unwrap", "summed_area", "visibility")]
+
+
+def assert_light(outputs, cause):
+    assert_finite(outputs, cause)
+    for name, values in outputs.items():
+        for part, found in numbers(values):
+            if found.dtype.kind == "f" and not (name.startswith(SIGNED) and "radiance" not in part):
+                assert (found >= 0).all(), f"{name}{part} is below zero {cause}"
+
+
+@pytest.mark.atlas(row=6)
+@pytest.mark.parametrize(("stage", "rung"), MAP_READERS)
+def test_any_map_gives_finite_light(rig_for, stage, rung):
+    """Maps that a room can have, into every stage that reads one; what no room can have, into those that guard."""
+    rig = rig_for(stage, rung)
+    reads = [name for name in MAPS if name in rig.stage(stage)[0].wiring.reads]
+    # A stage that reads no map itself gets what the stages before it make of one.
+    upstream = [] if reads else [name for name in RUNGS if name in before(rig, stage)]
+    maps = FINITE if not reads or stage not in GUARDED else {**FINITE, **BROKEN}
+    for name, values in maps.items():
+        for target in reads or ["environment"]:
+            rig.poke(target, values)
+            if f"{target}_confidence" in rig.arrays:
+                rig.poke(f"{target}_confidence", 1.0)
+        for earlier in upstream:
+            rig.run(earlier)
+        assert_light(rig.run(stage), f"for the map {name!r}")
+
+
+def before(rig, stage):
+    """Names of the stages between the environment and ``stage``."""
+    names = [one.name for one, _ in rig.pipeline._scheduler._stages]
+    start = names.index("fill") + 1
+    return names[start : names.index(stage)] if stage in names[start:] else []
+
+
+@pytest.mark.atlas(row=6)
+@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+def test_any_frame_gives_finite_light(rig_for, stage, rung):
+    """Frames as corrupt as 8 bits can be, through the whole pipeline."""
+    rig = rig_for(stage, rung)
+    for name, image in FRAMES.items():
+        rig.frame(image)
+        outputs = {key: rig.get(key) for one, _ in rig.pipeline._scheduler._stages for key in one.wiring.writes}
+        assert_light(outputs, f"for the frame {name!r}")
+
+
+@pytest.mark.atlas(row=6, stage="pipeline")
+@pytest.mark.parametrize("name", [*FINITE, *BROKEN])
+def test_garbage_in_the_accumulated_light_is_a_picture_still(rig_for, name):
+    """Whatever stands in the accumulated map, the complete one is light, and everything behind it finite."""
+    rig = rig_for("shade", RUNGS["shade"][-1])
+    rig.poke("environment_radiance", {**FINITE, **BROKEN}[name])
+    rig.poke("environment_confidence", 1.0)
+    names = [one.name for one, _ in rig.pipeline._scheduler._stages]
+    for stage in names[names.index("accumulate") + 1 :]:
+        assert_light(rig.run(stage), f"in {stage}")
+
+
+# --- Containment ------------------------------------------------------------------------------------------------------
+
+
+def changed(rig, name, before_values, output):
+    return (rig.run(name)[output] != before_values[output]).reshape(*before_values[output].shape[:2], -1).any(-1)
+
+
+@pytest.mark.atlas(row=6, stage="unwrap")
+@pytest.mark.parametrize("rung", RUNGS["unwrap"])
+def test_a_pixel_reaches_only_the_texels_that_look_at_it(rig_for, rung):
+    rig = rig_for("unwrap", rung)
+    rig.poke("frame", FRAMES["grey"])
+    clean = rig.run("unwrap")
+    corners = rig.get("unwrap_corners")[:, :, 0]
+    seen = corners[corners[..., 2] > RIM_START]
+    reached = 0
+    for x, y in np.unique(np.round(seen[:, :2]).astype(int), axis=0)[::2]:
+        bad = FRAMES["grey"].copy()
+        bad[y, x] = (255, 0, 7)
+        rig.poke("frame", bad)
+        touched = changed(rig, "unwrap", clean, "probe_radiance")
+        # A bilinear sample inside the texel's quad reads the pixels within one of it.
+        quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, :-1], corners[1:, 1:]])[..., :2]
+        near = ((quads.min(0) < (x + 1, y + 1)) & (quads.max(0) > (x - 1, y - 1))).all(-1)
+        assert not (touched & ~near).any(), f"pixel {x}, {y} changes texels that cannot see it"
+        reached += touched.any()
+    assert reached > 0, "the bad pixels must be seen at all"
+
+
+@pytest.mark.atlas(row=6, stage="accumulate")
+@pytest.mark.atlas(row=7, stage="accumulate")
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -3281.0, -1e-3])
+@pytest.mark.parametrize("where", ["probe_radiance", "probe_confidence", "probe_clipped"])
+def test_what_is_no_light_is_gone_with_its_frame(rig_for, bad, where):
+    """One bad texel in one frame: that texel waits, the others and all later frames are as if it had never been."""
+    rig = rig_for("accumulate", "default")
+    rig.poke("environment_confidence", 0.0)
+    for name, value in (("probe_radiance", 0.5), ("probe_confidence", 1.0), ("probe_clipped", 0.25)):
+        rig.poke(name, value)
+    rig.run("accumulate")
+    state = rig.state()
+    clean, later = rig.run("accumulate"), rig.run("accumulate")
+    rig.restore(state)
+    values = rig.get(where)
+    values[3, 4] = bad
+    rig.poke(where, values)
+    during = rig.run("accumulate")
+    assert_finite(during)
+    other = np.ones(MAP, bool)
+    other[3, 4] = False
+    for name, expected in clean.items():
+        np.testing.assert_array_equal(during[name][other], expected[other])
+    values[3, 4] = state[where][3, 4]
+    rig.poke(where, values)
+    after = rig.run("accumulate")
+    # Values and shares are what they were; the confidence of a texel that was not seen recovers at its own pace.
+    for name in ("environment_radiance", "environment_clipped"):
+        np.testing.assert_array_equal(after[name], later[name])
+
+
+@pytest.mark.atlas(row=6, stage="fill")
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_broken_texel_is_completed_from_its_neighbours(rig_for, bad):
+    """Filled like a hole: within the neighbours' range, and texels that are trusted stay as they are to the bit."""
+    rig = rig_for("fill", "default")
+    room = np.random.default_rng(5).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
+    rig.poke("environment_radiance", room)
+    rig.poke("environment_confidence", 1.0)
+    clean = rig.run("fill")["environment"]
+    room[5, 6] = bad
+    rig.poke("environment_radiance", room)
+    filled = rig.run("fill")["environment"]
+    other = np.ones(MAP, bool)
+    other[5, 6] = False
+    np.testing.assert_array_equal(filled[other], clean[other])
+    assert 0.2 <= filled[5, 6].min() <= filled[5, 6].max() <= 0.8
+
+
+@pytest.mark.atlas(row=6)
+@pytest.mark.parametrize(("stage", "rung"), [(stage, rung) for stage in ("diffuse", "specular") for rung in RUNGS[stage]])
+def test_a_broken_texel_counts_as_no_light(rig_for, stage, rung):
+    """NaN and negative texels act as black ones, to the bit: no neighbour is poisoned."""
+    rig = rig_for(stage, rung)
+    room = np.random.default_rng(6).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
+    room[4, 5] = 0.0
+    rig.poke("environment", room)
+    clean = rig.run(stage)
+    for bad in (np.nan, -np.inf, -3281.0):
+        room[4, 5] = bad
+        rig.poke("environment", room)
+        for name, values in rig.run(stage).items():
+            np.testing.assert_array_equal(values, clean[name])
+
+
+@pytest.mark.atlas(row=6)
+@pytest.mark.parametrize(("stage", "rung"), [("composite", "default"), *(("expose", rung) for rung in RUNGS["expose"])])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1.0, 3e38])
+def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, rung, bad):
+    rig = rig_for(stage, rung)
+    clean = rig.run(stage)["image"]
+    added = rig.get("physical_added")
+    row, column = np.argwhere(added.sum(-1) > 0)[10]
+    added[row, column] = bad
+    rig.poke("physical_added", added)
+    touched = (rig.run(stage)["image"] != clean).any(-1)
+    touched[row, column] = False
+    assert not touched.any()
+
+
+@pytest.mark.atlas(row=6, stage="relight")
+@pytest.mark.parametrize("rung", RUNGS["relight"])
+def test_a_frame_pixel_changes_relighting_only_around_it(rig_for, rung):
+    """Its own light, and the surroundings of those within half a box of it."""
+    rig = rig_for("relight", rung)
+    rig.poke("frame", FRAMES["grey"])
+    if "summed_area" in rig.arrays:
+        rig.run("summed_area")
+    clean = rig.run("relight")
+    bad = FRAMES["grey"].copy()
+    row, column = np.argwhere(clean["physical_added"].sum(-1) > 0)[40]
+    bad[row, column] = 0
+    rig.poke("frame", bad)
+    if "summed_area" in rig.arrays:
+        rig.run("summed_area")
+    touched = changed(rig, "relight", clean, "physical_added")
+    rows, columns = np.nonzero(touched)
+    reach = round(SIZE[1] / 8 / 2) + 1
+    assert (np.abs(rows - row) <= reach).all()
+    assert (np.abs(columns - column) <= reach).all()
+    assert touched[row, column] == (rung != "flat")
+
+
+@pytest.mark.atlas(row=6, stage="summed_area")
+def test_a_frame_pixel_changes_only_boxes_that_hold_it(rig_for):
+    rig = rig_for("summed_area", "default")
+    clean = rig.run("summed_area")
+    bad = rig.get("frame")
+    bad[20, 30] ^= 255
+    rig.poke("frame", bad)
+    touched = changed(rig, "summed_area", clean, "summed_area")
+    assert touched[20:, 30:].all()
+    touched[20:, 30:] = False
+    assert not touched.any()
+
+
+# --- Any magnitude ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.atlas(row=6)
+@pytest.mark.parametrize(("stage", "rung"), [("fill", "default"), ("key_lights", "default"), ("room_samples", "default"), *((s, r) for s in ("diffuse", "specular") for r in RUNGS[s])])
+@given(exponent=st.floats(-8, 8), spread=st.floats(0, 8), row=st.integers(0, MAP[0] - 1), column=st.integers(0, MAP[1] - 1))
+def test_finite_at_any_magnitude(rig_for, stage, rung, exponent, spread, row, column):
+    """A lamp of any radiance over a sky of any other."""
+    rig = rig_for(stage, rung)
+    room = np.full((*MAP, 3), 10.0**exponent, np.float32)
+    room[row, column] = min(10.0 ** (exponent + spread), 1e8)
+    source = "environment_radiance" if stage == "fill" else "environment"
+    rig.poke(source, room)
+    if stage == "fill":
+        rig.poke("environment_confidence", 1.0)
+    assert_light(rig.run(stage), f"for a lamp of {room.max():g} over {room.min():g}")

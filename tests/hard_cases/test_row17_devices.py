@@ -1,0 +1,111 @@
+"""Row 17: CPU and CUDA agree: integers bit for bit, floats within a stated bound. Skipped where there is no CUDA device.
+
+Every stage gets the same inputs, those of the CPU, so errors do not add up from stage to stage. CUDA contracts
+multiplications and additions and has its own sine and exponential: a few units in the last place each.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.hard_cases import generators
+from tests.hard_cases.rig import SIZE, STAGE_RUNGS, Rig, numbers
+
+FRAMES = generators.frames(SIZE[1], SIZE[0])
+CUDA = [str(device) for device in wp.get_cuda_devices()[:1]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """How far a stage's floats may differ."""
+
+    relative: float
+    """Of a value, or of the largest one in its array where that is larger than it."""
+    cause: str
+    share: float = 0.0
+    """Share of the elements that may differ by more: a ray or a sample falls on the other side of an edge."""
+
+
+BOUNDS = {
+    "unwrap": Bound(2e-4, "positions of 1e-7 of a frame's width, times the contrast of noise", 0.01),
+    "accumulate": Bound(1e-5, "exponentials and a dozen roundings"),
+    "recover": Bound(1e-3, "fits of many terms", 0.01),
+    "fill": Bound(1e-5, "sums over a pyramid's levels"),
+    "key_lights": Bound(2e-3, "sums over a window in another order, refined by ten mean shifts"),
+    "diffuse": Bound(1e-5, "sums over the map, in the order of a block's lanes"),
+    "specular": Bound(5e-5, "sums over the map and powers with exponents up to 1e3"),
+    "visibility": Bound(1e-5, "a dozen roundings of a hit", 0.005),
+    "summed_area": Bound(0.0, "integers"),
+    "relight": Bound(1e-4, "shadow edges, powers of distances", 0.005),
+    "room_samples": Bound(1e-4, "cumulative sums inverted: a sample may fall into the neighbouring texel", 0.02),
+    "room_shadow": Bound(2e-3, "one of 64 rays may fall on the other side of an edge", 0.02),
+    "object_light": Bound(2e-3, "one of 32 rays may fall on the other side of an edge", 0.05),
+    "shade": Bound(5e-4, "powers, and edges of silhouettes and shadows", 0.02),
+    "composite": Bound(0.0, "thresholds are exact; a code may move where radiance lies within an ulp of one", 0.001),
+    "expose": Bound(0.0, "as composite", 0.001),
+}
+DEFAULT = Bound(1e-3, "a stage that states no bound of its own", 0.02)
+SEEN_ONLY = ("hits", "object_irradiance", "object_mirrored")
+"""Arrays that are defined only where an object is seen."""
+
+
+def differences(one: np.ndarray, other: np.ndarray, relative: float) -> float:
+    """Share of elements that differ by more than the bound; integers must be equal."""
+    if one.size == 0:
+        return 0.0
+    if one.dtype.kind != "f":
+        return float((one != other).mean())
+    scale = np.abs(one[np.isfinite(one)]).max(initial=0.0)
+    both = np.isfinite(one) & np.isfinite(other)
+    near = np.abs(np.where(both, one, 0.0) - np.where(both, other, 0.0)) <= relative * scale
+    return float((~((one == other) | (both & near))).mean())
+
+
+def compare(stage: str, rung: str, device: str) -> None:
+    bound = BOUNDS.get(stage, DEFAULT)
+    with Rig("cpu", stage, rung) as cpu, Rig(device, stage, rung) as other:
+        for name in ("noise", "torn"):
+            cpu.frame(FRAMES[name])
+            other.frame(FRAMES[name])
+        for name, values in cpu.state().items():
+            # Shapes refer to meshes by numbers that belong to a device.
+            if values.size and "mesh" not in (values.dtype.names or ()):
+                other.arrays[name].assign(values)
+        expected, found = cpu.run(stage), other.run(stage)
+        seen = cpu.get("hit_object") >= 0 if "hit_object" in cpu.arrays else None
+        for name, values in expected.items():
+            for (part, a), (_, b) in zip(numbers(values), numbers(found[name]), strict=True):
+                if seen is not None and name in SEEN_ONLY:
+                    a, b = a[seen], b[seen]
+                share = differences(a, b, bound.relative)
+                assert share <= bound.share, f"{name}{part}: {share:.4%} beyond {bound.relative:g} ({bound.cause})"
+
+
+@pytest.mark.atlas(row=17)
+@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+@pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
+def test_cuda_agrees_with_cpu(stage, rung):
+    compare(stage, rung, CUDA[0])
+
+
+@pytest.mark.parametrize("stage", ["fill", "visibility", "summed_area"])
+def test_the_comparison_itself(stage):
+    """Equal where devices are; sees a difference of more than the bound."""
+    compare(stage, "default", "cpu")
+    values = np.linspace(0.0, 1.0, 101, dtype=np.float32)
+    assert differences(values, values * np.float32(1 + 1e-3), 1e-4) > 0.5
+    assert differences(np.arange(5), np.arange(5) + (np.arange(5) == 3), 0.0) == pytest.approx(0.2)
+
+
+@pytest.mark.atlas(row=17, stage="pipeline")
+@pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
+def test_pictures_of_both_devices():
+    """Whole frames, errors of all stages together: hardly a pixel is off by more than one code."""
+    with Rig("cpu") as cpu, Rig(CUDA[0]) as cuda:
+        for name in ("noise", "ramp", "one saturated pixel"):
+            one, other = cpu.frame(FRAMES[name]).astype(int), cuda.frame(FRAMES[name]).astype(int)
+            assert (np.abs(one - other) > 1).mean() < 0.01, name

@@ -1,0 +1,64 @@
+"""Row 17: the same input gives the same bits: run to run, in 1 to 16 bands, replayed from a captured graph or launched."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.hard_cases import generators
+from tests.hard_cases.rig import SIZE, STAGE_RUNGS, Rig, assert_same_bits
+
+FRAMES = generators.frames(SIZE[1], SIZE[0])
+
+
+@pytest.mark.atlas(row=17)
+@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+def test_run_to_run_and_in_any_bands(rig_for, stage, rung):
+    """What a stage writes is a function of what it reads and of its own state before."""
+    rig = rig_for(stage, rung)
+    state = rig.state()
+    first = rig.run(stage)
+    for bands in (1, 2, 3, 5, 16):
+        rig.restore(state)
+        assert_same_bits(first, rig.run(stage, bands=bands))
+
+
+@pytest.mark.atlas(row=17)
+@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, rung):
+    """Stages without a memory of their own write every element that a reader may look at."""
+    if stage in ("accumulate", "expose", "recover"):
+        pytest.skip("keeps a state from frame to frame")
+    rig = rig_for(stage, rung)
+    state = rig.state()
+    first = rig.run(stage)
+    rig.restore(state)
+    for name in first:
+        values = rig.get(name)
+        if values.dtype.names is None and values.dtype.kind == "f" and name != "hit_depth":
+            rig.poke(name, np.full_like(values, 3.0))
+    second = rig.run(stage)
+    if stage == "object_light":  # defined where an object is seen
+        seen = rig.get("hit_object") >= 0
+        first, second = ({name: values[seen] for name, values in outputs.items()} for outputs in (first, second))
+    assert_same_bits(first, second)
+
+
+@pytest.mark.atlas(row=17, stage="pipeline")
+def test_a_graph_replayed_is_the_stages_launched(device):
+    """Frames that change which stages run, through captured graphs and launched one by one; on CPU both are launched."""
+    with Rig(device) as replayed, Rig(device) as eager:
+        eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
+        for name in ("noise", "noise", "white", "black", "noise", "ramp", "noise"):
+            np.testing.assert_array_equal(replayed.frame(FRAMES[name]), eager.frame(FRAMES[name]), err_msg=name)
+        for stage, _ in replayed.pipeline._scheduler._stages:
+            assert_same_bits(replayed.written(stage.name), eager.written(stage.name))
+
+
+@pytest.mark.atlas(row=17, stage="pipeline")
+@pytest.mark.parametrize("bands", range(2, 17))
+def test_bands_of_threads(bands):
+    """The thread pool's bands, over the rows that matter only."""
+    with Rig("cpu", bands=bands) as rig, Rig("cpu", bands=1) as whole:
+        for name in ("noise", "top half saturated", "ramp"):
+            np.testing.assert_array_equal(rig.frame(FRAMES[name]), whole.frame(FRAMES[name]))
