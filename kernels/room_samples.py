@@ -169,6 +169,7 @@ def draw_samples_kernel(
     count: wp.int32,
     # Out:
     directions_out: wp.array[wp.vec3],
+    flux_out: wp.array[wp.vec3],
     samples_out: wp.array[RoomSample],
 ):
     """Invert the cumulative sums of the mixture for one point."""
@@ -229,6 +230,7 @@ def draw_samples_kernel(
     sample.distance = FAR_AWAY
     sample.origin = origin
     directions_out[index] = sample.direction
+    flux_out[index] = sample.measure * sample.radiance
     samples_out[index] = sample
 
 
@@ -240,6 +242,7 @@ def list_texels_kernel(
     origin: wp.vec3,
     # Out:
     directions_out: wp.array[wp.vec3],
+    flux_out: wp.array[wp.vec3],
     samples_out: wp.array[RoomSample],
 ):
     """Every texel of a map as a sample at its centre."""
@@ -259,6 +262,7 @@ def list_texels_kernel(
     sample.distance = FAR_AWAY
     sample.origin = origin
     directions_out[i * width + j] = sample.direction
+    flux_out[i * width + j] = sample.measure * sample.radiance
     samples_out[i * width + j] = sample
 
 
@@ -291,6 +295,7 @@ def draw_samples(
     rows_sums: wp.array[wp.vec2],
     origin: wp.vec3,
     directions_out: wp.array[wp.vec3],
+    flux_out: wp.array[wp.vec3],
     samples_out: wp.array[RoomSample],
     *,
     rows: Rows | None = None,
@@ -303,6 +308,7 @@ def draw_samples(
         rows_sums: From ``sum_environment``.
         origin: Where the environment was captured, world.
         directions_out: (n,) unit directions of the samples, by themselves for culling.
+        flux_out: (n,) their radiance times solid angle, likewise.
         samples_out: (n,), n a power of two.
         rows: Range of samples; None means all.
     """
@@ -310,7 +316,7 @@ def draw_samples(
         draw_samples_kernel,
         samples_out.shape,
         [environment, cumulative, rows_sums, origin, samples_out.shape[0]],
-        [directions_out, samples_out],
+        [directions_out, flux_out, samples_out],
         rows=rows,
         device=environment.device,
     )
@@ -320,6 +326,7 @@ def list_texels(
     environment: wp.array2d[wp.vec3],
     origin: wp.vec3,
     directions_out: wp.array[wp.vec3],
+    flux_out: wp.array[wp.vec3],
     samples_out: wp.array[RoomSample],
     *,
     rows: Rows | None = None,
@@ -330,6 +337,7 @@ def list_texels(
         environment: (h, w) radiance.
         origin: Where the environment was captured, world.
         directions_out: (h * w,) directions of the samples.
+        flux_out: (h * w,) their radiance times solid angle.
         samples_out: (h * w,).
         rows: Band of the map's rows; None means all.
     """
@@ -337,7 +345,7 @@ def list_texels(
         list_texels_kernel,
         environment.shape,
         [environment, origin],
-        [directions_out, samples_out],
+        [directions_out, flux_out, samples_out],
         rows=rows,
         device=environment.device,
     )

@@ -71,6 +71,8 @@ class RoomShadowConfig:
     """Pixels along a tile; there are side^2 sets."""
     bounce: bool
     """Whether objects reflect light onto the desk."""
+    near: bool = False
+    """Whether some samples are lamps at a known distance."""
 
 
 @wp.func
@@ -90,17 +92,30 @@ def cone_threshold(to_center: wp.vec3, radius: wp.float32) -> wp.float32:
     return wp.sqrt(squared)
 
 
-@wp.func
-def mask_cone(
-    directions: wp.array[wp.vec3], first: wp.int32, count: wp.int32, to_center: wp.vec3, radius: wp.float32
-) -> wp.uint64:
-    """Which of up to 64 directions point at a sphere."""
-    threshold = cone_threshold(to_center, radius)
-    mask = wp.uint64(0)
-    for k in range(count):
-        if wp.dot(directions[first + k], to_center) >= threshold:
-            mask = mask | (wp.uint64(1) << wp.uint64(k))
-    return mask
+@functools.cache
+def make_mask_cone(count: int, near: bool) -> wp.Function:
+    """``mask_cone(directions, samples, first, point, to_center, radius) -> uint64``: samples that point at a sphere."""
+
+    @wp.func(module="unique")
+    def mask_cone(
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        first: wp.int32,
+        point: wp.vec3,
+        to_center: wp.vec3,
+        radius: wp.float32,
+    ) -> wp.uint64:
+        threshold = cone_threshold(to_center, radius)
+        mask = wp.uint64(0)
+        for k in range(count):
+            direction = directions[first + k]
+            if wp.static(near):
+                direction = sample_toward(samples[first + k], point).direction
+            if wp.dot(direction, to_center) >= threshold:
+                mask = mask | (wp.uint64(1) << wp.uint64(k))
+        return mask
+
+    return mask_cone
 
 
 @functools.cache
@@ -221,6 +236,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     trace = make_trace(config.room.trace)
     closest_proxy, closest_object = trace.closest_proxy, trace.closest_object
     occluded_by_objects, occluded_by_proxies = trace.occluded_by_objects, trace.occluded_by_proxies
+    mask_cone = make_mask_cone(min(config.count, CHUNK), config.near)
     bounced = make_bounced(config.room)
     find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
     side = config.side
@@ -237,6 +253,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         scene: RayScene,
         room: Room,
         directions: wp.array[wp.vec3],
+        flux: wp.array[wp.vec3],
         samples: wp.array[RoomSample],
         stride: wp.int32,
         # Out:
@@ -269,7 +286,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         own = hit.shape
         everywhere = wp.uint64(0) - wp.uint64(1)
         without = wp.vec3(0.0)
-        with_objects = wp.vec3(0.0)
+        change = wp.vec3(0.0)
         first = wp.static(config.count) * ((i % side) * side + j % side)
         for part in range(wp.static(config.count // chunk)):
             at = first + part * wp.static(chunk)
@@ -277,7 +294,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
             for index in range(scene.objects.shape[0]):
                 shape = scene.objects[index]
                 virtual_mask = virtual_mask | mask_cone(
-                    directions, at, wp.static(chunk), shape.position - point, bounding_radius(shape)
+                    directions, samples, at, point, shape.position - point, bounding_radius(shape)
                 )
             if wp.static(config.count == chunk):
                 if virtual_mask == wp.uint64(0):
@@ -290,65 +307,73 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         proxy_mask = everywhere
                 elif shape.kind != BOX or index != own:
                     proxy_mask = proxy_mask | mask_cone(
-                        directions, at, wp.static(chunk), shape.position - point, bounding_radius(shape)
+                        directions, samples, at, point, shape.position - point, bounding_radius(shape)
                     )
             ball_mask = wp.uint64(0)
             if wp.static(config.room.probes):
                 for index in range(room.probes.shape[0]):
                     probe = room.probes[index]
                     ball_mask = ball_mask | mask_cone(
-                        directions, at, wp.static(chunk), probe.center - point, probe.radius
+                        directions, samples, at, point, probe.center - point, probe.radius
                     )
-
+            # Most samples meet nothing: they are but a sum.
+            met = virtual_mask | proxy_mask | ball_mask
             for k in range(wp.static(chunk)):
-                sample = samples[at + k]
-                toward = sample_toward(sample, point)
-                cosine = wp.dot(hit.normal, toward.direction)
-                if cosine > 0.0 and wp.dot(hit.geometric_normal, toward.direction) > 0.0:
-                    weight = cosine * toward.measure
-                    bit = wp.uint64(1) << wp.uint64(k)
-                    origin = offset_origin(point, hit.geometric_normal, toward.direction, hit.error)
+                bit = wp.uint64(1) << wp.uint64(k)
+                direction = directions[at + k]
+                reach = float(FAR)
+                grown = float(1.0)
+                if wp.static(config.near):
+                    toward = sample_toward(samples[at + k], point)
+                    direction = toward.direction
                     reach = toward.distance
-                    radiance = sample.radiance
-                    if (ball_mask & bit) != wp.uint64(0):
-                        radiance = wp.vec3(0.0)
-                    elif (proxy_mask & bit) != wp.uint64(0):
-                        if wp.static(config.bounce):
-                            proxy = closest_proxy(scene, origin, toward.direction, reach)
-                            if proxy.shape >= 0:
-                                reach = proxy.t
-                                radiance = wp.vec3(0.0)
-                                pixel = find_in_frame(
-                                    params[0],
-                                    frame.shape[0],
-                                    frame.shape[1],
-                                    scene,
-                                    room.probes,
-                                    proxy.point,
-                                    proxy.geometric_normal,
-                                )
-                                if pixel[0] >= 0.0:
-                                    radiance = look_up(frame, decode_table, pixel[0], pixel[1])
-                        else:
-                            if occluded_by_proxies(scene, origin, toward.direction, reach):
-                                radiance = wp.vec3(0.0)
-                    without += weight * radiance
-                    if (virtual_mask & bit) != wp.uint64(0):
-                        if wp.static(config.bounce):
-                            other = closest_object(scene, origin, toward.direction, reach)
-                            if other.shape >= 0:
-                                seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
-                                radiance = bounced(
-                                    params[0], frame, decode_table, scene, room, other, toward.direction, seed
-                                )
-                        else:
-                            if occluded_by_objects(scene, origin, toward.direction, reach):
-                                radiance = wp.vec3(0.0)
-                    with_objects += weight * radiance
+                    grown = toward.measure / samples[at + k].measure
+                cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
+                if cosine > 0.0:
+                    if (met & bit) == wp.uint64(0):
+                        without += cosine * grown * flux[at + k]
+                    else:
+                        measure = samples[at + k].measure
+                        weight = cosine * grown * measure
+                        origin = offset_origin(point, hit.geometric_normal, direction, hit.error)
+                        radiance = samples[at + k].radiance
+                        if (ball_mask & bit) != wp.uint64(0):
+                            radiance = wp.vec3(0.0)
+                        elif (proxy_mask & bit) != wp.uint64(0):
+                            if wp.static(config.bounce):
+                                proxy = closest_proxy(scene, origin, direction, reach)
+                                if proxy.shape >= 0:
+                                    reach = proxy.t
+                                    radiance = wp.vec3(0.0)
+                                    pixel = find_in_frame(
+                                        params[0],
+                                        frame.shape[0],
+                                        frame.shape[1],
+                                        scene,
+                                        room.probes,
+                                        proxy.point,
+                                        proxy.geometric_normal,
+                                    )
+                                    if pixel[0] >= 0.0:
+                                        radiance = look_up(frame, decode_table, pixel[0], pixel[1])
+                            else:
+                                if occluded_by_proxies(scene, origin, direction, reach):
+                                    radiance = wp.vec3(0.0)
+                        without += weight * radiance
+                        if (virtual_mask & bit) != wp.uint64(0):
+                            if wp.static(config.bounce):
+                                other = closest_object(scene, origin, direction, reach)
+                                if other.shape >= 0:
+                                    seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
+                                    light = bounced(params[0], frame, decode_table, scene, room, other, direction, seed)
+                                    change += weight * (light - radiance)
+                            else:
+                                if occluded_by_objects(scene, origin, direction, reach):
+                                    change -= weight * radiance
         ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
         for channel in range(3):
             if without[channel] > MIN_IRRADIANCE:
-                ratio[channel] = wp.min(with_objects[channel] / without[channel], MAX_RATIO)
+                ratio[channel] = wp.clamp(1.0 + change[channel] / without[channel], 0.0, MAX_RATIO)
         ratio_out[i, j] = ratio
 
     return room_shadow_kernel
@@ -358,46 +383,71 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
 def filter_ratio_kernel(
     # In:
     row_start: wp.int32,
-    params: wp.array[FrameParams],
     ratio: wp.array2d[wp.vec4],
     surface: wp.array2d[wp.int32],
     side: wp.int32,
-    stride: wp.int32,
     # Out:
-    physical_ratio_out: wp.array2d[wp.vec3],
+    filtered_out: wp.array2d[wp.vec3],
 ):
     """Mean over one tile's worth of neighbours on the same surface."""
     i, j = wp.tid()
     i += row_start
-    one = wp.vec3(1.0, 1.0, 1.0)
-    physical_ratio_out[i, j] = one
-    if not inside_rect(i, j, params[0].shadow_rect):
-        return
-    ci = wp.min(i / stride, ratio.shape[0] - 1)
-    cj = wp.min(j / stride, ratio.shape[1] - 1)
-    key = surface[ci, cj]
+    key = surface[i, j]
     if key < 0:
         return
-    # Continuous coordinates in cells. The window is a box of `side` cells with soft ends: a cell at distance d counts
-    # clamp(side / 2 + 1/2 - d, 0, 1), so that every set has the same weight wherever the window lies.
-    y = (wp.float32(i) - wp.float32(stride / 2)) / wp.float32(stride)
-    x = (wp.float32(j) - wp.float32(stride / 2)) / wp.float32(stride)
-    half = 0.5 * wp.float32(side) + 0.5
-    depth = ratio[ci, cj][3]
+    depth = ratio[i, j][3]
+    reach = side / 2
     total = wp.vec3(0.0)
     weights = float(0.0)
-    for ni in range(wp.max(wp.int32(wp.ceil(y - half)), 0), wp.min(wp.int32(wp.floor(y + half)) + 1, ratio.shape[0])):
-        vertical = wp.min(half - wp.abs(wp.float32(ni) - y), 1.0)
-        for nj in range(
-            wp.max(wp.int32(wp.ceil(x - half)), 0), wp.min(wp.int32(wp.floor(x + half)) + 1, ratio.shape[1])
-        ):
+    for ni in range(wp.max(i - reach, 0), wp.min(i + reach + 1, ratio.shape[0])):
+        for nj in range(wp.max(j - reach, 0), wp.min(j + reach + 1, ratio.shape[1])):
             if surface[ni, nj] == key:
                 value = ratio[ni, nj]
-                weight = vertical * wp.min(half - wp.abs(wp.float32(nj) - x), 1.0)
+                weight = float(1.0)
+                if side > 1:
+                    weight = wp.where(wp.abs(ni - i) == reach, 0.5, 1.0) * wp.where(wp.abs(nj - j) == reach, 0.5, 1.0)
                 # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
                 if key % 8 == MESH_KEY and wp.abs(value[3] - depth) > DEPTH_STEP * depth:
                     weight = 0.0
                 total += weight * wp.vec3(value[0], value[1], value[2])
+                weights += weight
+    filtered_out[i, j] = total / weights
+
+
+@wp.kernel(enable_backward=False)
+def spread_ratio_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    filtered: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    # Out:
+    physical_ratio_out: wp.array2d[wp.vec3],
+):
+    """From cells to pixels: bilinear among the cells on the surface of the nearest one."""
+    i, j = wp.tid()
+    i += row_start
+    physical_ratio_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
+    if not inside_rect(i, j, params[0].shadow_rect):
+        return
+    key = surface[wp.min(i / stride, surface.shape[0] - 1), wp.min(j / stride, surface.shape[1] - 1)]
+    if key < 0:
+        return
+    # Cell c was estimated at pixel c * stride + stride / 2.
+    y = wp.float32(i - stride / 2) / wp.float32(stride)
+    x = wp.float32(j - stride / 2) / wp.float32(stride)
+    row = wp.int32(wp.floor(y))
+    column = wp.int32(wp.floor(x))
+    total = wp.vec3(0.0)
+    weights = float(0.0)
+    for a in range(2):
+        for b in range(2):
+            weight = (1.0 - wp.abs(y - wp.float32(row + a))) * (1.0 - wp.abs(x - wp.float32(column + b)))
+            ni = wp.clamp(row + a, 0, surface.shape[0] - 1)
+            nj = wp.clamp(column + b, 0, surface.shape[1] - 1)
+            if weight > 0.0 and surface[ni, nj] == key:
+                total += weight * filtered[ni, nj]
                 weights += weight
     if weights > 0.0:
         physical_ratio_out[i, j] = total / weights
@@ -412,6 +462,7 @@ def shade_room(
     scene: RayScene,
     room: Room,
     directions: wp.array[wp.vec3],
+    flux: wp.array[wp.vec3],
     samples: wp.array[RoomSample],
     stride: int,
     ratio_out: wp.array2d[wp.vec4],
@@ -430,6 +481,7 @@ def shade_room(
         scene: Objects and proxies.
         room: The room's light; what ``config.room`` leaves out may be empty.
         directions: (config.side^2 * config.count,) directions of the samples, set after set.
+        flux: (the same) radiance times solid angle of the samples.
         samples: (the same) the samples.
         stride: Pixels from one estimate to the next.
         ratio_out: (ceil(H / stride), ceil(W / stride)) RGB ratio and depth.
@@ -439,7 +491,7 @@ def shade_room(
     launch_rows(
         make_room_shadow_kernel(config),
         ratio_out.shape,
-        [params, rays, frame, decode_table, scene, room, directions, samples, stride],
+        [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride],
         [ratio_out, surface_out],
         rows=rows,
         device=rays.device,
@@ -447,31 +499,56 @@ def shade_room(
 
 
 def filter_ratio(
-    params: wp.array[FrameParams],
     ratio: wp.array2d[wp.vec4],
     surface: wp.array2d[wp.int32],
     side: int,
-    stride: int,
-    physical_ratio_out: wp.array2d[wp.vec3],
+    filtered_out: wp.array2d[wp.vec3],
     *,
     rows: Rows | None = None,
 ) -> None:
     """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded.
 
     Args:
-        params: (1,) FrameParams: shadow_rect.
         ratio: From ``shade_room``.
         surface: From ``shade_room``.
         side: Cells along a tile.
+        filtered_out: As ``ratio``, without the depth; written only where a surface is seen.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        filter_ratio_kernel,
+        surface.shape,
+        [ratio, surface, side],
+        [filtered_out],
+        rows=rows,
+        device=surface.device,
+    )
+
+
+def spread_ratio(
+    params: wp.array[FrameParams],
+    filtered: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: int,
+    physical_ratio_out: wp.array2d[wp.vec3],
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Give every pixel its ratio.
+
+    Args:
+        params: (1,) FrameParams: shadow_rect.
+        filtered: From ``filter_ratio``.
+        surface: From ``shade_room``.
         stride: Pixels per cell.
         physical_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
         rows: Band of rows; None means all.
     """
     launch_rows(
-        filter_ratio_kernel,
+        spread_ratio_kernel,
         physical_ratio_out.shape,
-        [params, ratio, surface, side, stride],
+        [params, filtered, surface, stride],
         [physical_ratio_out],
         rows=rows,
-        device=ratio.device,
+        device=surface.device,
     )

@@ -47,6 +47,7 @@ class RoomSamples(Stage):
         specs = {
             "room_samples": ArraySpec((count,), RoomSample, RoomSample()),
             "room_samples_directions": ArraySpec((count,), wp.vec3),
+            "room_samples_flux": ArraySpec((count,), wp.vec3),
         }
         if self.request.quality.rung("room_shadow") == "brute_force":
             size = min(REFERENCE_SIZE[0], height), min(REFERENCE_SIZE[1], 2 * height)
@@ -60,16 +61,16 @@ class RoomSamples(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Sum, then invert; or list the texels of a small map."""
         environment, samples = arrays["environment"], arrays["room_samples"]
-        directions = arrays["room_samples_directions"]
+        directions, flux = arrays["room_samples_directions"], arrays["room_samples_flux"]
         origin = wp.vec3(*self.request.scene.probes[0].center)
         small = arrays.get("room_samples_map")
         if small is not None:
             return [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
-                Pass(lambda rows: room_samples.list_texels(small, origin, directions, samples)),
+                Pass(lambda rows: room_samples.list_texels(small, origin, directions, flux, samples)),
             ]
         cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
         return [
             Pass(lambda rows: room_samples.sum_environment(environment, cumulative, sums)),
-            Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, directions, samples)),
+            Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, directions, flux, samples)),
         ]

@@ -34,9 +34,9 @@ class Rung:
 
 
 RUNGS: Mapping[str, Rung] = {
-    "half": Rung(64, 4, 2, False),
-    "sampled": Rung(64, 4, 1, False),
-    "bounce": Rung(64, 4, 1, True),
+    "sampled": Rung(64, 4, 2, False),
+    "bounce": Rung(64, 4, 2, True),
+    "fine": Rung(64, 4, 1, True),
     "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),
 }
 """Cheapest first, after ``none``."""
@@ -114,6 +114,7 @@ class RoomShadow(Stage):
         specs = {
             "physical_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "room_shadow_ratio": ArraySpec(cells, wp.vec4),
+            "room_shadow_filtered": ArraySpec(cells, wp.vec3),
             "room_shadow_surface": ArraySpec(cells, wp.int32, -1),
         }
         if METALLIC_ROUGHNESS in room_config(self.request).models:
@@ -132,7 +133,8 @@ class RoomShadow(Stage):
         if dfg is not None:
             integrate_dfg(dfg)
         room = make_room(forms, self.request, arrays, dfg)
-        ratio, surface, out = (arrays[name] for name in ("room_shadow_ratio", "room_shadow_surface", "physical_ratio"))
+        ratio, surface, filtered = (arrays[f"room_shadow_{name}"] for name in ("ratio", "surface", "filtered"))
+        out = arrays["physical_ratio"]
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode", "ray_scene")]
         shadow_rows = arrays["shadow_rows"]
 
@@ -147,6 +149,7 @@ class RoomShadow(Stage):
                 *inputs,
                 room,
                 arrays["room_samples_directions"],
+                arrays["room_samples_flux"],
                 arrays["room_samples"],
                 rung.stride,
                 ratio,
@@ -155,9 +158,13 @@ class RoomShadow(Stage):
             )
 
         def average(rows: Rows | None) -> None:
-            room_shadow.filter_ratio(arrays["params"], ratio, surface, rung.side, rung.stride, out, rows=rows)
+            room_shadow.filter_ratio(ratio, surface, rung.side, filtered, rows=rows)
+
+        def spread(rows: Rows | None) -> None:
+            room_shadow.spread_ratio(arrays["params"], filtered, surface, rung.stride, out, rows=rows)
 
         return [
             Pass(estimate, rows=ratio.shape[0], extent=cells),
-            Pass(average, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
+            Pass(average, rows=ratio.shape[0], extent=cells),
+            Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
         ]
