@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import warp as wp
@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import relight
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.visibility import GrowingRows
 
 
 class Relight(Stage):
@@ -65,7 +66,7 @@ class Relight(Stage):
                 rows=rows,
             )
 
-        return [Pass(launch, rows=self.request.size[1], extent=_with_previous(arrays["light_rows"]))]
+        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["light_rows"]))]
 
 
 def relight_rung(request: Request) -> str:
@@ -76,22 +77,3 @@ def relight_rung(request: Request) -> str:
 def irradiance_name(request: Request) -> str:
     """Resource that holds the room's irradiance at this quality."""
     return "irradiance_sh" if request.quality.rung("diffuse") == "sh2" else "irradiance_map"
-
-
-def _with_previous(extent: Callable[[], Rows]) -> Callable[[], Rows]:
-    """Rows of this frame and of the last one, whose light must be erased."""
-    previous = (0, 0)
-
-    def both() -> Rows:
-        nonlocal previous
-        current = extent()
-        if current[1] <= current[0]:
-            union = previous
-        elif previous[1] <= previous[0]:
-            union = current
-        else:
-            union = (min(current[0], previous[0]), max(current[1], previous[1]))
-        previous = current
-        return union
-
-    return both
