@@ -1,0 +1,256 @@
+"""Scenes as the page edits them: whatever it changes is checked as a scene file is."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from warp_ar.errors import UsageError
+from warp_ar.geometry import load_mesh
+from warp_ar.quality import Quality
+from warp_ar.scene import (
+    Exposure,
+    LambertMaterial,
+    Light,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    Object,
+    PhongMaterial,
+    Scene,
+    dumps_scene,
+    loads_scene,
+)
+from warp_ar.stages import STAGES
+from warp_ar.viewer.protocol import EFFECTS
+
+MOST_THINGS: Final = 16
+"""Objects or lights in a scene that the page may add to."""
+
+_LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
+# No key that names a file is among them.
+_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
+    "object": ("at", "rotate", "scale", "radius", "size", "major_radius", "minor_radius"),
+    "light": ("at", "target", "direction", "color", "intensity", "inner_angle", "outer_angle", "radius"),
+    "proxy": ("at", "rotate", "size"),
+    "probe": ("center", "radius", "reflectance"),
+    "exposure": ("scale",),
+    "marker": ("dictionary", "id", "size"),
+}
+_MATERIAL_KEYS: Final = ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness")
+_MODELS: Final[Mapping[str, type[Material]]] = {
+    "lambert": LambertMaterial,
+    "phong": PhongMaterial,
+    "metallic_roughness": MetallicRoughnessMaterial,
+    "mirror": MirrorMaterial,
+}
+_NEW: Final[Mapping[str, Object | Light]] = {
+    "sphere": Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
+    "box": Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
+    "torus": Object(
+        "torus",
+        major_radius=0.03,
+        minor_radius=0.011,
+        at=(0.12, -0.08, 0.011),
+        material=MetallicRoughnessMaterial((1.0, 0.77, 0.34), 1.0, 0.25),
+    ),
+    "point": Light("point", 0.12, at=(0.05, -0.05, 0.2)),
+    "spot": Light("spot", 1.0, at=(0.0, -0.1, 0.35), target=(0.05, 0.05, 0.0), inner_angle=12.0, outer_angle=20.0),
+    "directional": Light("directional", 0.6, direction=(0.4, 0.5, -1.0)),
+}
+
+
+def checked(scene: Scene) -> Scene:
+    """The scene as its file would be read.
+
+    Raises:
+        SceneError: The file would be refused.
+    """
+    return dataclasses.replace(loads_scene(dumps_scene(scene)), path=scene.path)
+
+
+def set_value(scene: Scene, thing: str, index: int, key: str, value: Any) -> Scene:
+    """The scene with one key of one thing changed.
+
+    Args:
+        scene: The scene.
+        thing: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
+        index: Which one.
+        key: A key of the scene file's section, or of its material.
+        value: A number, a tuple of numbers or a word.
+
+    Raises:
+        UsageError: There is no such thing, or it has no such key that could be edited.
+        SceneError: The scene file would refuse the value.
+    """
+    if thing in ("exposure", "marker"):
+        section = dataclasses.replace(getattr(scene, thing), **{_key(thing, key): value})
+        changed: dict[str, Any] = {thing: section}
+        return checked(dataclasses.replace(scene, **changed))
+    items = list(getattr(scene, _LISTS[thing]))
+    if index >= len(items):
+        raise UsageError(f"{thing} {index}: the scene has {len(items)}")
+    item = items[index]
+    if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
+        items[index] = dataclasses.replace(item, material=_material(item.material, key, value))
+    else:
+        changes = {_key(thing, key): value}
+        if thing == "light" and key in ("target", "direction"):
+            changes["direction" if key == "target" else "target"] = None
+        items[index] = dataclasses.replace(item, **changes)
+    return _with_list(scene, thing, tuple(items))
+
+
+def _with_list(scene: Scene, thing: str, items: tuple[Any, ...]) -> Scene:
+    changed: dict[str, Any] = {_LISTS[thing]: items}
+    return checked(dataclasses.replace(scene, **changed))
+
+
+def _key(thing: str, key: str) -> str:
+    if key not in _KEYS[thing]:
+        raise UsageError(f"{thing}: key {key!r} cannot be edited; expected {', '.join(_KEYS[thing])}")
+    return key
+
+
+def _material(material: Material, key: str, value: Any) -> Material:
+    if key == "model":
+        if value not in _MODELS:
+            raise UsageError(f"material: model {value!r}; expected {', '.join(_MODELS)}")
+        color: Any = next(iter(vars(material).values()))  # the first field of every model is its colour
+        return _MODELS[value](color)
+    if key not in vars(material):
+        raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
+    color_like = isinstance(vars(material)[key], tuple | Path)
+    if color_like != isinstance(value, tuple):
+        raise UsageError(f"material: {key} takes {'a colour' if color_like else 'a number'}")
+    return dataclasses.replace(material, **{key: value})
+
+
+def add_thing(scene: Scene, thing: str, kind: str) -> Scene:
+    """The scene with a new object or light of ``kind``."""
+    items = getattr(scene, _LISTS[thing])
+    if len(items) >= MOST_THINGS:
+        raise UsageError(f"{len(items)} are on the desk already; {MOST_THINGS} at most: take one away first")
+    return _with_list(scene, thing, (*items, _NEW[kind]))
+
+
+def remove_thing(scene: Scene, thing: str, index: int) -> Scene:
+    """The scene without one object or light."""
+    items = getattr(scene, _LISTS[thing])
+    if index >= len(items):
+        raise UsageError(f"{thing} {index}: the scene has {len(items)}")
+    return _with_list(scene, thing, items[:index] + items[index + 1 :])
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """What the viewers want to see."""
+
+    scene: Scene
+    """The scene, edited."""
+    quality: Quality
+    """The preset."""
+    off: frozenset[str] = frozenset()
+    """Effects that are switched off."""
+    hidden: frozenset[tuple[str, int]] = frozenset()
+    """(thing, index) of objects and lights that are hidden."""
+    rungs: tuple[tuple[str, str], ...] = ()
+    """(stage, rung) that differ from the preset's."""
+
+    def shown_scene(self) -> Scene:
+        """The scene without what is hidden or switched off: the one that a file of this picture holds."""
+        scene = self.scene
+
+        def seen(thing: str, effect: str) -> tuple[Any, ...]:
+            items = getattr(scene, _LISTS[thing])
+            return tuple(x for i, x in enumerate(items) if effect not in self.off and (thing, i) not in self.hidden)
+
+        return dataclasses.replace(
+            scene,
+            objects=seen("object", "objects"),
+            lights=seen("light", "lights"),
+            probes=seen("probe", "room"),
+            proxies=seen("proxy", "desk"),
+            exposure=Exposure() if "exposure" in self.off else scene.exposure,
+        )
+
+    def shown_quality(self) -> Quality:
+        """The quality without what is switched off."""
+        rungs = dict(self.rungs)
+        if "relief" in self.off:
+            rungs["relight"] = "flat"
+        if "room_shadow" in self.off:
+            rungs["room_shadow"] = "none"
+        return self.quality.with_rungs(**rungs) if rungs else self.quality
+
+    def without_thing(self, thing: str, index: int) -> Wanted:
+        """With one object or light removed; what is hidden stays hidden."""
+        hidden = {(t, i - (t == thing and i > index)) for t, i in self.hidden if (t, i) != (thing, index)}
+        return dataclasses.replace(self, scene=remove_thing(self.scene, thing, index), hidden=frozenset(hidden))
+
+    def with_rung(self, stage: str, rung: str) -> Wanted:
+        """With a stage on another rung than the preset's; an empty name goes back.
+
+        Raises:
+            UsageError: There is no such stage or rung.
+        """
+        known = {kind.name: kind.rungs for kind in STAGES}
+        if stage not in known or (rung and rung not in known[stage]):
+            raise UsageError(f"stage {stage!r} has no rung {rung!r}")
+        rungs = {**dict(self.rungs), stage: rung}
+        return dataclasses.replace(self, rungs=tuple(sorted((s, r) for s, r in rungs.items() if r)))
+
+    def with_effect(self, name: str, on: bool) -> Wanted:
+        """With an effect switched."""
+        return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
+
+
+def wanted_record(wanted: Wanted) -> dict[str, Any]:
+    """What the page needs to know of a scene, as plain data; of files only their names."""
+    scene = wanted.scene
+
+    def plain(item: Any) -> dict[str, Any]:
+        fields = {key: value.name if isinstance(value, Path) else value for key, value in vars(item).items()}
+        return {
+            key: value for key, value in fields.items() if isinstance(value, str | int | float | tuple) or value is None
+        }
+
+    def thing(kind: str, index: int, item: Any) -> dict[str, Any]:
+        record = {**plain(item), "visible": (kind, index) not in wanted.hidden, "animated": item.animate is not None}
+        if isinstance(item, Object):
+            model = next(name for name, made in _MODELS.items() if isinstance(item.material, made))
+            record["material"] = {"model": model, **plain(item.material)}
+            record["reach"] = _reach(item)
+        return record
+
+    return {
+        "name": scene.name,
+        "objects": [thing("object", i, item) for i, item in enumerate(scene.objects)],
+        "lights": [thing("light", i, item) for i, item in enumerate(scene.lights)],
+        "probes": [plain(item) for item in scene.probes],
+        "exposure": scene.exposure.scale,
+        "marker": {"dictionary": scene.marker.dictionary, "id": scene.marker.id, "size": scene.marker.size},
+        "effects": {name: name not in wanted.off for name in EFFECTS},
+        "quality": wanted.quality.name,
+        "rungs": dict(wanted.rungs),
+    }
+
+
+def _reach(item: Object) -> float:
+    """Radius in metres of a circle on the desk around an object's position, unscaled and unrotated, that holds it."""
+    if item.shape == "mesh":
+        assert item.file is not None
+        return item.scale * _mesh_reach(item.file)
+    if item.shape == "box":
+        return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
+    return item.scale * (item.radius + item.major_radius + item.minor_radius)
+
+
+@functools.lru_cache(maxsize=32)
+def _mesh_reach(file: Path) -> float:
+    return float(np.abs(load_mesh(file).bounds)[:, :2].max())

@@ -1,0 +1,484 @@
+"""Serves the page, over HTTP and one WebSocket per viewer.
+
+A viewer is sent a frame only after it has shown an earlier one: two are under way at most, and the newest wins. Pictures
+are encoded once for all viewers, and only if one is ready for them. Nothing that a viewer sends is trusted; one that
+breaks the rules is dropped with a reason, and no other notices.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import hmac
+import importlib.resources
+import json
+import ssl
+import time
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.quality import PRESETS
+from warp_ar.scene import bundled_scenes
+from warp_ar.viewer import protocol
+from warp_ar.viewer.host import Host, Lit
+
+LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
+JPEG_QUALITY: Final = 85
+"""At 640x480 a desk takes 60 KB; at 95 it takes twice that."""
+MOST_VIEWERS: Final = 8
+IN_FLIGHT: Final = 2
+"""Frames that a viewer may have unshown: one on the way while another is decoded."""
+SEND_SECONDS: Final = 20.0
+"""A viewer that takes nothing for so long is dropped."""
+STATE_SECONDS: Final = 0.5
+MESSAGES_PER_SECOND: Final = 240.0
+BYTES_PER_SECOND: Final = 8e6
+"""Thirty pictures a second of a camera at 1920x1080."""
+LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
+
+_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:; "
+    "media-src 'self' blob:; connect-src 'self' ws: wss:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS: Final = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",  # the address holds the token
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
+    """JPEG of an RGB picture."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1])
+
+
+def encode_light(light: npt.NDArray[np.float32]) -> bytes:
+    """PNG of an environment: x / (1 + x), so that what clips in the camera still shows, encoded as sRGB."""
+    value = np.maximum(light, 0.0)
+    value = value / (1.0 + value)
+    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
+    return bytes(cv2.imencode(".png", np.uint8(np.round(encoded[..., ::-1] * 255.0)))[1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Address:
+    """Where the page is served, and what it takes to see it."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on."""
+    port: int = 8720
+    token: str | None = None
+    """Secret that the page's address must hold; None asks for none."""
+    tls: ssl.SSLContext | None = None
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can reach it."""
+        return self.host in LOOPBACK
+
+    @property
+    def url(self) -> str:
+        """The page's address as it is printed."""
+        host = (
+            "localhost" if self.host in ("0.0.0.0", "::", "") else f"[{self.host}]" if ":" in self.host else self.host
+        )
+        return f"http{'s' * (self.tls is not None)}://{host}:{self.port}/" + (
+            f"?token={self.token}" if self.token else ""
+        )
+
+
+class _Viewer:
+    """One WebSocket."""
+
+    def __init__(self, socket: web.WebSocketResponse) -> None:
+        self.socket = socket
+        self.wake = asyncio.Event()
+        self.queue: asyncio.Queue[str | bytes] = asyncio.Queue(64)
+        self.sent = 0
+        """Number of the newest frame sent."""
+        self.unshown: set[int] = set()
+        self.compare = ""
+        self.messages = protocol.Bucket(MESSAGES_PER_SECOND, 2 * MESSAGES_PER_SECOND)
+        self.bytes = protocol.Bucket(BYTES_PER_SECOND, 2 * BYTES_PER_SECOND)
+        self.picture: asyncio.Task[None] | None = None
+
+    def tell(self, message: str | bytes) -> None:
+        """Send a message when there is room; a viewer that lets 64 pile up misses some."""
+        with contextlib.suppress(asyncio.QueueFull):
+            self.queue.put_nowait(message)
+        self.wake.set()
+
+
+class Server:
+    """The page of one host."""
+
+    def __init__(self, make_host: Callable[..., Host], address: Address) -> None:
+        """Build the host and the application.
+
+        Args:
+            make_host: Called with ``publish`` and ``notify``; gives the host.
+            address: Where to serve.
+        """
+        self.address = address
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._viewers: set[_Viewer] = set()
+        self._latest: Lit | None = None
+        self._jpegs: dict[tuple[int, str], asyncio.Future[bytes]] = {}
+        self._encode_ms = 0.0
+        self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
+        self._hands = ThreadPoolExecutor(2, "warp-ar-page")
+        self.failed: BaseException | None = None
+        """What ended the frames, if it was an error."""
+        # Read once: no request's path ever becomes a file's.
+        folder = importlib.resources.files("warp_ar.viewer") / "static"
+        self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
+        self.host = make_host(publish=self._publish, notify=self._notify)
+        self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
+        self.app.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/static/{name}", self._file),
+                web.get("/download/{name}", self._download),
+                web.get("/live", self._live),
+            ]
+        )
+
+    # ------------------------------------------------------------------------------------------------------- admission
+
+    @web.middleware
+    async def _guard(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        """Refuse what comes from other sites, and beyond this machine whoever does not know the token."""
+        name = (
+            request.host.rsplit(":", 1)[0].strip("[]") if not request.host.endswith("]") else request.host.strip("[]")
+        )
+        # A foreign site that has its name resolve to this machine would pass every other check.
+        if self.address.loopback and self.address.token is None and name not in LOOPBACK:
+            return self._refuse(f"this page is at {self.address.url}")
+        origin = request.headers.get("Origin")
+        if origin is not None and origin != f"{request.scheme}://{request.host}":
+            return self._refuse("requests from other sites are refused")
+        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and request.path != "/":
+            return self._refuse("requests from other sites are refused")
+        given = request.query.get("token", "")
+        public = request.path.startswith("/static/")
+        if self.address.token is not None and not public and not _same(given, self.address.token):
+            return self._refuse("a token is needed: open the whole address that the program printed")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
+
+    @staticmethod
+    def _refuse(reason: str) -> web.Response:
+        return web.Response(status=403, text=f"warp_ar: {reason}\n", headers=_HEADERS)
+
+    # ------------------------------------------------------------------------------------------------------------ files
+
+    async def _page(self, request: web.Request) -> web.Response:
+        return web.Response(body=self._static["index.html"], headers={"Content-Type": _TYPES["html"]})
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name = request.match_info["name"]
+        if name not in self._static:
+            raise web.HTTPNotFound(text="no such file\n")
+        return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
+
+    async def _download(self, request: web.Request) -> web.Response:
+        makers: dict[str, tuple[str, Callable[[], bytes]]] = {
+            "frame.png": ("image/png", self.host.snapshot),
+            "environment.exr": ("image/x-exr", self.host.environment_exr),
+            "scene.toml": (
+                "application/toml",
+                lambda: self.host.scene_toml(full_paths=self.address.loopback).encode(),
+            ),
+            "recording.mp4": ("video/mp4", self.host.recording),
+        }
+        name = request.match_info["name"]
+        if name not in makers:
+            raise web.HTTPNotFound(text="no such download\n")
+        kind, make = makers[name]
+        try:
+            body = await asyncio.get_running_loop().run_in_executor(self._hands, make)
+        except WarpArError as error:
+            raise web.HTTPConflict(text=f"{error}\n") from error
+        headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
+        return web.Response(body=body, headers=headers)
+
+    # ---------------------------------------------------------------------------------------------------------- frames
+
+    def _publish(self, lit: Lit) -> None:
+        """On the host's thread."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._arrived, lit)
+
+    def _arrived(self, lit: Lit) -> None:
+        self._latest = lit
+        for key in [key for key in self._jpegs if key[0] < lit.id - 1]:
+            del self._jpegs[key]
+        for viewer in self._viewers:
+            viewer.wake.set()
+
+    def _notify(self, message: dict[str, Any]) -> None:
+        """On any thread."""
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._tell_all, json.dumps(message))
+
+    def _tell_all(self, message: str | bytes) -> None:
+        for viewer in self._viewers:
+            viewer.tell(message)
+
+    async def _jpeg(self, lit: Lit, which: str) -> bytes:
+        """A picture of a frame, encoded when first asked for."""
+        key = (lit.id, which)
+        if key not in self._jpegs:
+            image = lit.image if which == "image" else lit.other
+
+            def encode() -> bytes:
+                start = time.perf_counter()
+                assert image is not None
+                data = encode_jpeg(image)
+                self._encode_ms = (time.perf_counter() - start) * 1e3
+                return data
+
+            self._jpegs[key] = asyncio.get_running_loop().run_in_executor(self._encoder, encode)
+        return await asyncio.shield(self._jpegs[key])
+
+    async def _message(self, lit: Lit) -> bytes:
+        pictures = [await self._jpeg(lit, "image")]
+        if lit.other is not None:
+            pictures.append(await self._jpeg(lit, "other"))
+        camera, pose = lit.camera, lit.pose
+        header = {
+            "type": "frame",
+            "id": lit.id,
+            "taken": lit.taken * 1e3,
+            "stamp": lit.stamp,
+            "state": None if lit.state is None else lit.state.value,
+            "pose": None if pose is None else [*pose.rotation.ravel().tolist(), *pose.translation.tolist()],
+            "camera": [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion],
+            "stages": lit.stages,
+            "light_ms": round(lit.light_ms, 3),
+            "encode_ms": round(self._encode_ms, 3),
+            "plan": lit.plan,
+        }
+        return protocol.pack(header, *pictures)
+
+    async def _send(self, viewer: _Viewer) -> None:
+        """Send a viewer what is new, as fast as it takes it."""
+        while True:
+            await viewer.wake.wait()
+            viewer.wake.clear()
+            while not viewer.queue.empty():
+                message = viewer.queue.get_nowait()
+                send = viewer.socket.send_str if isinstance(message, str) else viewer.socket.send_bytes
+                await asyncio.wait_for(send(message), SEND_SECONDS)  # type: ignore[arg-type]
+            lit = self._latest
+            if lit is None or lit.id <= viewer.sent or len(viewer.unshown) >= IN_FLIGHT:
+                continue
+            viewer.sent = lit.id
+            viewer.unshown.add(lit.id)
+            data = await self._message(lit)
+            await asyncio.wait_for(viewer.socket.send_bytes(data), SEND_SECONDS)
+            # A newer one may have come meanwhile.
+            viewer.wake.set()
+
+    async def _send_safely(self, viewer: _Viewer) -> None:
+        try:
+            await self._send(viewer)
+        except (TimeoutError, ConnectionError):
+            await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, "nothing was taken for too long")
+
+    async def _tick(self) -> None:
+        """Tell viewers what changes by itself."""
+        shown: npt.NDArray[np.float32] | None = None
+        while True:
+            await asyncio.sleep(STATE_SECONDS)
+            if not self._viewers:
+                continue
+            self._tell_all(json.dumps(self.host.state_message()))
+            light = self.host.light()
+            if light is not shown:
+                shown = light
+                self._tell_all(await self._light_message(light))
+
+    async def _light_message(self, light: npt.NDArray[np.float32] | None) -> bytes:
+        loop = asyncio.get_running_loop()
+        data = b"" if light is None else await loop.run_in_executor(self._encoder, encode_light, light)
+        return protocol.pack({"type": "light", "known": light is not None}, data)
+
+    # --------------------------------------------------------------------------------------------------------- viewers
+
+    async def _live(self, request: web.Request) -> web.StreamResponse:
+        if len(self._viewers) >= MOST_VIEWERS:
+            return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n", headers=_HEADERS)
+        socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30.0, compress=False)
+        await socket.prepare(request)
+        viewer = _Viewer(socket)
+        self._viewers.add(viewer)
+        self.host.watch(1)
+        sender = asyncio.create_task(self._send_safely(viewer))
+        try:
+            viewer.tell(json.dumps(self._hello()))
+            for message in (self.host.plan_message(), self.host.scene_message(), self.host.state_message()):
+                viewer.tell(json.dumps(message))
+            viewer.tell(await self._light_message(self.host.light()))
+            await self._receive(viewer)
+        finally:
+            self._viewers.discard(viewer)
+            self.host.watch(-1)
+            sender.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await sender
+            if viewer.picture is not None:
+                viewer.picture.cancel()
+            await asyncio.get_running_loop().run_in_executor(self._hands, self.host.leave_camera, viewer)
+        return socket
+
+    def _hello(self) -> dict[str, Any]:
+        return {
+            "type": "hello",
+            "scenes": list(bundled_scenes()),
+            "presets": list(PRESETS),
+            "effects": list(protocol.EFFECTS),
+            "largest_camera": list(protocol.LARGEST_CAMERA),
+        }
+
+    async def _receive(self, viewer: _Viewer) -> None:
+        """Take a viewer's messages until it leaves or breaks a rule."""
+        async for message in viewer.socket:
+            now = time.monotonic()
+            size = len(message.data) if message.type in (WSMsgType.TEXT, WSMsgType.BINARY) else 0
+            if not viewer.messages.take(1.0, now) or not viewer.bytes.take(size, now):
+                limit = f"{MESSAGES_PER_SECOND:g} messages or {BYTES_PER_SECOND / 1e6:g} MB a second"
+                await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, f"more than {limit}")
+                return
+            try:
+                if message.type is WSMsgType.TEXT:
+                    await self._command(viewer, protocol.parse_text(message.data))
+                elif message.type is WSMsgType.BINARY:
+                    self._camera_picture(viewer, message.data)
+                else:  # aiohttp has closed it already, with the reason that the protocol has for it
+                    return
+            except protocol.ProtocolError as error:
+                await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
+                return
+
+    async def _command(self, viewer: _Viewer, command: protocol.Command) -> None:
+        match command:
+            case protocol.Ack(number):
+                viewer.unshown = {id for id in viewer.unshown if id > number}
+                viewer.wake.set()
+            case protocol.Ping(sent):
+                viewer.tell(json.dumps({"type": "pong", "sent": sent, "clock": time.monotonic() * 1e3}))
+            case _:
+                try:
+                    await asyncio.get_running_loop().run_in_executor(self._hands, self.host.edit, command, viewer)
+                except WarpArError as error:
+                    viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
+                    viewer.tell(json.dumps(self.host.scene_message()))
+
+    def _camera_picture(self, viewer: _Viewer, data: bytes) -> None:
+        size = self.host.camera_size(viewer)
+        if size is None:
+            # What was on the way when the camera was switched off.
+            if len(data) > protocol.MAX_PICTURE:
+                raise protocol.ProtocolError("picture too large")
+            return
+        picture = protocol.parse_picture(data, size)
+        if viewer.picture is None or viewer.picture.done():
+            viewer.picture = asyncio.create_task(self._push(viewer, picture))
+        else:  # the page waits for "taken"; whoever does not has pictures left out
+            viewer.tell(json.dumps({"type": "taken", "id": picture.id}))
+
+    async def _push(self, viewer: _Viewer, picture: protocol.Picture) -> None:
+        try:
+            loop = asyncio.get_running_loop()
+            await loop.run_in_executor(self._hands, self.host.push, picture.jpeg, picture.taken, viewer)
+        except protocol.ProtocolError as error:
+            await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
+        except WarpArError as error:
+            viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
+        viewer.tell(json.dumps({"type": "taken", "id": picture.id}))
+
+    @staticmethod
+    async def _drop(viewer: _Viewer, code: int, reason: str) -> None:
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            await asyncio.wait_for(viewer.socket.close(code=code, message=reason.encode()[:120]), 5.0)
+
+    # --------------------------------------------------------------------------------------------------------- running
+
+    async def serve(self, ready: Callable[[Address], None] = lambda address: None, *, tries: int = 1) -> None:
+        """Serve until the host ends or the task is cancelled.
+
+        Args:
+            ready: Called with the address once the page can be opened.
+            tries: Ports to try from the address's on.
+
+        Raises:
+            UsageError: The address cannot be listened on.
+        """
+        self._loop = asyncio.get_running_loop()
+        runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        frames = ThreadPoolExecutor(1, "warp-ar-frames")
+        running: asyncio.Future[None] | None = None
+        ticker: asyncio.Task[None] | None = None
+        try:
+            await runner.setup()
+            await self._listen(runner, tries)
+            running = self._loop.run_in_executor(frames, self.host.run)
+            ticker = asyncio.create_task(self._tick())
+            ready(self.address)
+            await asyncio.shield(running)
+        finally:
+            self.host.stop()
+            if ticker is not None:
+                ticker.cancel()
+            for viewer in tuple(self._viewers):
+                await self._drop(viewer, WSCloseCode.GOING_AWAY, "the program has ended")
+            if running is not None:
+                with contextlib.suppress(WarpArError):
+                    await running
+            self._loop = None
+            await runner.cleanup()
+            for pool in (frames, self._encoder, self._hands):
+                pool.shutdown()
+            self.host.close()
+
+    async def _listen(self, runner: web.AppRunner, tries: int) -> None:
+        first = self.address.port
+        for port in range(first, first + max(tries, 1)):
+            site = web.TCPSite(runner, self.address.host, port, ssl_context=self.address.tls)
+            try:
+                await site.start()
+            except OSError as error:
+                if port + 1 < first + tries:
+                    continue
+                raise UsageError(
+                    f"cannot serve at {self.address.host} port {port}: {error.strerror or error}; choose another --port"
+                ) from error
+            bound = runner.addresses[0][1] if port == 0 else port
+            self.address = dataclasses.replace(self.address, port=bound)
+            return
+
+
+def _same(given: str, expected: str) -> bool:
+    return hmac.compare_digest(given.encode("utf-8", "surrogateescape"), expected.encode())
