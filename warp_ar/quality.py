@@ -38,11 +38,11 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
     {
         preset.name: preset
         for preset in (
-            _preset("paper", 64, 4, diffuse="top_mip", specular="box_mip", relight="relief"),
-            _preset("low", 32, 1, diffuse="sh2", specular="box_mip", relight="relief"),
-            _preset("medium", 64, 4, diffuse="sh2", specular="box_mip", relight="reflectance"),
-            _preset("high", 128, 16, diffuse="sh2", specular="box_mip", relight="reflectance"),
-            _preset("reference", 256, 16, diffuse="sh2", specular="box_mip", relight="reflectance"),
+            _preset("paper", 64, 4, diffuse="top_mip", specular="box_mip", relight="relief", recover="clipped"),
+            _preset("low", 32, 1, diffuse="sh2", specular="box_mip", relight="relief", recover="white_card"),
+            _preset("medium", 64, 4, diffuse="sh2", specular="box_mip", relight="reflectance", recover="white_card"),
+            _preset("high", 128, 16, diffuse="sh2", specular="box_mip", relight="reflectance", recover="shading"),
+            _preset("reference", 256, 16, diffuse="sh2", specular="box_mip", relight="reflectance", recover="shading"),
         )
     }
 )

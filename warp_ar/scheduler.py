@@ -7,6 +7,7 @@ graph.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -130,24 +131,36 @@ class Scheduler:
         if not key:
             return timings
         start = time.perf_counter()
-        graph = self._graphs.get(key)
-        if graph is None:
-            # Launched once outside the capture: that loads every module, which a capture must not do.
-            self._launch_all(due)
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._launch_all(due)
-            self._graphs[key] = capture.graph
-        else:
-            wp.capture_launch(graph)
+        for index, (on_host, steps) in enumerate(_segments(due)):
+            if on_host:
+                _launch_all(steps)
+            else:
+                self._replay((*key, str(index)), steps)
         share = (time.perf_counter() - start) * 1e3 / len(key)
         timings.update({name: StageTiming(share, False) for name in key})
         return timings
 
-    @staticmethod
-    def _launch_all(due: list[tuple[Stage, list[Pass]]]) -> None:
-        for _, passes in due:
-            for step in passes:
-                step.launch(None)
+    def _replay(self, key: tuple[str, ...], steps: list[Pass]) -> None:
+        graph = self._graphs.get(key)
+        if graph is not None:
+            wp.capture_launch(graph)
+            return
+        # Launched once outside the capture: that loads every module, which a capture must not do.
+        _launch_all(steps)
+        with wp.ScopedCapture(device=self.device) as capture:
+            _launch_all(steps)
+        self._graphs[key] = capture.graph
+
+
+def _segments(due: list[tuple[Stage, list[Pass]]]) -> list[tuple[bool, list[Pass]]]:
+    """Passes in order, grouped to stretches that are captured as one and stretches that run on the host."""
+    steps = [step for _, passes in due for step in passes]
+    return [(on_host, list(group)) for on_host, group in itertools.groupby(steps, key=lambda step: step.on_host)]
+
+
+def _launch_all(steps: list[Pass]) -> None:
+    for step in steps:
+        step.launch(None)
 
 
 def _call(launch: Callable[[Rows | None], None], rows: Rows) -> None:

@@ -310,6 +310,21 @@ def _make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | G
     )
 
 
+def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
+    """What is printed where.
+
+    Args:
+        marker: Marker or board.
+
+    Returns:
+        Centres of all cells (c, 3), which of them are white (c,), the side of a cell in metres, and the whole's corners (4, 3).
+    """
+    pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+    size = marker.size if marker.board is None else marker.board.marker_length
+    side = size / (int(find_dictionary(marker.dictionary).markerSize) + 2)
+    return pattern.cells, pattern.white > 0.5, side, pattern.outline
+
+
 def _square(x: float, y: float, width: float, height: float) -> Array:
     w, h = width / 2, height / 2
     return np.array([[x - w, y + h, 0.0], [x + w, y + h, 0.0], [x + w, y - h, 0.0], [x - w, y - h, 0.0]])

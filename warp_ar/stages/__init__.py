@@ -10,6 +10,7 @@ from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
 from warp_ar.stages.object_light import ObjectLight
+from warp_ar.stages.recover import Recover
 from warp_ar.stages.relight import Relight
 from warp_ar.stages.room_samples import RoomSamples
 from warp_ar.stages.room_shadow import RoomShadow
@@ -23,6 +24,7 @@ STAGES: tuple[type[Stage], ...] = (
     Unwrap,
     Accumulate,
     Fill,
+    Recover,
     KeyLights,
     Diffuse,
     Specular,

@@ -69,6 +69,8 @@ class Pass:
     """Rows to split into bands on CPU; None means that it cannot be split."""
     extent: Callable[[], Rows] | None = None
     """Rows that matter in this frame, asked on CPU before splitting; None means all."""
+    on_host: bool = False
+    """Works on the host between launches, and may read arrays back: it cannot be part of a captured graph."""
 
 
 class Arrays(Mapping[str, Any]):

@@ -9,11 +9,12 @@ import warp as wp
 
 from warp_ar.kernels import environment
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.recover import recovers
 from warp_ar.stages.unwrap import NO_PROBE
 
 
 class Fill(Stage):
-    """The complete map that everything downstream reads."""
+    """The complete map: what everything downstream reads, or what ``recover`` starts from."""
 
     name: ClassVar[str] = "fill"
     rungs: ClassVar[tuple[str, ...]] = ("default",)
@@ -24,14 +25,15 @@ class Fill(Stage):
         """Needs a mirror ball."""
         if not request.scene.probes:
             return LeftOut(NO_PROBE)
-        return Wiring(("environment_radiance", "environment_confidence"), ("environment",))
+        written = "filled_radiance" if recovers(request) else "environment"
+        return Wiring(("environment_radiance", "environment_confidence"), (written,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the fill pyramid, and what readers have seen."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         return {
-            "environment": ArraySpec(shape, wp.vec3),
+            self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
             "fill_levels": ArraySpec((environment.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
             "fill_difference": ArraySpec((height,), wp.float32),
@@ -52,11 +54,11 @@ class Fill(Stage):
             environment.push_pull(arrays["fill_levels"], height, 2 * height)
 
         def finish(rows: Rows | None) -> None:
-            environment.finish_fill(arrays["fill_levels"], arrays["environment"], rows=rows)
+            environment.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
 
         def measure(rows: Rows | None) -> None:
             environment.measure_difference(
-                arrays["environment"], arrays["fill_published"], arrays["fill_difference"], rows=rows
+                arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 
         passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
@@ -71,5 +73,5 @@ class Fill(Stage):
             return True
         if not self._arrays["fill_difference"].numpy().max() > 1.0:
             return False
-        wp.copy(self._arrays["fill_published"], self._arrays["environment"])
+        wp.copy(self._arrays["fill_published"], self._arrays[self.wiring.writes[0]])
         return True

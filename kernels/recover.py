@@ -1,0 +1,531 @@
+"""What else the frame says about the room's light: brightness of surfaces, and how much light each part of the room sends to them.
+
+The ball clips where lamps and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or not there, and are
+lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the radiance L receives
+
+    E(x) = pi L / rho = sum over the room's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle visibility.
+
+The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps`` the same for lamps at
+finite distances. ``warp_ar.recovery`` solves for what is missing in the clipped cells, ``add_excess`` puts it into the map.
+
+**Cells.** The room is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with its mean radiance, its
+share at clipping, and the direction in which that share lies.
+
+**Visibility.** From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size, the ball as an edge in
+front of it. What the ball hides it replaces: the ray is mirrored, and the share goes to the cell that it then meets. Where a proxy is in the
+way, its radiance is what the ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left
+for what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.latlong import PI, direction_from_latlong, latlong_from_direction, texel_solid_angle
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.probe import is_clipped, project
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.visibility import TraceConfig, make_trace
+
+wp.set_module_options({"enable_backward": False})
+
+CELL_ROWS = 32
+CELL_COLUMNS = 64
+
+PATCH = wp.constant(5)
+"""Points along the side of the patch over which a surface point is averaged."""
+BALL_MARGIN = wp.constant(wp.float32(1.08))
+"""How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
+FULL_TRUST = wp.constant(wp.float32(0.5))
+"""Confidence above which a texel counts as seen; as for filling."""
+CLOSE = wp.constant(wp.float32(1.0e-3))
+"""Relative distance within which what a camera ray meets is the surface itself."""
+
+
+@wp.struct
+class SurfacePoint:
+    """A place on a physical surface."""
+
+    position: wp.vec3
+    normal: wp.vec3
+    tangent: wp.vec3  # unit, along the patch's first side
+    half: wp.float32  # half the side of the patch, metres
+
+
+@wp.struct
+class Observation:
+    """What the frame shows of a surface point."""
+
+    radiance: wp.vec3  # mean over the patch, linear camera values
+    deviation: wp.vec3  # standard deviation over the patch
+    clipped: wp.vec3  # share of the patch at clipping
+    visible: wp.float32  # share of the patch that the camera sees, 0 where it sees none
+
+
+@wp.struct
+class Cell:
+    """A part of the room."""
+
+    radiance: wp.vec3  # mean, as captured
+    clipped: wp.vec3  # mean share that may lack light: at clipping, or not seen at all
+    hidden: wp.float32  # mean share that is not seen
+    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the room beyond
+    direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
+    solid_angle: wp.float32
+
+
+def cell_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of cells for a map of this size."""
+    return min(CELL_ROWS, height), min(CELL_COLUMNS, width)
+
+
+@wp.func
+def trust(confidence: wp.float32) -> wp.float32:
+    """How far a texel counts as seen, 0..1; 0 for NaN."""
+    t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
+    return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
+
+
+@wp.func
+def lacking(clipped: wp.vec3, seen: wp.float32) -> wp.vec3:
+    """Share of a texel that may lack light, per channel."""
+    return seen * clipped + (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
+
+
+@functools.cache
+def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def condense_cells_kernel(
+        # In:
+        row_start: wp.int32,
+        radiance: wp.array2d[wp.vec3],
+        confidence: wp.array2d[wp.float32],
+        clipped: wp.array2d[wp.vec3],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        # Out:
+        cells_out: wp.array2d[Cell],
+    ):
+        band_row, column = wp.tid()
+        row = row_start + band_row
+        height = radiance.shape[0]
+        width = radiance.shape[1]
+        rows = cells_out.shape[0]
+        columns = cells_out.shape[1]
+        cell = Cell()
+        toward = wp.vec3(0.0, 0.0, 0.0)
+        lost_toward = wp.vec3(0.0, 0.0, 0.0)
+        for i in range(row * height // rows, (row + 1) * height // rows):
+            area = texel_solid_angle(i, height, width)
+            for j in range(column * width // columns, (column + 1) * width // columns):
+                direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
+                seen = trust(confidence[i, j])
+                lost = seen * clipped[i, j]
+                cell.solid_angle += area
+                cell.radiance += area * radiance[i, j]
+                cell.clipped += area * lacking(clipped[i, j], seen)
+                cell.hidden += area * (1.0 - seen)
+                toward += area * direction
+                lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
+        cell.radiance /= cell.solid_angle
+        cell.clipped /= cell.solid_angle
+        cell.hidden /= cell.solid_angle
+        cell.direction = wp.normalize(toward)
+        if wp.length(lost_toward) > 0.0:
+            cell.direction = wp.normalize(lost_toward)
+        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, 1.0e8):
+            cell.modelled = 1.0
+        cells_out[row, column] = cell
+
+    return condense_cells_kernel
+
+
+def condense_cells(
+    radiance: wp.array,
+    confidence: wp.array,
+    clipped: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    cells_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Condense a map to cells.
+
+    Args:
+        radiance: ``wp.vec3`` (h, w), complete.
+        confidence: How well each texel was seen, ``wp.float32`` (h, w).
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        probes: ``Probe`` (P), at least one.
+        scene: Its proxies are known surfaces: what clips there is lit, not a light.
+        cells_out: ``Cell``, ``cell_shape(h, w)``.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of cell rows, None for all.
+    """
+    launch_rows(
+        make_condense_cells_kernel(proxies),
+        cells_out.shape,
+        [radiance, confidence, clipped, probes, scene],
+        [cells_out],
+        rows=rows,
+        device=cells_out.device,
+    )
+
+
+@wp.kernel(enable_backward=False)
+def add_excess_kernel(
+    # In:
+    row_start: wp.int32,
+    radiance: wp.array2d[wp.vec3],
+    confidence: wp.array2d[wp.float32],
+    clipped: wp.array2d[wp.vec3],
+    excess: wp.array2d[wp.vec3],
+    # Out:
+    recovered_out: wp.array2d[wp.vec3],
+):
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    more = excess[i * excess.shape[0] // radiance.shape[0], j * excess.shape[1] // radiance.shape[1]]
+    share = lacking(clipped[i, j], trust(confidence[i, j]))
+    recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
+
+
+def add_excess(
+    radiance: wp.array,
+    confidence: wp.array,
+    clipped: wp.array,
+    excess: wp.array,
+    recovered_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Give texels back what they lost.
+
+    Args:
+        radiance: As captured and completed, ``wp.vec3`` (h, w).
+        confidence: How well each texel was seen, ``wp.float32`` (h, w).
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        excess: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
+        recovered_out: ``wp.vec3`` (h, w).
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        add_excess_kernel,
+        radiance.shape,
+        [radiance, confidence, clipped, excess],
+        [recovered_out],
+        rows=rows,
+        device=recovered_out.device,
+    )
+
+
+@wp.func
+def distance_to_sphere(center: wp.vec3, radius: wp.float32, origin: wp.vec3, direction: wp.vec3) -> wp.float32:
+    """Distance along a unit direction to a sphere that the ray meets from outside; negative if it does not."""
+    to_center = center - origin
+    along = wp.dot(to_center, direction)
+    off = to_center - along * direction
+    within = radius * radius - wp.dot(off, off)
+    if along <= 0.0 or within <= 0.0:
+        return -1.0
+    return along - wp.sqrt(within)
+
+
+@wp.func
+def hidden_share(
+    center: wp.vec3, radius: wp.float32, origin: wp.vec3, direction: wp.vec3, cell_angle: wp.float32
+) -> wp.float32:
+    """Share of a disc of angular radius ``cell_angle`` around ``direction`` that a ball hides.
+
+    Both are taken to meet along a straight edge: (3 t - t^3) / 4 + 1 / 2 with t in -1..1 is within 2 % of a disc's exact share.
+    """
+    to_center = center - origin
+    away = wp.length(to_center)
+    if away <= radius:
+        return 0.0
+    # atan2 of both: exact for small angles.
+    side = wp.length(wp.cross(to_center, direction))
+    t = (wp.asin(radius / away) - wp.atan2(side, wp.dot(to_center, direction))) / cell_angle
+    t = wp.clamp(t, -1.0, 1.0)
+    return 0.5 + 0.25 * t * (3.0 - t * t)
+
+
+@wp.func
+def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp.float32:
+    """Irradiance at a surface point by way of a ball, per unit irradiance of a parallel beam from direction ``light``.
+
+    The ball's point with normal n that mirrors the beam to x halves the angle a between both. There a convex mirror has the focal lengths
+    R cos a / 2 (in the plane of incidence) and R / (2 cos a) (across it); at the distance s the beam is wider by
+
+        (1 + 2 s / (R cos a)) (1 + 2 s cos a / R).
+    """
+    to_point = point.position - probe.center
+    away = wp.normalize(to_point)
+    normal = wp.normalize(light + away)
+    for _step in range(3):
+        away = wp.normalize(to_point - probe.radius * normal)
+        normal = wp.normalize(light + away)
+    leave = to_point - probe.radius * normal
+    s = wp.length(leave)
+    cos_a = wp.dot(normal, light)
+    cosine = -wp.dot(leave, point.normal) / s
+    if cos_a < 0.05 or cosine <= 0.0 or wp.dot(leave, normal) <= 0.0:
+        return 0.0
+    spread = (1.0 + 2.0 * s / (probe.radius * cos_a)) * (1.0 + 2.0 * s * cos_a / probe.radius)
+    grey = (probe.reflectance[0] + probe.reflectance[1] + probe.reflectance[2]) / 3.0
+    return grey * cosine / spread
+
+
+@wp.func
+def cell_of(direction: wp.vec3, rows: wp.int32, columns: wp.int32) -> wp.int32:
+    """Index of the cell that holds a direction."""
+    at = latlong_from_direction(direction, rows, columns)
+    row = wp.clamp(wp.int32(at[0]), 0, rows - 1)
+    return row * columns + wp.clamp(wp.int32(at[1]), 0, columns - 1)
+
+
+@functools.cache
+def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
+    """Kernels for the given kinds of proxy: observe, transfer, lamps."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def observe_surfaces_kernel(
+        # In:
+        row_start: wp.int32,
+        frame: wp.array2d[wp.vec3ub],
+        table: wp.array[wp.vec3],
+        params: wp.array[FrameParams],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        points: wp.array[SurfacePoint],
+        # Out:
+        observations_out: wp.array[Observation],
+    ):
+        index = row_start + wp.tid()
+        camera = params[0]
+        point = points[index]
+        seen = Observation()
+        across = wp.cross(point.normal, point.tangent)
+        if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
+            squares = wp.vec3(0.0, 0.0, 0.0)
+            count = wp.float32(0.0)
+            for a in range(PATCH):
+                for b in range(PATCH):
+                    u = (2.0 * wp.float32(a) + 1.0) / wp.float32(PATCH) - 1.0
+                    v = (2.0 * wp.float32(b) + 1.0) / wp.float32(PATCH) - 1.0
+                    place = point.position + point.half * (u * point.tangent + v * across)
+                    ray = place - camera.camera_position
+                    at = project(camera, ray)
+                    i = wp.int32(wp.round(wp.clamp(at[1], -1.0, 1.0e6)))
+                    j = wp.int32(wp.round(wp.clamp(at[0], -1.0, 1.0e6)))
+                    clear = at[2] > 0.0 and i >= 0 and j >= 0 and i < frame.shape[0] and j < frame.shape[1]
+                    if clear:
+                        reach = wp.length(ray)
+                        for k in range(probes.shape[0]):
+                            t = distance_to_sphere(
+                                probes[k].center, BALL_MARGIN * probes[k].radius, camera.camera_position, ray / reach
+                            )
+                            if t >= 0.0 and t < reach:
+                                clear = False
+                        if trace.occluded_by_proxies(scene, camera.camera_position, ray, 1.0 - CLOSE):
+                            clear = False
+                    if clear:
+                        code = frame[i, j]
+                        value = decode(table, code)
+                        count += 1.0
+                        before = value - seen.radiance
+                        seen.radiance += before / count
+                        squares += wp.cw_mul(before, value - seen.radiance)
+                        seen.clipped += is_clipped(code)
+            if count > 0.0:
+                seen.clipped /= count
+                seen.visible = count / wp.float32(PATCH * PATCH)
+                for channel in range(3):
+                    seen.deviation[channel] = wp.sqrt(wp.max(squares[channel], 0.0) / count)
+        observations_out[index] = seen
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def trace_transfer_kernel(
+        # In:
+        row_start: wp.int32,
+        points: wp.array[SurfacePoint],
+        observations: wp.array[Observation],
+        cells: wp.array2d[Cell],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        # Out:
+        transfer_out: wp.array2d[wp.float32],
+    ):
+        index = row_start + wp.tid()
+        rows = cells.shape[0]
+        columns = cells.shape[1]
+        for m in range(rows * columns):
+            transfer_out[index, m] = 0.0
+        if observations[index].visible > 0.0:
+            point = points[index]
+            for m in range(rows * columns):
+                cell = cells[m // columns, m % columns]
+                for k in range(probes.shape[0]):
+                    more = cell.solid_angle * mirrored_irradiance(probes[k], point, cell.direction)
+                    transfer_out[index, m] = transfer_out[index, m] + more
+                cosine = wp.dot(cell.direction, point.normal)
+                if cosine > 0.0:
+                    share = cosine * cell.solid_angle
+                    angle = wp.sqrt(cell.solid_angle / PI)
+                    for k in range(probes.shape[0]):
+                        center = probes[k].center
+                        share *= 1.0 - hidden_share(center, probes[k].radius, point.position, cell.direction, angle)
+                    target = m
+                    hit = trace.closest_proxy(scene, point.position + 1.0e-5 * point.normal, cell.direction, 1.0e8)
+                    if hit.shape >= 0:
+                        target = cell_of(hit.point - probes[0].center, rows, columns)
+                    transfer_out[index, target] = transfer_out[index, target] + share
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def trace_lamps_kernel(
+        # In:
+        row_start: wp.int32,
+        points: wp.array[SurfacePoint],
+        observations: wp.array[Observation],
+        lamps: wp.array[wp.vec4],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        # Out:
+        transfer_out: wp.array2d[wp.float32],
+    ):
+        band_row, index = wp.tid()
+        row = row_start + band_row
+        point = points[row]
+        lamp = lamps[index]
+        center = wp.vec3(lamp[0], lamp[1], lamp[2])
+        given = wp.float32(0.0)
+        if observations[row].visible > 0.0:
+            ray = center - point.position
+            away = wp.length(ray)
+            cosine = wp.dot(ray, point.normal) / away
+            if cosine > 0.0 and away > lamp[3]:
+                direction = ray / away
+                given = cosine / (away * away)
+                if trace.occluded_by_proxies(scene, point.position + 1.0e-5 * point.normal, direction, away - lamp[3]):
+                    given = 0.0
+                for k in range(probes.shape[0]):
+                    if wp.dot(probes[k].center - point.position, direction) < away:
+                        given *= 1.0 - hidden_share(
+                            probes[k].center, probes[k].radius, point.position, direction, wp.asin(lamp[3] / away)
+                        )
+            for k in range(probes.shape[0]):
+                from_ball = center - probes[k].center
+                beam = 1.0 / wp.dot(from_ball, from_ball)
+                given += beam * mirrored_irradiance(probes[k], point, wp.normalize(from_ball))
+        transfer_out[row, index] = given
+
+    return observe_surfaces_kernel, trace_transfer_kernel, trace_lamps_kernel
+
+
+def observe_surfaces(
+    frame: wp.array,
+    decode_table: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    points: wp.array,
+    observations_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Measure what the frame shows of surface points.
+
+    Args:
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
+        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P): they hide surfaces.
+        scene: Its proxies hide surfaces as well.
+        points: ``SurfacePoint`` (n).
+        observations_out: ``Observation`` (n).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_kernels(proxies)[0],
+        observations_out.shape,
+        [frame, decode_table, params, probes, scene, points],
+        [observations_out],
+        rows=rows,
+        device=observations_out.device,
+    )
+
+
+def trace_transfer(
+    points: wp.array,
+    observations: wp.array,
+    cells: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    transfer_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Irradiance that a surface point receives from each cell of the room, per unit of the cell's radiance.
+
+    Args:
+        points: ``SurfacePoint`` (n).
+        observations: ``Observation`` (n): points that the camera does not see are left out.
+        cells: ``Cell`` (rows, columns): directions and solid angles.
+        probes: ``Probe`` (P), at least one; the room is the one that the first sees.
+        scene: Its proxies hide the room.
+        transfer_out: ``wp.float32`` (n, rows * columns).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_kernels(proxies)[1],
+        points.shape,
+        [points, observations, cells, probes, scene],
+        [transfer_out],
+        rows=rows,
+        device=transfer_out.device,
+    )
+
+
+def trace_lamps(
+    points: wp.array,
+    observations: wp.array,
+    lamps: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    transfer_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Irradiance that a surface point receives from lamps, per unit of their radiant intensity.
+
+    Args:
+        points: ``SurfacePoint`` (n).
+        observations: ``Observation`` (n): points that the camera does not see receive nothing.
+        lamps: ``wp.vec4`` (q): position and radius in metres.
+        probes: ``Probe`` (P).
+        scene: Its proxies hide lamps.
+        transfer_out: ``wp.float32`` (n, q), per square metre.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_kernels(proxies)[2],
+        transfer_out.shape,
+        [points, observations, lamps, probes, scene],
+        [transfer_out],
+        rows=rows,
+        device=transfer_out.device,
+    )
