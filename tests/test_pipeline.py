@@ -81,6 +81,42 @@ def test_numpy_and_warp_frames_give_the_same(frames: Frames, device: str) -> Non
             np.testing.assert_array_equal(first(image).image, second(array).image)
 
 
+def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
+    many = frames * 3  # more than are under way at once
+    with (
+        Pipeline(make_scene(), device=device, quality="low") as first,
+        Pipeline(make_scene(), device=device, quality="low") as second,
+    ):
+        expected = [result.image for result in run(first, many)]
+        ahead = [second.submit(image, time_seconds=index / 30) for index, image in enumerate(many)]
+        if wp.get_device(device).is_cpu:  # one picture, valid until the next call
+            ahead = ahead[-1:]
+        for result, image in zip(reversed(ahead), reversed(expected), strict=False):
+            np.testing.assert_array_equal(result.image, image)
+
+
+def test_a_known_pose_spares_tracking(frames: Frames, device: str) -> None:
+    with (
+        Pipeline(make_scene(), device=device, quality="low") as tracked,
+        Pipeline(make_scene(), device=device, quality="low") as told,
+    ):
+        expected = tracked(frames[0])
+        result = told(frames[0], pose=expected.pose)
+        np.testing.assert_array_equal(result.image, expected.image)
+        assert result.state is None
+        assert "track" not in result.stages
+
+
+def test_profiling_changes_times_only(frames: Frames, device: str) -> None:
+    with (
+        Pipeline(make_scene(), device=device, quality="low") as plain,
+        Pipeline(make_scene(), device=device, quality="low", profile=True) as profiled,
+    ):
+        for one, other in zip(run(plain, frames), run(profiled, frames), strict=True):
+            np.testing.assert_array_equal(one.image, other.image)
+            assert one.stages.keys() == other.stages.keys()
+
+
 def test_result_stays_on_the_device(frames: Frames, device: str) -> None:
     with Pipeline(make_scene(), device=device, quality="low", outputs=("image", "environment", "pose")) as pipeline:
         result = pipeline(frames[0])

@@ -1,7 +1,7 @@
 """What changes per frame, in one small block of memory: camera, virtual lights, virtual objects.
 
 The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being
-captured again.
+captured again. The copy is asynchronous, out of pinned memory that is not written again before it is over.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import warp as wp
 from warp_ar.kernels.structs import FrameParams, Light, Shape
 
 _ALIGNMENT = 16
+_SLOTS = 4  # uploads that may be under way
 
 
 class FrameBlock:
@@ -35,15 +36,18 @@ class FrameBlock:
             bytes_needed = np.dtype(struct.numpy_dtype()).itemsize * max(count, 1)
             size += -(-bytes_needed // _ALIGNMENT) * _ALIGNMENT
         self._device_buffer = wp.zeros(size, dtype=wp.uint8, device=device)
-        self._host_buffer = (
-            self._device_buffer if device.is_cpu else wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True)
-        )
-        host_bytes = self._host_buffer.numpy()
+        self._pinned: list[tuple[Any, Any]] = []
+        if not device.is_cpu:
+            self._pinned = [
+                (wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True), wp.Event(device)) for _ in range(_SLOTS)
+            ]
+        self._uploads = 0
+        self._bytes = self._device_buffer.numpy() if device.is_cpu else np.zeros(size, np.uint8)
         self._host: dict[str, Any] = {}
         self._device: dict[str, Any] = {}
         for (name, struct, count), offset in zip(layout, offsets, strict=True):
             dtype = np.dtype(struct.numpy_dtype())
-            self._host[name] = host_bytes[offset : offset + dtype.itemsize * count].view(dtype)
+            self._host[name] = self._bytes[offset : offset + dtype.itemsize * count].view(dtype)
             pointer = self._device_buffer.ptr + offset if count else None
             self._device[name] = wp.array(ptr=pointer, dtype=struct, shape=(count,), device=device)
 
@@ -57,5 +61,12 @@ class FrameBlock:
 
     def upload(self) -> None:
         """Copy the host's values to the device; on CPU they are the same memory."""
-        if self._device_buffer is not self._host_buffer:
-            wp.copy(self._device_buffer, self._host_buffer)
+        if not self._pinned:
+            return
+        buffer, done = self._pinned[self._uploads % _SLOTS]
+        if self._uploads >= _SLOTS:
+            wp.synchronize_event(done)
+        self._uploads += 1
+        buffer.numpy()[:] = self._bytes
+        wp.copy(self._device_buffer, buffer)
+        wp.record_event(done)

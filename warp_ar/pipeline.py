@@ -26,6 +26,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
 from warp_ar.stages.base import Arrays, Request
 from warp_ar.tracking import Pose, Tracker, TrackState
+from warp_ar.transfer import Download, Transfers
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the room's light from frame to frame."""
@@ -51,10 +52,14 @@ class Result:
     """Tracked, held or lost; None when nothing needed the pose."""
     stages: Mapping[str, StageTiming]
     """Milliseconds of every stage of the plan, and whether it was skipped."""
+    download: Download | None = None
+    """The lit frame on its way to the host, where it was sent ahead."""
 
     @functools.cached_property
     def image(self) -> npt.NDArray[np.uint8]:
         """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
+        if self.download is not None:
+            return self.download.take()
         return np.array(self.image_array.numpy() if isinstance(self.image_array, wp.array) else self.image_array)
 
     @functools.cached_property
@@ -91,6 +96,7 @@ class Pipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         bands: int | None = None,
+        profile: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -101,6 +107,7 @@ class Pipeline:
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
             bands: Bands of rows per CPU pass; None means one per core.
+            profile: On CUDA wait for every frame and time each stage on the device.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -120,7 +127,7 @@ class Pipeline:
         self._arrays = Arrays()
         with wp.ScopedDevice(self.device):
             self._add_inputs()
-        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands)
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
 
     def __enter__(self) -> Pipeline:
         return self
@@ -133,6 +140,8 @@ class Pipeline:
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
         self._scheduler.close()
+        if self._transfers is not None:
+            self._transfers.close()
 
     @property
     def arrays(self) -> Arrays:
@@ -146,7 +155,7 @@ class Pipeline:
         self._block = FrameBlock(device, len(self.scene.lights), len(self.scene.objects))
         self._host_scene.ray_scene.objects = self._block.device_array("objects")
         self._frame = wp.zeros((height, width), dtype=wp.vec3ub, device=device)
-        self._staging = None if device.is_cpu else wp.zeros((height, width), dtype=wp.vec3ub, device="cpu", pinned=True)
+        self._transfers = None if device.is_cpu else Transfers((height, width), device)
         add = self._arrays.add
         for name in ("pose", "lights", "objects", "exposure", "clock"):
             add(name, None)
@@ -223,13 +232,30 @@ class Pipeline:
             value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
         return values
 
-    def __call__(self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None) -> Result:
+    def submit(
+        self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None, pose: Pose | None = None
+    ) -> Result:
+        """Light one frame without waiting for it: on CUDA its picture is sent ahead, and waited for when it is read.
+
+        With the next frame submitted before this one's image is read, tracking, both ways over the bus and the kernels
+        run side by side. The device's own arrays of a result still hold only until the next frame. Arguments as those
+        of a call.
+        """
+        result = self(image, time_seconds=time_seconds, pose=pose)
+        if self._transfers is None or not isinstance(result.image_array, wp.array):
+            return result
+        return dataclasses.replace(result, download=self._transfers.download(result.image_array))
+
+    def __call__(
+        self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None, pose: Pose | None = None
+    ) -> Result:
         """Light one frame.
 
         Args:
             image: uint8 RGB, a NumPy array (height, width, 3), or a Warp array (height, width) of ``wp.vec3ub`` on the
                 pipeline's device, which is used without a copy to the host unless the marker must be found.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
+            pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
 
         Raises:
             UsageError: The image has another size or type.
@@ -239,9 +265,8 @@ class Pipeline:
         if self._start_time is None:
             self._start_time = self._last_time = now
         timings: dict[str, StageTiming] = {}
-        pose: Pose | None = None
         state: TrackState | None = None
-        if self._tracker is not None:
+        if self._tracker is not None and pose is None:
             start = time.perf_counter()
             track = self._tracker.track(host_image if host_image is not None else image.numpy(), now)
             timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
@@ -316,14 +341,13 @@ class Pipeline:
     def _upload(self, image: Any, host_image: npt.NDArray[np.uint8] | None) -> None:
         if host_image is None:
             wp.copy(self._frame, image)
-        elif self._staging is None:
+        elif self._transfers is None:
             target = self._frame.numpy()
             if self._index and np.array_equal(target, host_image):
                 return  # a still picture: nothing that reads the frame needs to run
             np.copyto(target, host_image)
         else:
-            np.copyto(self._staging.numpy(), host_image)
-            wp.copy(self._frame, self._staging)
+            self._transfers.upload(host_image, self._frame)
         self._arrays.touch("frame")
 
 

@@ -1,7 +1,8 @@
 """Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
 
 On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
-graph.
+graph. In the graph a stage waits only for those whose output it reads, so that short kernels, which leave most of the
+device idle, run beside others.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ import warp as wp
 from warp_ar.graph import INPUTS, Plan
 from warp_ar.stages.base import Arrays, Pass, Rows, Stage
 
+Step = tuple[Stage, list[Pass]]
+"""A stage and those of its passes that are launched."""
+
 # Bands shorter than this cost more in launching than they save.
 MIN_BAND_ROWS = 8
 
@@ -28,6 +32,7 @@ class StageTiming:
     """What one stage did in one frame."""
 
     milliseconds: float
+    """On CUDA, unless the pipeline profiles, the stage's share of the time that launching took the host."""
     skipped: bool
     """True: nothing that it reads had changed."""
 
@@ -35,7 +40,9 @@ class StageTiming:
 class Scheduler:
     """Runs the stages of one plan on one device."""
 
-    def __init__(self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None) -> None:
+    def __init__(
+        self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None, profile: bool = False
+    ) -> None:
         """Allocate what the stages declared and build their passes.
 
         Args:
@@ -43,6 +50,7 @@ class Scheduler:
             arrays: Resources; the pipeline's inputs must be there already.
             device: Warp device.
             bands: Bands per CPU pass; None means one per core that this process may use.
+            profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
         """
         self.plan = plan
         self.arrays = arrays
@@ -51,9 +59,13 @@ class Scheduler:
             len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         )
         self._pool = ThreadPoolExecutor(self.bands, "warp_ar") if device.is_cpu and self.bands > 1 else None
-        self._stages: list[tuple[Stage, list[Pass]]] = []
+        self._stages: list[Step] = []
         self._seen: dict[str, tuple[int, ...]] = {}
         self._graphs: dict[tuple[str, ...], Any] = {}
+        self._streams: list[Any] = []
+        self._marks: dict[str, tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
+        self.clock = time.perf_counter
+        """Seconds by which stages are timed on the host."""
         with wp.ScopedDevice(device):
             for kind, wiring in plan.stages:
                 stage = kind(plan.request, wiring)
@@ -93,12 +105,12 @@ class Scheduler:
             if versions is None:
                 timings[stage.name] = StageTiming(0.0, True)
                 continue
-            start = time.perf_counter()
+            start = self.clock()
             for step in passes:
                 self._run_pass(step)
             self._seen[stage.name] = versions
             self._publish(stage)
-            timings[stage.name] = StageTiming((time.perf_counter() - start) * 1e3, False)
+            timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)
         return timings
 
     def _run_pass(self, step: Pass) -> None:
@@ -117,7 +129,7 @@ class Scheduler:
             future.result()
 
     def _run_captured(self) -> dict[str, StageTiming]:
-        due: list[tuple[Stage, list[Pass]]] = []
+        due: list[Step] = []
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
@@ -130,37 +142,74 @@ class Scheduler:
         key = tuple(stage.name for stage, _ in due)
         if not key:
             return timings
-        start = time.perf_counter()
-        for index, (on_host, steps) in enumerate(_segments(due)):
+        start = self.clock()
+        for index, (on_host, part) in enumerate(_segments(due)):
             if on_host:
-                _launch_all(steps)
+                self._launch_in_turn(part)
             else:
-                self._replay((*key, str(index)), steps)
-        share = (time.perf_counter() - start) * 1e3 / len(key)
-        timings.update({name: StageTiming(share, False) for name in key})
+                self._replay((*key, str(index)), part)
+        share = (self.clock() - start) * 1e3 / len(key)
+        times = dict.fromkeys(key, share)
+        if self._marks is not None:
+            times = {name: wp.get_event_elapsed_time(*self._marks[name]) for name in key}
+        timings.update({name: StageTiming(milliseconds, False) for name, milliseconds in times.items()})
         return timings
 
-    def _replay(self, key: tuple[str, ...], steps: list[Pass]) -> None:
+    def _replay(self, key: tuple[str, ...], part: list[Step]) -> None:
         graph = self._graphs.get(key)
         if graph is not None:
             wp.capture_launch(graph)
             return
         # Launched once outside the capture: that loads every module, which a capture must not do.
-        _launch_all(steps)
+        self._launch_in_turn(part)
         with wp.ScopedCapture(device=self.device) as capture:
-            _launch_all(steps)
+            if self._marks is None:
+                self._launch_side_by_side(part)
+            else:
+                self._launch_in_turn(part)
         self._graphs[key] = capture.graph
 
+    def _launch_in_turn(self, part: list[Step]) -> None:
+        """Launch stages one after another; if profiling, between two marks each."""
+        for stage, passes in part:
+            if self._marks is not None:
+                begin, end = self._marks.setdefault(stage.name, _make_marks(self.device))
+                wp.record_event(begin)
+            for step in passes:
+                step.launch(None)
+            if self._marks is not None:
+                wp.record_event(end)
 
-def _segments(due: list[tuple[Stage, list[Pass]]]) -> list[tuple[bool, list[Pass]]]:
-    """Passes in order, grouped to stretches that are captured as one and stretches that run on the host."""
-    steps = [step for _, passes in due for step in passes]
-    return [(on_host, list(group)) for on_host, group in itertools.groupby(steps, key=lambda step: step.on_host)]
+    def _launch_side_by_side(self, part: list[Step]) -> None:
+        """Launch each stage on a stream of its own that waits for the writers of what it reads."""
+        stream = wp.get_stream(self.device)
+        self._streams += [wp.Stream(self.device) for _ in range(len(part) - len(self._streams))]
+        begun = stream.record_event()
+        written: dict[str, Any] = {}
+        for own, (stage, passes) in zip(self._streams, part, strict=False):
+            own.wait_event(begun)
+            for name in stage.wiring.reads:
+                if name in written:
+                    own.wait_event(written[name])
+            with wp.ScopedStream(own, sync_enter=False):
+                for step in passes:
+                    step.launch(None)
+            done = own.record_event()
+            written.update(dict.fromkeys(stage.wiring.writes, done))
+            stream.wait_event(done)
 
 
-def _launch_all(steps: list[Pass]) -> None:
-    for step in steps:
-        step.launch(None)
+def _make_marks(device: Any) -> tuple[Any, Any]:
+    return wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
+
+
+def _segments(due: list[Step]) -> list[tuple[bool, list[Step]]]:
+    """Stages in order, cut into stretches that are captured as one and stretches that run on the host."""
+    steps = [(step.on_host, stage, step) for stage, passes in due for step in passes]
+    return [
+        (on_host, [(stage, [step for _, _, step in own]) for stage, own in itertools.groupby(stretch, lambda s: s[1])])
+        for on_host, stretch in itertools.groupby(steps, lambda s: s[0])
+    ]
 
 
 def _call(launch: Callable[[Rows | None], None], rows: Rows) -> None:

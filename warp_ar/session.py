@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result
 from warp_ar.quality import DEFAULT_PRESET, Quality
 from warp_ar.scene import Camera, Scene, SourceSpec, load_scene
@@ -86,5 +86,19 @@ class Session:
         self.pipeline.close()
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
-        for frame in self.source:
-            yield frame, self.pipeline(frame.image, time_seconds=frame.time)
+        pipeline = self.pipeline
+        if pipeline.device.is_cpu or self.source.live or "environment" in pipeline.plan.request.outputs:
+            for frame in self.source:
+                yield frame, pipeline(frame.image, time_seconds=frame.time)
+            return
+        # One frame ahead of what is handed out, so that reading a picture does not hold up the next frame.
+        ready: list[tuple[Frame, Result]] = []
+        try:
+            for frame in self.source:
+                ready.append((frame, pipeline.submit(frame.image, time_seconds=frame.time)))
+                if len(ready) > 1:
+                    yield ready.pop(0)
+        except WarpArError:
+            yield from ready
+            raise
+        yield from ready
