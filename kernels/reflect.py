@@ -146,7 +146,7 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
         if wp.static(config.diffuse == "map"):
             radiance += wp.cw_mul(surface.diffuse, sample_latlong(room.irradiance_map, normal)) / wp.pi
         if wp.static(config.specular):
-            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, reflect(wo, normal))
+            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, reflect(wo, normal), 0.0)
             radiance += wp.cw_mul(surface.reflectance, mirrored)
         return radiance
 
@@ -155,11 +155,19 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
 
 @functools.cache
 def make_mirrored(config: RoomConfig) -> wp.Function:
-    """``mirrored(room, model, roughness, shininess, direction) -> vec3``: the distant room as a lobe sees it."""
+    """``mirrored(room, model, roughness, shininess, direction, floor) -> vec3``: the distant room as a lobe sees it.
+
+    ``floor`` is the least level to read: 0 for what is looked at, more for what is only one ray of many.
+    """
 
     @wp.func(module="unique")
     def mirrored(
-        room: Room, model: wp.int32, roughness: wp.float32, shininess: wp.float32, direction: wp.vec3
+        room: Room,
+        model: wp.int32,
+        roughness: wp.float32,
+        shininess: wp.float32,
+        direction: wp.vec3,
+        floor: wp.float32,
     ) -> wp.vec3:
         level = level_from_roughness(roughness, room.level_height)
         if wp.static(PHONG in config.models):
@@ -168,6 +176,6 @@ def make_mirrored(config: RoomConfig) -> wp.Function:
         if wp.static(MIRROR in config.models):
             if model == MIRROR:
                 level = 0.0
-        return sample_levels(room.levels, direction, level, room.level_height)
+        return sample_levels(room.levels, direction, wp.max(level, floor), room.level_height)
 
     return mirrored

@@ -19,8 +19,9 @@ rays are traced, and pixels that have none are done.
 
 Bounce. What a ray meets is not black: an object reflects one of its two lobes, picked by their reflectance. Its rough
 lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an object, that object's own colour; the desk,
-whether a ray from there leaves the scene, so that the light between an object and the ground that it stands on dies
-out. Its glossy lobe gives what is in the mirror direction.
+1 if a ray from there leaves the scene, else a share of the object's reflectance, so that light dies out between an
+object and the ground that it stands on, the slower the whiter the object. Its glossy lobe gives what is in the mirror
+direction.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -38,6 +39,7 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.prefilter import level_from_alpha
 from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_mirrored, make_shade_unoccluded
 from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.room_samples import RoomSample, sample_toward
@@ -53,6 +55,14 @@ MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
 """Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
+CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
+"""Least width of an object's lobe as the desk sees it.
+
+A mirror's image of a lamp on the desk is too fine for the few rays that look for it: it would come out as specks. This
+blurs it to what they can carry, and keeps its energy.
+"""
+FURTHER = wp.constant(wp.float32(0.5))
+"""Light of an object close above the desk, over that in the open: half of what it sees is its own shadow."""
 MESH_KEY = wp.constant(7)
 """``surface_key`` modulo 8 of a mesh."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
@@ -107,12 +117,14 @@ def make_mask_cone(count: int, near: bool) -> wp.Function:
     ) -> wp.uint64:
         threshold = cone_threshold(to_center, radius)
         mask = wp.uint64(0)
+        bit = wp.uint64(1)
         for k in range(count):
             direction = directions[first + k]
             if wp.static(near):
                 direction = sample_toward(samples[first + k], point).direction
             if wp.dot(direction, to_center) >= threshold:
-                mask = mask | (wp.uint64(1) << wp.uint64(k))
+                mask = mask | bit
+            bit = bit << wp.uint64(1)
         return mask
 
     return mask_cone
@@ -185,19 +197,20 @@ def make_bounced(config: RoomConfig) -> wp.Function:
                 up = -up
             leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
             start = offset_origin(proxy.point, up, leaving, proxy.error)
-            if not occluded_by_objects(scene, start, leaving, FAR):
-                at = find_in_frame(
-                    params, frame.shape[0], frame.shape[1], scene, room.probes, proxy.point, proxy.geometric_normal
-                )
-                if at[0] >= 0.0:
-                    received = look_up(frame, decode_table, at[0], at[1])
-                else:
-                    received = sample_latlong(room.environment, outward)
-                if is_rough:
-                    if wp.static(config.diffuse == "sh"):
-                        received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
-                    if wp.static(config.diffuse == "map"):
-                        received = sample_latlong(room.irradiance_map, normal) / wp.pi
+            at = find_in_frame(
+                params, frame.shape[0], frame.shape[1], scene, room.probes, proxy.point, proxy.geometric_normal
+            )
+            if at[0] >= 0.0:
+                received = look_up(frame, decode_table, at[0], at[1])
+            else:
+                received = sample_latlong(room.environment, outward)
+            if is_rough:
+                if wp.static(config.diffuse == "sh"):
+                    received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
+                if wp.static(config.diffuse == "map"):
+                    received = sample_latlong(room.irradiance_map, normal) / wp.pi
+            if occluded_by_objects(scene, start, leaving, FAR):
+                received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
             received = shade_unoccluded(scene, room, other, outward)
         elif is_rough:
@@ -207,7 +220,8 @@ def make_bounced(config: RoomConfig) -> wp.Function:
                 received = sample_latlong(room.irradiance_map, normal) / wp.pi
         else:
             if wp.static(config.specular):
-                received = mirrored(room, surface.model, surface.roughness, surface.shininess, outward)
+                floor = level_from_alpha(CAUSTIC_ALPHA, room.level_height)
+                received = mirrored(room, surface.model, surface.roughness, surface.shininess, outward, floor)
         return wp.cw_mul(weight, received)
 
     return bounced
@@ -287,7 +301,8 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         everywhere = wp.uint64(0) - wp.uint64(1)
         without = wp.vec3(0.0)
         change = wp.vec3(0.0)
-        first = wp.static(config.count) * ((i % side) * side + j % side)
+        # A set is in the order of its sequence: any first part of it is a smaller set.
+        first = samples.shape[0] / wp.static(side * side) * ((i % side) * side + j % side)
         for part in range(wp.static(config.count // chunk)):
             at = first + part * wp.static(chunk)
             virtual_mask = wp.uint64(0)
@@ -318,8 +333,8 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                     )
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | proxy_mask | ball_mask
+            bit = wp.uint64(1)
             for k in range(wp.static(chunk)):
-                bit = wp.uint64(1) << wp.uint64(k)
                 direction = directions[at + k]
                 reach = float(FAR)
                 grown = float(1.0)
@@ -370,6 +385,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                             else:
                                 if occluded_by_objects(scene, origin, direction, reach):
                                     change -= weight * radiance
+                bit = bit << wp.uint64(1)
         ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
         for channel in range(3):
             if without[channel] > MIN_IRRADIANCE:
@@ -480,7 +496,7 @@ def shade_room(
         decode_table: (256,) of ``color.decode_table``.
         scene: Objects and proxies.
         room: The room's light; what ``config.room`` leaves out may be empty.
-        directions: (config.side^2 * config.count,) directions of the samples, set after set.
+        directions: (config.side^2 * n,) directions of the samples, set after set; n is config.count or more.
         flux: (the same) radiance times solid angle of the samples.
         samples: (the same) the samples.
         stride: Pixels from one estimate to the next.

@@ -34,12 +34,18 @@ class Rung:
 
 
 RUNGS: Mapping[str, Rung] = {
+    "coarse": Rung(16, 4, 2, False),
     "sampled": Rung(64, 4, 2, False),
     "bounce": Rung(64, 4, 2, True),
     "fine": Rung(64, 4, 1, True),
     "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),
 }
 """Cheapest first, after ``none``."""
+
+
+def bounces_light(request: Request) -> bool:
+    """Whether virtual objects reflect light onto the desk, for which every material's light is read as a wide lobe."""
+    return shades_room(request) and RUNGS[request.quality.rung("room_shadow")].bounce
 
 
 def room_config(request: Request) -> RoomConfig:

@@ -12,6 +12,7 @@ from warp_ar.kernels import prefilter, pyramid
 from warp_ar.ray_scene import reflects_glossily
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.room_shadow import bounces_light
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -45,7 +46,8 @@ class Specular(Stage):
 
     @property
     def _mirrors_only(self) -> bool:
-        return all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
+        mirrors = all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
+        return mirrors and not bounces_light(self.request)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Levels, and the pyramid that the levels are made from."""
