@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
+import dataclasses
 import itertools
 import json
+import os
+import secrets
 import signal
 import sys
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -18,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.quality import DEFAULT_PRESET, PRESETS
 from warp_ar.run_log import RunLog, print_plan
-from warp_ar.scene import Scene, bundled_scenes
+from warp_ar.scene import Camera, Scene, bundled_scenes, load_scene
 from warp_ar.session import Session
 from warp_ar.sinks import NullSink, open_sink, write_environment
 
@@ -27,9 +32,11 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 
+DEFAULT_PORT = 8720
+PORT_TRIES = 20
+
 # A clip that shows no marker for this many frames is not going to: say so instead of running on.
 MARKER_PATIENCE = 100
-DEFAULT_OUTPUT = Path("desk.mp4")
 
 
 class RunError(WarpArError):
@@ -48,21 +55,62 @@ def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.live",
-        description="Camera frames of a desk with a marker and a mirror ball in, consistently lit frames out.",
+        description="Camera frames of a desk with a marker and a mirror ball in, consistently lit frames out. "
+        "Without --output or --headless they go to a page in the browser.",
     )
     add = parser.add_argument
-    add("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file or a bundled scene's name (default: desk)")
+    add(
+        "scene",
+        nargs="?",
+        default="desk",
+        metavar="SCENE",
+        help="a scene file or a bundled scene's name (default: desk)",
+    )
     add("--list", action="store_true", help="list the bundled scenes and stop")
-    add("--source", metavar="PATH|INDEX", help="frames from this folder, video file or capture device, not the scene's own")
+    add(
+        "--source",
+        metavar="PATH|INDEX",
+        help="frames from this folder, video file or capture device, not the scene's own",
+    )
     add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add("--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})")
     add("--frames", type=int, metavar="N", help="stop after N frames")
-    add("--output", type=Path, metavar="FILE.mp4|DIR", help=f"a folder gets NNNN.png, a file H.264 (default: {DEFAULT_OUTPUT})")
-    add("--headless", action="store_true", help="no progress bar, no table; writes only what other options name")
+    add(
+        "--output",
+        type=Path,
+        metavar="FILE.mp4|DIR",
+        help="write frames instead of serving the page: a folder gets NNNN.png, a file H.264",
+    )
+    add(
+        "--headless",
+        action="store_true",
+        help="no page, no progress bar, no table; writes only what other options name",
+    )
     add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
-    add("--loop", action="store_true", help="start the clip again when it ends")
+    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
+    page = parser.add_argument_group("the page")
+    page.add_argument(
+        "--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)"
+    )
+    page.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address to serve at; one that other machines reach, such as 0.0.0.0, asks them for a token (default: 127.0.0.1)",
+    )
+    page.add_argument(
+        "--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)"
+    )
+    page.add_argument(
+        "--tls",
+        nargs="?",
+        const=True,
+        metavar="FILE.pem",
+        help="serve over TLS, which browsers demand before they open a camera to another machine; without a file a certificate is made",
+    )
+    page.add_argument("--no-browser", action="store_true", help="only print the page's address")
     return parser
 
 
@@ -90,14 +138,18 @@ def _prepare_file(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     except OSError as error:
-        raise UsageError(f"cannot write {path}: {error.strerror}; name a file in a folder that you may write to") from error
+        raise UsageError(
+            f"cannot write {path}: {error.strerror}; name a file in a folder that you may write to"
+        ) from error
 
 
 def _prepare_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"cannot make the folder {path}: {error.strerror}; name a folder that you may write to") from error
+        raise UsageError(
+            f"cannot make the folder {path}: {error.strerror}; name a folder that you may write to"
+        ) from error
 
 
 def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
@@ -115,6 +167,64 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     print(f"warp_ar: {message}", file=sys.stderr)
 
 
+def serve_page(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
+    # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.viewer.host import Host
+    from warp_ar.viewer.server import LOOPBACK, Address, Server
+    from warp_ar.viewer.tls import load_context, make_context
+
+    for name in ("save_environment", "report"):
+        if getattr(options, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
+    if options.port is not None and not 0 <= options.port <= 65535:
+        raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
+    scene = load_scene(options.scene)
+    if options.calibration is not None:
+        scene = dataclasses.replace(scene, camera=Camera.load_calibration(options.calibration, scene.camera.transfer))
+    local = options.host in LOOPBACK
+    token = options.token if options.token is not None or local else secrets.token_urlsafe(16)
+    if token is not None and not token.isalnum() and options.token is not None:
+        raise UsageError("--token: expected letters and digits only, for it stands in an address")
+    if token == "":
+        raise UsageError("--token: expected a secret, not nothing")
+    tls = (
+        None
+        if options.tls is None
+        else make_context(options.host)
+        if options.tls is True
+        else load_context(Path(options.tls))
+    )
+    port = DEFAULT_PORT if options.port is None else options.port
+
+    def make_host(**callbacks: Any) -> Host:
+        return Host(
+            scene,
+            source=options.source,
+            device=options.device,
+            quality=options.quality,
+            frames=options.frames,
+            **callbacks,
+        )
+
+    def ready(address: Address) -> None:
+        print(f"warp_ar: {scene.name} is at {address.url} (Ctrl-C ends it)", flush=True)
+        if not options.no_browser and local and _has_display():
+            webbrowser.open(address.url)
+
+    server = Server(make_host, Address(options.host, port, token, tls))
+    try:
+        asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    return EXIT_DONE
+
+
+def _has_display() -> bool:
+    """Whether a browser can open a window here."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def run(options: argparse.Namespace) -> int:
     """Build everything that ``options`` ask for, then let frames flow until they end."""
     if options.list:
@@ -123,7 +233,9 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_DONE
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
-    output = options.output if options.output is not None or options.headless else DEFAULT_OUTPUT
+    if options.output is None and not options.headless:
+        return serve_page(options)
+    output = options.output
     outputs = ["image"]
     if options.save_environment is not None:
         _prepare_folder(options.save_environment)
@@ -147,7 +259,11 @@ def run(options: argparse.Namespace) -> int:
         source = session.source
         sink = NullSink() if output is None else open_sink(output, fps=source.fps, size=session.pipeline.size)
         log = RunLog(session.pipeline)
-        total = options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
+        total = (
+            options.frames
+            if options.loop or source.length is None
+            else min(options.frames or source.length, source.length)
+        )
         progress = Progress(
             TextColumn(session.scene.name),
             BarColumn(),

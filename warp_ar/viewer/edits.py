@@ -242,7 +242,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
 
 def _reach(item: Object) -> float:
-    """Radius in metres of a circle on the desk around an object's position, unscaled and unrotated, that holds it."""
+    """Radius in metres of a circle on the desk around an object, about its size."""
     if item.shape == "mesh":
         assert item.file is not None
         return item.scale * _mesh_reach(item.file)
@@ -253,4 +253,4 @@ def _reach(item: Object) -> float:
 
 @functools.lru_cache(maxsize=32)
 def _mesh_reach(file: Path) -> float:
-    return float(np.abs(load_mesh(file).bounds)[:, :2].max())
+    return float(np.abs(load_mesh(file).bounds)[:, :2].mean())

@@ -1,0 +1,238 @@
+// The page: wires the connection, the picture, the handles and the panels together.
+
+import { Capture } from "./capture.js";
+import { cameraOf, poseOf } from "./geometry.js";
+import { Handles } from "./handles.js";
+import { Light } from "./light.js";
+import { Connection, downloadUrl } from "./net.js";
+import { QualityPanel, ScenePanel, TimePanel } from "./panels.js";
+import { View } from "./view.js";
+
+const $ = (id) => document.getElementById(id);
+const connection = new Connection();
+const view = new View($("canvas"), connection);
+const handles = new Handles($("handles"), connection);
+const capture = new Capture(connection, $("video"));
+const light = new Light($("latlong"), $("ball"), $("light-note"));
+const time = new TimePanel(connection);
+const scenePanel = new ScenePanel(connection, handles);
+const quality = new QualityPanel(connection, time);
+let state = {};
+let scene = null;
+let camera = null;
+
+// ------------------------------------------------------------------------------------------------------------- messages
+
+connection.addEventListener("hello", ({ detail }) => {
+  $("scene-name").replaceChildren(...detail.scenes.map((name) => new Option(name, name)));
+  const group = document.createElement("optgroup");
+  group.label = "another preset";
+  group.append(...detail.presets.map((name) => new Option(name, name)));
+  $("compare").replaceChildren(new Option("nothing", ""), new Option("camera", "camera"), group);
+  quality.presets = detail.presets;
+});
+
+const adopt = (next) => {
+  scene = next;
+  const { name } = scene;
+  if (![...$("scene-name").options].some((option) => option.value === name)) $("scene-name").add(new Option(name, name));
+  $("scene-name").value = name;
+  document.title = `${name} · warp_ar`;
+  handles.scene = scene;
+  scenePanel.scene = scene;
+  quality.scene = scene;
+};
+let waiting = null;
+connection.addEventListener("scene", ({ detail }) => {
+  if (handles.busy) waiting = detail.scene;
+  else adopt(detail.scene);
+});
+handles.addEventListener("released", () => {
+  // What was on the way while dragging is older than what was dragged: the answer to the last edit follows.
+  waiting = null;
+});
+
+connection.addEventListener("plan", ({ detail }) => {
+  time.plan = detail;
+  quality.plan = detail;
+});
+
+connection.addEventListener("state", ({ detail }) => {
+  const before = state;
+  state = detail;
+  quality.state = state;
+  $("play").setAttribute("aria-pressed", String(state.playing));
+  $("play").lastElementChild.textContent = state.playing ? "Hold" : "Go on";
+  $("record").setAttribute("aria-pressed", String(state.recording !== null));
+  $("recording-badge").hidden = state.recording === null;
+  $("recording-badge").lastElementChild.textContent = `${state.recording ?? 0} frames`;
+  if (before.recording !== null && before.recording !== undefined && state.recording === null) {
+    $("recording-link").hidden = false;
+    download("recording.mp4");
+  }
+  $("compare").value = state.compare;
+  showSplit();
+  $("use-clip").setAttribute("aria-pressed", String(!state.camera));
+  $("use-camera").setAttribute("aria-pressed", String(state.camera));
+  $("fps").title = `Shown per second here; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
+  showCamera();
+});
+
+connection.addEventListener("light", ({ detail }) => light.take(detail));
+connection.addEventListener("notice", ({ detail }) => notice(detail.text, detail.bad));
+connection.addEventListener("intrinsics", ({ detail }) => {
+  if (detail.focal) {
+    const spread = Math.max(1, Math.round(100 * detail.spread));
+    notice(`Your camera's focal length was estimated from the marker: ${detail.focal.toFixed(0)} pixels, within about ${spread} %. For exact light, calibrate it: `, false, "python -m warp_ar.calibrate camera PHOTOS --output camera.yml");
+  } else notice("The marker was not seen from enough sides to tell your camera's focal length: 60 degrees are assumed. Move the camera around the marker, or calibrate it: ", false, "python -m warp_ar.calibrate camera PHOTOS --output camera.yml");
+});
+
+connection.addEventListener("open", () => ($("veil").hidden = view.stats.shown > 0));
+connection.addEventListener("lost", ({ detail }) => {
+  $("veil").hidden = false;
+  $("veil").textContent = detail.reason ? `Disconnected: ${detail.reason}` : "The program is not reachable; trying again …";
+});
+
+view.addEventListener("shown", ({ detail: frame }) => {
+  $("veil").hidden = true;
+  camera = cameraOf(frame.camera);
+  const pose = poseOf(frame.pose);
+  handles.frame(camera, pose);
+  light.pose = pose;
+  light.draw();
+  time.frame(frame);
+  $("track-state").className = `chip ${frame.state ?? ""}`;
+  $("track-state").lastElementChild.textContent = frame.state === null ? "no marker needed" : { tracked: "marker found", held: "marker hidden", lost: "no marker" }[frame.state];
+});
+view.addEventListener("resize", () => $("figure").style.setProperty("--aspect", $("canvas").width / $("canvas").height));
+
+setInterval(() => {
+  const { fps, latency } = view.stats;
+  $("fps").textContent = fps ? `${fps.toFixed(1)} fps` : "–";
+  $("latency").textContent = latency === null ? "–" : `${latency.toFixed(0)} ms`;
+}, 400);
+
+// ------------------------------------------------------------------------------------------------------------- controls
+
+function notice(text, bad = false, code = "") {
+  const holder = $("notices");
+  const old = [...holder.children].find((one) => one.dataset.text === text);
+  old?.remove();
+  const box = document.createElement("div");
+  box.className = `notice${bad ? " bad" : ""}`;
+  box.dataset.text = text;
+  const line = document.createElement("p");
+  line.textContent = text;
+  if (code) {
+    const command = document.createElement("code");
+    command.textContent = code;
+    line.append(command);
+  }
+  const close = document.createElement("button");
+  close.textContent = "×";
+  close.setAttribute("aria-label", "Close");
+  close.onclick = () => box.remove();
+  box.append(line, close);
+  holder.prepend(box);
+  while (holder.children.length > 3) holder.lastElementChild.remove();
+  if (bad) setTimeout(() => box.remove(), 9000);
+}
+
+function download(name) {
+  const link = document.createElement("a");
+  link.href = downloadUrl(name);
+  link.download = name;
+  link.click();
+}
+
+function showSplit() {
+  const on = !!state.compare;
+  $("split").hidden = $("divider").hidden = $("tag-left").hidden = $("tag-right").hidden = !on;
+  $("divider").style.left = `${100 * view.split}%`;
+  $("tag-left").textContent = scene?.quality ?? "";
+  $("tag-right").textContent = state.compare_ready ? state.compare : `${state.compare} …`;
+  view.draw();
+}
+
+function showCamera() {
+  if (!camera) return;
+  const field = (2 * Math.atan((0.5 * camera.width) / camera.fx) * 180) / Math.PI;
+  const guess = state.estimating ? " Guessed for now: show the marker from several sides." : "";
+  $("camera-note").textContent = `${state.source}. ${camera.width}×${camera.height}, focal length ${camera.fx.toFixed(0)} pixels (${field.toFixed(0)}° across).${guess}`;
+}
+
+for (const link of document.querySelectorAll("[data-download]")) {
+  link.href = downloadUrl(link.dataset.download);
+  link.download = link.dataset.download;
+}
+for (const menu of document.querySelectorAll(".menu")) {
+  menu.addEventListener("click", (event) => event.target.closest("a, div > button") && (menu.open = false));
+  menu.addEventListener("keydown", (event) => event.key === "Escape" && ((menu.open = false), menu.firstElementChild.focus()));
+}
+document.addEventListener("pointerdown", (event) => {
+  for (const menu of document.querySelectorAll(".menu[open]")) if (!menu.contains(event.target)) menu.open = false;
+});
+for (const button of document.querySelectorAll("[data-add]")) {
+  button.addEventListener("click", () => {
+    const [thing, kind] = button.dataset.add.split(" ");
+    scenePanel.select(`${thing} ${scene[`${thing}s`].length}`);
+    connection.send("add", { thing, kind });
+  });
+}
+const tabs = [...document.querySelectorAll("[role=tab]")];
+const openTab = (tab) => {
+  for (const one of tabs) {
+    one.setAttribute("aria-selected", String(one === tab));
+    one.tabIndex = one === tab ? 0 : -1;
+    $(one.getAttribute("aria-controls")).hidden = one !== tab;
+  }
+};
+tabs.forEach((tab, index) => {
+  tab.addEventListener("click", () => openTab(tab));
+  tab.addEventListener("keydown", (event) => {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (step) openTab(tabs[(index + step + tabs.length) % tabs.length]), tabs[(index + step + tabs.length) % tabs.length].focus();
+  });
+});
+openTab(tabs[0]);
+
+$("scene-name").addEventListener("change", (event) => connection.send("scene", { name: event.target.value }));
+$("compare").addEventListener("change", (event) => connection.send("compare", { other: event.target.value }));
+$("split").addEventListener("input", (event) => {
+  view.split = event.target.value / 1000;
+  showSplit();
+});
+$("play").addEventListener("click", () => connection.send("play", { on: !state.playing }));
+$("record").addEventListener("click", () => connection.send("record", { on: state.recording === null }));
+$("reset").addEventListener("click", () => connection.send("reset"));
+$("show-handles").addEventListener("click", (event) => {
+  const on = event.currentTarget.getAttribute("aria-pressed") !== "true";
+  event.currentTarget.setAttribute("aria-pressed", String(on));
+  handles.visible = on;
+});
+$("fullscreen").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : $("figure").requestFullscreen?.()));
+$("use-camera").addEventListener("click", async () => {
+  if (capture.on) return;
+  try {
+    await capture.start();
+  } catch (error) {
+    const reasons = { NotAllowedError: "the browser was not allowed to open it", NotFoundError: "this device has none", NotReadableError: "another program is using it" };
+    notice(`Your camera cannot be opened: ${reasons[error.name] ?? error.message}.`, true);
+  }
+});
+$("use-clip").addEventListener("click", () => capture.stop());
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea, summary")) return;
+  const keys = { " ": "play", h: "show-handles", r: "record", f: "fullscreen" };
+  if (event.key === " " && event.target.closest("button, [tabindex]:not(g)")) return;
+  if (keys[event.key]) $(keys[event.key]).click();
+  else if (event.key === "s") download("frame.png");
+  else if (event.key === "c") connection.send("compare", { other: state.compare ? "" : "camera" });
+  else return;
+  event.preventDefault();
+});
+
+connection.open();
+// What the tests read.
+window.warpAr = { view, handles, connection, get scene() { return scene; }, get state() { return state; }, get camera() { return camera; } };

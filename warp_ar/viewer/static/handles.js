@@ -1,0 +1,307 @@
+// Handles on the desk: rings around objects, lamps on stems, dragged with pointer, wheel or keys.
+
+import { deskAxes, onPlane, project } from "./geometry.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+const make = (name, attributes = {}, parent = null) => {
+  const element = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  parent?.append(element);
+  return element;
+};
+const css = (color) => {
+  const top = Math.max(...color, 1e-6);
+  return `rgb(${color.map((c) => Math.round(255 * Math.pow(Math.min(c / top, 1), 1 / 2.2))).join(" ")})`;
+};
+const rounded = (values) => values.map((v) => Math.round(v * 1e5) / 1e5);
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const SUN = 0.22; // metres from the marker at which a directional light's handle hangs
+
+export const lightColor = css;
+
+export class Handles extends EventTarget {
+  #svg;
+  #connection;
+  #items = [];
+  #camera = null;
+  #pose = null;
+  #scene = null;
+  #drag = null;
+  #selected = null;
+  #visible = true;
+
+  constructor(svg, connection) {
+    super();
+    this.#svg = svg;
+    this.#connection = connection;
+    svg.addEventListener("pointermove", (event) => this.#move(event));
+    svg.addEventListener("pointerup", () => this.#release());
+    svg.addEventListener("pointercancel", () => this.#release());
+    svg.addEventListener("wheel", (event) => this.#wheel(event), { passive: false });
+    svg.addEventListener("pointerdown", (event) => event.target === svg && this.#select(null));
+  }
+
+  /** Whether something is being dragged: the scene is the page's until it is let go. */
+  get busy() {
+    return this.#drag !== null;
+  }
+
+  set visible(on) {
+    this.#visible = on;
+    this.#place();
+  }
+
+  set selected(key) {
+    this.#selected = key;
+    for (const item of this.#items) item.group.classList.toggle("on", item.key === key);
+  }
+
+  set scene(scene) {
+    const shape = JSON.stringify([scene.objects.map((o) => o.shape), scene.lights.map((l) => [l.kind, !!l.target])]);
+    const same = this.#scene && shape === this.#scene.shape;
+    this.#scene = { ...scene, shape };
+    if (!same) this.#rebuild();
+    this.selected = this.#selected;
+    this.#place();
+  }
+
+  frame(camera, pose) {
+    this.#camera = camera;
+    this.#pose = pose;
+    this.#place();
+  }
+
+  #thing(item) {
+    return item.thing === "object" ? this.#scene.objects[item.index] : this.#scene.lights[item.index];
+  }
+
+  #rebuild() {
+    this.#svg.replaceChildren();
+    this.#items = [];
+    this.#scene.lights.forEach((light, index) => {
+      const item = this.#group("light", index, `${light.kind} light ${index + 1}`);
+      item.stem = make("line", { class: "stem" }, item.group);
+      item.floor = this.#part(item, "floor", make("path", { class: "ring" }, item.group));
+      if (light.target) {
+        item.beam = make("line", { class: "stem" }, item.group);
+        item.target = make("circle", { class: "knob", r: 5 }, item.group);
+        item.targetHit = this.#part(item, "target", make("circle", { class: "hit", r: 18 }, item.group));
+      }
+      item.lamp = make("circle", { class: "lamp", r: 10 }, item.group);
+      item.hit = this.#part(item, "at", make("circle", { class: "hit", r: 24 }, item.group));
+    });
+    this.#scene.objects.forEach((object, index) => {
+      const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
+      item.halo = make("path", { class: "halo" }, item.group);
+      item.ring = this.#part(item, "at", make("path", { class: "ring" }, item.group));
+      item.knob = make("circle", { class: "knob", r: 6 }, item.group);
+      item.knobHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
+    });
+  }
+
+  #group(thing, index, label) {
+    const group = make("g", { class: "thing", tabindex: 0, role: "button", "aria-label": `${label}: arrows move it` }, this.#svg);
+    const item = { thing, index, key: `${thing} ${index}`, group };
+    group.dataset.key = item.key;
+    group.addEventListener("focus", () => this.#select(item.key));
+    group.addEventListener("keydown", (event) => this.#key(event, item));
+    this.#items.push(item);
+    return item;
+  }
+
+  #part(item, part, element) {
+    element.addEventListener("pointerdown", (event) => this.#grab(event, item, part));
+    return element;
+  }
+
+  #circle([x, y], radius, z) {
+    const points = [];
+    for (let i = 0; i < 40; i++) {
+      const angle = (i * Math.PI) / 20;
+      const at = project(this.#camera, this.#pose, [x + radius * Math.cos(angle), y + radius * Math.sin(angle), z]);
+      if (!at) return "";
+      points.push(`${(at[0] + 0.5).toFixed(1)} ${(at[1] + 0.5).toFixed(1)}`);
+    }
+    return `M${points.join("L")}Z`;
+  }
+
+  #lampAt(light) {
+    if (light.kind !== "directional") return light.at;
+    const size = Math.hypot(...light.direction) || 1;
+    return light.direction.map((d) => (-SUN * d) / size);
+  }
+
+  #place() {
+    const shown = this.#visible && this.#camera && this.#pose && this.#scene;
+    this.#svg.style.visibility = shown ? "" : "hidden";
+    if (!shown) return;
+    const { width, height } = this.#camera;
+    const box = `0 0 ${width} ${height}`;
+    if (this.#svg.getAttribute("viewBox") !== box) this.#svg.setAttribute("viewBox", box);
+    // Sizes are in pixels of the screen, whatever the picture's.
+    const unit = width / (this.#svg.clientWidth || width);
+    for (const item of this.#items) {
+      const thing = this.#thing(item);
+      item.group.style.display = thing.visible ? "" : "none";
+      if (!thing.visible) continue;
+      if (item.thing === "object") this.#placeObject(item, thing, unit);
+      else this.#placeLight(item, thing, unit);
+    }
+  }
+
+  #placeObject(item, object, unit) {
+    const radius = Math.max(object.reach * 1.1, 0.012);
+    const path = this.#circle(object.at, radius, 0);
+    item.ring.setAttribute("d", path);
+    item.halo.setAttribute("d", path);
+    const angle = (object.rotate[2] * Math.PI) / 180;
+    const knob = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
+    for (const [element, size] of [[item.knob, 5.5], [item.knobHit, 18]]) put(element, knob, size * unit);
+  }
+
+  #placeLight(item, light, unit) {
+    const at = this.#lampAt(light);
+    const lamp = project(this.#camera, this.#pose, at);
+    const floor = project(this.#camera, this.#pose, light.kind === "directional" ? [0, 0, 0] : [at[0], at[1], 0]);
+    // A lamp above the picture hangs at its border, where it can still be taken.
+    const rim = 14 * unit;
+    const held = lamp && [clamp(lamp[0], rim, this.#camera.width - rim), clamp(lamp[1], rim, this.#camera.height - rim)];
+    put(item.lamp, held, 9 * unit);
+    put(item.hit, held, 24 * unit);
+    item.group.classList.toggle("beyond", !!lamp && (held[0] !== lamp[0] || held[1] !== lamp[1]));
+    item.lamp.setAttribute("fill", css(light.color));
+    line(item.stem, lamp, floor);
+    item.floor.setAttribute("d", light.kind === "directional" ? "" : this.#circle(at, 0.014, 0));
+    if (item.target) {
+      const target = project(this.#camera, this.#pose, light.target);
+      put(item.target, target, 4.5 * unit);
+      put(item.targetHit, target, 18 * unit);
+      line(item.beam, lamp, target);
+    }
+  }
+
+  #select(key) {
+    this.selected = key;
+    this.dispatchEvent(new CustomEvent("select", { detail: key }));
+  }
+
+  #pointer(event) {
+    const box = this.#svg.getBoundingClientRect();
+    const { width, height } = this.#camera;
+    // A pixel's centre is an integer: its left edge is half a pixel to the left.
+    return [((event.clientX - box.left) / box.width) * width - 0.5, ((event.clientY - box.top) / box.height) * height - 0.5];
+  }
+
+  #grab(event, item, part) {
+    if (event.button !== 0 || !this.#pose) return;
+    event.preventDefault();
+    event.stopPropagation();
+    const thing = this.#thing(item);
+    const point = item.thing === "object" || part === "floor" ? [thing.at[0], thing.at[1], 0] : part === "target" ? thing.target : this.#lampAt(thing);
+    const seen = project(this.#camera, this.#pose, point) ?? [0, 0];
+    const [u, v] = this.#pointer(event);
+    this.#drag = { item, part, point, off: [seen[0] - u, seen[1] - v], height: thing.at[2], from: v };
+    this.#svg.setPointerCapture(event.pointerId);
+    item.group.focus({ preventScroll: true });
+    this.#select(item.key);
+  }
+
+  #move(event) {
+    if (!this.#drag || !this.#pose) return;
+    const { item, part, point, off, from, height } = this.#drag;
+    const thing = this.#thing(item);
+    const [u, v] = this.#pointer(event);
+    if (part === "turn") {
+      const at = onPlane(this.#camera, this.#pose, u, v, 0);
+      if (at) this.#put(item, "rotate", [thing.rotate[0], thing.rotate[1], (Math.atan2(at[1] - thing.at[1], at[0] - thing.at[0]) * 180) / Math.PI]);
+      return;
+    }
+    if (event.shiftKey && part === "at" && thing.kind !== "directional") {
+      this.#put(item, "at", [thing.at[0], thing.at[1], clamp(height + (from - v) * 0.001, -1, 3)]);
+      return;
+    }
+    const at = onPlane(this.#camera, this.#pose, u + off[0], v + off[1], point[2]);
+    if (!at) return;
+    const [x, y] = [clamp(at[0], -3, 3), clamp(at[1], -3, 3)];
+    if (part === "target") this.#put(item, "target", [x, y, thing.target[2]]);
+    else if (thing.kind === "directional") this.#put(item, "direction", [-x, -y, -point[2]]);
+    else this.#put(item, "at", [x, y, thing.at[2]]);
+  }
+
+  #release() {
+    if (!this.#drag) return;
+    this.#drag = null;
+    this.dispatchEvent(new Event("released"));
+  }
+
+  #wheel(event) {
+    const key = event.target.closest?.(".thing")?.dataset.key ?? this.#selected;
+    const item = this.#items.find((one) => one.key === key);
+    if (!item || !this.#pose) return;
+    event.preventDefault();
+    const step = clamp(event.deltaY * (event.deltaMode === 1 ? 30 : 1), -240, 240);
+    if (item.thing === "light") this.#raise(item, -step * 0.0002);
+    else if (event.shiftKey) this.#raise(item, -step * 0.0001);
+    else this.#turn(item, step * 0.06);
+    this.#select(item.key);
+  }
+
+  #raise(item, by) {
+    const thing = this.#thing(item);
+    if (thing.kind === "directional") {
+      const [x, y, z] = this.#lampAt(thing);
+      this.#put(item, "direction", [-x, -y, -clamp(z + by, 0.01, 3)]);
+    } else this.#put(item, "at", [thing.at[0], thing.at[1], clamp(thing.at[2] + by, item.thing === "light" ? 0.01 : -1, 3)]);
+  }
+
+  #turn(item, degrees) {
+    const thing = this.#thing(item);
+    if (item.thing === "object") this.#put(item, "rotate", [thing.rotate[0], thing.rotate[1], thing.rotate[2] + degrees]);
+  }
+
+  #key(event, item) {
+    const step = event.shiftKey ? 0.001 : 0.006;
+    const axes = deskAxes(this.#pose);
+    const arrows = { ArrowRight: axes.right, ArrowLeft: axes.right.map((a) => -a), ArrowUp: axes.away, ArrowDown: axes.away.map((a) => -a) };
+    const thing = this.#thing(item);
+    if (arrows[event.key]) {
+      const [x, y] = arrows[event.key];
+      if (thing.kind === "directional") {
+        const at = this.#lampAt(thing);
+        this.#put(item, "direction", [-at[0] - x * step, -at[1] - y * step, -at[2]]);
+      } else this.#put(item, "at", [thing.at[0] + x * step, thing.at[1] + y * step, thing.at[2]]);
+    } else if (event.key === "PageUp" || event.key === "PageDown") this.#raise(item, event.key === "PageUp" ? step : -step);
+    else if (event.key === "[" || event.key === "]") this.#turn(item, event.key === "]" ? 5 : -5);
+    else if (event.key === "v") this.#connection.send("show", { thing: item.thing, index: item.index, on: false });
+    else if (event.key === "Delete") this.#connection.send("remove", { thing: item.thing, index: item.index });
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  /** Change a value here at once, and on the server. */
+  #put(item, key, value) {
+    const thing = this.#thing(item);
+    thing[key] = rounded(value);
+    this.#connection.set(item.thing, item.index, key, thing[key]);
+    this.#place();
+    this.dispatchEvent(new CustomEvent("edited", { detail: item.key }));
+  }
+}
+
+function put(element, at, radius) {
+  element.style.display = at ? "" : "none";
+  if (!at) return;
+  element.setAttribute("cx", at[0] + 0.5);
+  element.setAttribute("cy", at[1] + 0.5);
+  element.setAttribute("r", radius);
+}
+
+function line(element, from, to) {
+  element.style.display = from && to ? "" : "none";
+  if (!from || !to) return;
+  element.setAttribute("x1", from[0] + 0.5);
+  element.setAttribute("y1", from[1] + 0.5);
+  element.setAttribute("x2", to[0] + 0.5);
+  element.setAttribute("y2", to[1] + 0.5);
+}

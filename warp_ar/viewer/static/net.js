@@ -1,0 +1,104 @@
+// The connection: messages in and out, the server's clock, and coming back after a loss.
+
+const token = new URLSearchParams(location.search).get("token");
+const query = token ? `?token=${encodeURIComponent(token)}` : "";
+
+export const downloadUrl = (name) => `download/${name}${query}`;
+
+export class Connection extends EventTarget {
+  /** Milliseconds to add to performance.now() for the server's clock. */
+  offset = null;
+  #socket = null;
+  #bestTrip = Infinity;
+  #wait = 500;
+  #edits = new Map();
+  #flushing = false;
+
+  open() {
+    const url = new URL("live" + query, location.href);
+    url.protocol = url.protocol.replace("http", "ws");
+    const socket = new WebSocket(url);
+    socket.binaryType = "arraybuffer";
+    this.#socket = socket;
+    socket.onopen = () => {
+      this.#wait = 500;
+      this.#bestTrip = Infinity;
+      this.#emit("open");
+      this.#ping();
+    };
+    socket.onmessage = ({ data }) => {
+      if (typeof data === "string") this.#text(JSON.parse(data));
+      else this.#binary(data);
+    };
+    socket.onclose = ({ code, reason }) => {
+      this.#emit("lost", { code, reason });
+      setTimeout(() => this.open(), this.#wait);
+      this.#wait = Math.min(this.#wait * 1.7, 8000);
+    };
+  }
+
+  get ready() {
+    return this.#socket?.readyState === WebSocket.OPEN;
+  }
+
+  get backlog() {
+    return this.#socket?.bufferedAmount ?? 0;
+  }
+
+  send(type, fields = {}) {
+    if (this.ready) this.#socket.send(JSON.stringify({ type, ...fields }));
+  }
+
+  sendBinary(data) {
+    if (this.ready) this.#socket.send(data);
+  }
+
+  /** Change a value of the scene; of several changes of one value within 30 ms only the last is sent. */
+  set(thing, index, key, value) {
+    this.#edits.set(`${thing} ${index} ${key}`, { thing, index, key, value });
+    if (this.#flushing) return;
+    this.#flushing = true;
+    this.#flush();
+    setTimeout(() => {
+      this.#flushing = false;
+      this.#flush();
+    }, 30);
+  }
+
+  #flush() {
+    for (const edit of this.#edits.values()) this.send("set", edit);
+    this.#edits.clear();
+  }
+
+  #emit(name, detail) {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  }
+
+  #ping() {
+    if (!this.ready) return;
+    this.send("ping", { sent: performance.now() });
+    setTimeout(() => this.#ping(), this.offset === null ? 200 : 3000);
+  }
+
+  #text(message) {
+    if (message.type === "pong") {
+      const now = performance.now();
+      const trip = now - message.sent;
+      // The quickest answer was held up least; later ones are let in, for clocks drift.
+      if (trip <= this.#bestTrip * 1.2) {
+        this.#bestTrip = Math.min(trip, this.#bestTrip * 1.05);
+        this.offset = message.clock + trip / 2 - now;
+      }
+      return;
+    }
+    this.#emit(message.type, message);
+  }
+
+  #binary(data) {
+    const length = new DataView(data).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+    let place = 4 + length;
+    header.pictures = header.sizes.map((size) => new Uint8Array(data, place, ((place += size), size)));
+    this.#emit(header.type, header);
+  }
+}

@@ -1,0 +1,422 @@
+// The panels: what is on the desk, effects, exposure, quality, time.
+
+import { lightColor } from "./handles.js";
+
+const el = (name, attributes = {}, ...children) => {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key in element && typeof value !== "string") element[key] = value;
+    else element.setAttribute(key, value);
+  }
+  element.append(...children);
+  return element;
+};
+const svg = (path) => {
+  const holder = document.createElement("template");
+  holder.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true">${path}</svg>`;
+  return holder.content.firstChild;
+};
+const EYE = '<path d="M2 12s3.6-6.5 10-6.5S22 12 22 12s-3.6 6.5-10 6.5S2 12 2 12z"/><circle cx="12" cy="12" r="2.8"/>';
+const SHUT = '<path d="M3 3l18 18M10 6a9 9 0 012-.3c6.400 0 10 6.300 10 6.300a17 17 0 01-3 3.700M6.500 7.500A17 17 0 002 12s3.600 6.500 10 6.500c1.600 0 3-.4 4.300-1"/>';
+const BIN = '<path d="M5 7h14M10 7V5h4v2M7 7l1 12h8l1-12"/>';
+
+const toHex = (color) => "#" + color.map((c) => Math.round(255 * Math.pow(Math.min(Math.max(c, 0), 1), 1 / 2.2)).toString(16).padStart(2, "0")).join("");
+const fromHex = (hex) => [1, 3, 5].map((i) => Math.round(1e4 * Math.pow(parseInt(hex.slice(i, i + 2), 16) / 255, 2.2)) / 1e4);
+const shown = (value) => Math.abs(value) < 5e-4 ? "0" :  (Math.abs(value) >= 100 ? value.toFixed(0) : Math.abs(value) >= 10 ? value.toFixed(1) : value.toFixed(3).replace(/\.?0+$/, "") || "0");
+
+/** A row of label, slider and number; `curve` above 1 spreads the slider's low end. */
+function slider(label, { low, high, curve = 1, step = 0.001 }, value, change) {
+  const range = el("input", { type: "range", min: "0", max: "1000", "aria-label": label });
+  const number = el("input", { type: "number", step: String(step), "aria-label": label });
+  const place = (v) => {
+    range.value = 1000 * Math.pow(Math.min(Math.max((v - low) / (high - low), 0), 1), 1 / curve);
+    if (document.activeElement !== number) number.value = shown(v);
+  };
+  range.addEventListener("input", () => {
+    const v = low + (high - low) * Math.pow(range.value / 1000, curve);
+    const near = Math.round(v / step) * step;
+    if (document.activeElement !== number) number.value = shown(near);
+    change(near);
+  });
+  number.addEventListener("change", () => Number.isFinite(number.valueAsNumber) && (change(number.valueAsNumber), place(number.valueAsNumber)));
+  const row = el("div", { class: "row" }, el("span", {}, label), range, number);
+  row.place = place;
+  place(value);
+  return row;
+}
+
+function color(label, value, change) {
+  if (!Array.isArray(value)) return el("div", { class: "row" }, el("span", {}, label), el("span", {}, String(value)));
+  const input = el("input", { type: "color", "aria-label": label, oninput: () => change(fromHex(input.value)) });
+  input.value = toHex(value);
+  return el("div", { class: "row" }, el("span", {}, label), input);
+}
+
+const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror" };
+const EFFECTS = {
+  objects: ["Virtual objects", ""],
+  lights: ["Virtual lights", ""],
+  room: ["Light of the room", "captured from the mirror ball"],
+  desk: ["The desk's shape", "receives light and shadow, hides what is behind it"],
+  room_shadow: ["Shadows of the room's light", "under virtual objects"],
+  relief: ["Relief of the desk", "virtual light brings out its bumps"],
+  exposure: ["Exposure", "darkens as a camera would"],
+};
+
+export class ScenePanel {
+  #connection;
+  #handles;
+  #scene = null;
+  #selected = null;
+  #shape = "";
+
+  constructor(connection, handles) {
+    this.#connection = connection;
+    this.#handles = handles;
+    this.things = document.getElementById("things");
+    this.inspector = document.getElementById("inspector");
+    handles.addEventListener("select", ({ detail }) => this.select(detail, false));
+    handles.addEventListener("edited", ({ detail }) => detail === this.#selected && this.#fill());
+  }
+
+  select(key, tellHandles = true) {
+    this.#selected = key;
+    if (tellHandles) this.#handles.selected = key;
+    for (const item of this.things.children) item.classList.toggle("on", item.dataset.key === key);
+    this.#inspect();
+  }
+
+  set scene(scene) {
+    this.#scene = scene;
+    const entries = [...scene.objects.map((o, i) => ["object", i, o]), ...scene.lights.map((l, i) => ["light", i, l])];
+    this.things.replaceChildren(...entries.map(([thing, index, item]) => this.#entry(thing, index, item)));
+    if (!entries.length) this.things.append(el("li", { class: "note" }, "Nothing yet: add an object or a light."));
+    if (!this.#selected || !this.things.querySelector(`[data-key="${this.#selected}"]`)) {
+      this.#selected = entries.length ? `${entries[0][0]} ${entries[0][1]}` : null;
+      this.#handles.selected = this.#selected;
+    }
+    for (const item of this.things.children) item.classList.toggle("on", item.dataset.key === this.#selected);
+    const inside = this.inspector.contains(document.activeElement);
+    const shape = JSON.stringify([scene.name, this.#selected, this.#item() && Object.keys(this.#item()), this.#item()?.material?.model, this.#item()?.target === null]);
+    if (shape !== this.#shape || !inside) this.#inspect();
+    this.#shape = shape;
+    this.#effects(scene);
+    this.#exposure(scene);
+  }
+
+  #entry(thing, index, item) {
+    const key = `${thing} ${index}`;
+    const tint = thing === "light" ? item.color : item.material.base_color ?? item.material.diffuse;
+    const dot = el("i", { class: thing });
+    const css = Array.isArray(tint) ? (thing === "light" ? lightColor(tint) : toHex(tint)) : "#999";
+    dot.style.background = css;
+    dot.style.setProperty("--c", css);
+    const name = thing === "light" ? { point: "Point light", spot: "Spotlight", directional: "Sun" }[item.kind] : item.file?.replace(/\.\w+$/, "") ?? item.shape;
+    const title = name[0].toUpperCase() + name.slice(1);
+    const entry = el("li", { class: item.visible ? "" : "off" },
+      el("button", { class: "pick", onclick: () => this.select(key) }, dot, title),
+      el("button", { class: "eye", "aria-label": `${item.visible ? "Hide" : "Show"} ${title}`, title: item.visible ? "Hide" : "Show",
+        onclick: () => this.#connection.send("show", { thing, index, on: !item.visible }) }, svg(item.visible ? EYE : SHUT)),
+      el("button", { class: "drop", "aria-label": `Remove ${title}`, title: "Remove", onclick: () => this.#connection.send("remove", { thing, index }) }, svg(BIN)));
+    entry.dataset.key = key;
+    return entry;
+  }
+
+  #item() {
+    if (!this.#selected || !this.#scene) return null;
+    const [thing, index] = this.#selected.split(" ");
+    return (thing === "object" ? this.#scene.objects : this.#scene.lights)[index] ?? null;
+  }
+
+  /** Bring the numbers of the inspector up to date with a drag. */
+  #fill() {
+    this.#inspect();
+  }
+
+  #inspect() {
+    const item = this.#item();
+    if (!item) return this.inspector.replaceChildren();
+    const [thing, number] = this.#selected.split(" ");
+    const index = Number(number);
+    const set = (key, value, holder = item) => {
+      holder[key] = value;
+      this.#connection.set(thing, index, key, value);
+      if (holder === item) this.#handles.scene = this.#scene;
+    };
+    const part = (key, axis) => (value) => {
+      const changed = [...item[key]];
+      changed[axis] = value;
+      set(key, changed);
+    };
+    const rows = [];
+    if (item.kind !== "directional") {
+      rows.push(slider("Height", { low: thing === "light" ? 0.01 : 0, high: thing === "light" ? 1 : 0.3, curve: 1.6 }, item.at[2], part("at", 2)));
+    }
+    if (thing === "object") rows.push(...this.#object(item, set, part));
+    else rows.push(...this.#light(item, set));
+    this.inspector.replaceChildren(...rows);
+  }
+
+  #object(item, set, part) {
+    const { material } = item;
+    const rows = [slider("Turn", { low: -180, high: 180, step: 1 }, ((item.rotate[2] + 540) % 360) - 180, part("rotate", 2))];
+    const scale = item.scale;
+    rows.push(slider("Size", { low: scale * 0.25, high: scale * 2.5, step: scale / 200 }, scale, (value) => set("scale", value)));
+    const model = el("select", { "aria-label": "Material", onchange: () => set("model", model.value, {}) },
+      ...Object.entries(MODELS).map(([value, text]) => el("option", { value, selected: value === material.model }, text)));
+    rows.push(el("div", { class: "row" }, el("span", {}, "Material"), model));
+    const number = (label, key, limits) => key in material && rows.push(slider(label, limits, material[key], (value) => set(key, value, material)));
+    for (const [label, key] of [["Colour", "base_color"], ["Diffuse", "diffuse"], ["Specular", "specular"]]) {
+      if (key in material) rows.push(color(label, material[key], (value) => set(key, value, material)));
+    }
+    number("Metallic", "metallic", { low: 0, high: 1, step: 0.01 });
+    number("Roughness", "roughness", { low: 0, high: 1, step: 0.01 });
+    number("Shininess", "shininess", { low: 0, high: 1000, curve: 3, step: 1 });
+    return rows;
+  }
+
+  #light(item, set) {
+    const rows = [color("Colour", item.color, (value) => set("color", value))];
+    const high = item.kind === "spot" ? 12 : item.kind === "point" ? 3 : 6;
+    rows.push(slider("Intensity", { low: 0, high: Math.max(high, item.intensity), curve: 2, step: 0.005 }, item.intensity, (value) => set("intensity", value)));
+    if (item.kind === "spot") {
+      rows.push(slider("Inner cone", { low: 0, high: 60, step: 0.5 }, item.inner_angle, (v) => set("inner_angle", Math.min(v, item.outer_angle))));
+      rows.push(slider("Outer cone", { low: 1, high: 80, step: 0.5 }, item.outer_angle, (v) => set("outer_angle", Math.max(v, item.inner_angle))));
+    }
+    if (item.kind !== "directional") rows.push(slider("Softness", { low: 0, high: 0.1, curve: 2 }, item.radius, (value) => set("radius", value)));
+    return rows;
+  }
+
+  #effects(scene) {
+    const holder = document.getElementById("effects");
+    const focused = document.activeElement?.id;
+    holder.replaceChildren(...Object.entries(scene.effects).map(([name, on]) => {
+      const [title, about] = EFFECTS[name] ?? [name, ""];
+      const flip = el("button", { class: "switch", role: "switch", id: `effect-${name}`, "aria-checked": String(on), "aria-label": title,
+        onclick: () => this.#connection.send("effect", { name, on: flip.getAttribute("aria-checked") !== "true" }) });
+      const label = el("label", { class: "toggle", for: flip.id }, el("span", {}, title, about ? el("small", {}, about) : ""), flip);
+      return label;
+    }));
+    if (focused?.startsWith("effect-")) document.getElementById(focused)?.focus();
+  }
+
+  #exposure(scene) {
+    const holder = document.getElementById("exposure");
+    if (holder.contains(document.activeElement) && document.activeElement.type === "range" && scene.exposure !== "auto") return;
+    const auto = scene.exposure === "auto";
+    const set = (value) => this.#connection.set("exposure", 0, "scale", value);
+    const row = slider("Scale", { low: 0, high: 2, step: 0.01 }, auto ? 1 : scene.exposure, set);
+    row.querySelectorAll("input").forEach((input) => (input.disabled = auto));
+    const flip = el("button", { class: "switch", role: "switch", id: "exposure-auto", "aria-checked": String(auto), "aria-label": "Automatic exposure",
+      onclick: () => set(auto ? 1 : "auto") });
+    holder.replaceChildren(row, el("label", { class: "toggle", for: "exposure-auto" }, el("span", {}, "Automatic", el("small", {}, "keeps highlights below clipping")), flip));
+  }
+}
+
+const hue = (index) => `hsl(${(28 + index * 47) % 360} ${58 + (index % 3) * 9}% ${56 + (index % 2) * 8}%)`;
+const HISTORY = 120;
+
+export class TimePanel {
+  #connection;
+  #plan = null;
+  #means = new Map();
+  #skips = new Map();
+  #frames = [];
+  #rows = new Map();
+  #painted = 0;
+  budget = null;
+
+  constructor(connection) {
+    this.#connection = connection;
+    this.list = document.getElementById("stages");
+    this.canvas = document.getElementById("history");
+    this.total = document.getElementById("frame-ms");
+  }
+
+  set plan(plan) {
+    this.#plan = plan;
+    this.#means.clear();
+    this.#skips.clear();
+    this.#rows.clear();
+    const all = [...plan.run, { stage: "encode", rung: "", rungs: [], summary: "packs the picture for the page, once for all viewers" }];
+    const runs = all.map((entry, index) => this.#row(entry, hue(index)));
+    const outs = plan.left_out.map((entry) => this.#row(entry, "var(--line)"));
+    this.list.replaceChildren(...runs, ...outs);
+  }
+
+  #row(entry, tint) {
+    const out = "reason" in entry;
+    const why = el("div", { class: "why" }, out ? `Left out: ${entry.reason}.` : `${entry.summary[0].toUpperCase()}${entry.summary.slice(1)}.`);
+    if (entry.rungs.length > 1) {
+      const pick = el("select", { "aria-label": `Rung of ${entry.stage}`, onchange: () => this.#connection.send("rung", { stage: entry.stage, rung: pick.value }) },
+        ...(entry.rungs.includes(entry.rung) ? [] : [el("option", { value: "", selected: true }, "default")]),
+        ...entry.rungs.map((rung) => el("option", { value: rung, selected: rung === entry.rung }, rung)));
+      why.append(pick);
+    }
+    const bar = el("b");
+    const time = el("span", { class: "ms" }, out ? "–" : "");
+    const row = el("li", { class: out ? "out" : "", tabindex: "0", title: why.firstChild.textContent },
+      el("span", { class: "name" }, el("i"), entry.stage), out ? el("span", { class: "ms" }, "left out") : el("span", { class: "bar" }, bar), time, why);
+    row.style.setProperty("--c", tint);
+    row.dataset.stage = entry.stage;
+    this.#rows.set(entry.stage, { row, bar, time, tint, why, out, summary: entry.summary });
+    return row;
+  }
+
+  frame(frame) {
+    if (!this.#plan || frame.plan !== this.#plan.plan) return;
+    const stages = [...frame.stages, ["encode", frame.encode_ms, false]];
+    for (const [name, ms, skipped] of stages) {
+      const mean = this.#means.get(name);
+      // A mean over the frames in which a stage ran; being skipped is told apart.
+      if (!skipped) this.#means.set(name, mean === undefined ? ms : mean + (ms - mean) * 0.12);
+      this.#skips.set(name, (this.#skips.get(name) ?? 0) * 0.9 + (skipped ? 0.1 : 0));
+    }
+    this.#frames.push({ stages, total: frame.light_ms });
+    if (this.#frames.length > HISTORY) this.#frames.shift();
+    const now = performance.now();
+    if (now - this.#painted < 120 || !this.canvas.offsetParent) return;
+    this.#painted = now;
+    this.#paint(frame);
+  }
+
+  #paint(frame) {
+    const longest = Math.max(...this.#means.values(), 0.1);
+    const skipped = new Set(frame.stages.filter((stage) => stage[2]).map((stage) => stage[0]));
+    for (const [name, { row, bar, time, why, out, summary }] of this.#rows) {
+      if (out) continue;
+      const ms = this.#means.get(name);
+      const rests = skipped.has(name) && this.#skips.get(name) > 0.6;
+      row.classList.toggle("skipped", rests);
+      bar.style.width = ms === undefined || rests ? "0" : `${Math.max(1, (100 * ms) / longest)}%`;
+      time.textContent = rests ? "skipped" : ms === undefined ? "" : ms.toFixed(ms < 10 ? 2 : 1);
+      const text = rests ? "Skipped: nothing that it reads has changed." : `${summary[0].toUpperCase()}${summary.slice(1)}.`;
+      if (why.firstChild.textContent !== text) {
+        why.firstChild.textContent = text;
+        row.title = text;
+      }
+    }
+    const totals = this.#frames.map((f) => f.total).sort((a, b) => a - b);
+    this.total.textContent = `${totals[totals.length >> 1].toFixed(1)} ms a frame`;
+    const { canvas } = this;
+    const scale = devicePixelRatio || 1;
+    const [width, height] = [Math.round(canvas.clientWidth * scale), Math.round(canvas.clientHeight * scale)];
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    const context = canvas.getContext("2d");
+    context.clearRect(0, 0, width, height);
+    const top = Math.max(totals[Math.floor(totals.length * 0.95)] * 1.25, this.budget ?? 0, 8);
+    const column = width / HISTORY;
+    this.#frames.forEach((f, i) => {
+      let y = height;
+      for (const [name, ms] of f.stages) {
+        const h = (ms / top) * height;
+        context.fillStyle = this.#rows.get(name)?.tint ?? "#888";
+        context.fillRect(width - (this.#frames.length - i) * column, y - h, Math.max(column - 0.5, 1), h);
+        y -= h;
+      }
+    });
+    context.font = `${11 * scale}px system-ui`;
+    for (const [ms, style] of [[1000 / 30, "#8888"], ...(this.budget ? [[this.budget, "#f0a63c"]] : [])]) {
+      const y = height - (ms / top) * height;
+      if (y < 4) continue;
+      context.fillStyle = style;
+      context.fillRect(0, y, width, scale);
+      context.fillText(`${ms.toFixed(0)} ms`, 4 * scale, y - 3 * scale);
+    }
+  }
+}
+
+const DIAL = { low: 4, high: 1000 };
+
+export class QualityPanel {
+  #connection;
+  #time;
+  #state = null;
+  #plan = null;
+  #presets = [];
+
+  constructor(connection, time) {
+    this.#connection = connection;
+    this.#time = time;
+    this.holder = document.getElementById("presets");
+    this.range = document.getElementById("budget");
+    this.flip = document.getElementById("budget-on");
+    this.range.addEventListener("input", () => {
+      this.flip.setAttribute("aria-checked", "true");
+      this.#tell();
+      this.#draw();
+    });
+    this.flip.addEventListener("click", () => {
+      this.flip.setAttribute("aria-checked", String(this.flip.getAttribute("aria-checked") !== "true"));
+      this.#tell();
+      this.#draw();
+    });
+  }
+
+  get #ms() {
+    return DIAL.low * Math.pow(DIAL.high / DIAL.low, this.range.value / 1000);
+  }
+
+  get #on() {
+    return this.flip.getAttribute("aria-checked") === "true";
+  }
+
+  #tell() {
+    this.#connection.send("budget", { ms: this.#on ? Math.round(this.#ms * 10) / 10 : null });
+  }
+
+  set presets(names) {
+    this.#presets = names;
+    this.holder.replaceChildren(...names.map((name) => el("button", { role: "radio", "data-preset": name, onclick: () => this.#connection.send("quality", { name }) }, name, el("small", {}, "–"))));
+  }
+
+  set scene(scene) {
+    for (const button of this.holder.children) button.setAttribute("aria-checked", String(button.dataset.preset === scene.quality));
+    this.quality = scene.quality;
+    this.#draw();
+  }
+
+  set plan(plan) {
+    this.#plan = plan;
+    this.#draw();
+  }
+
+  set state(state) {
+    this.#state = state;
+    if (document.activeElement !== this.range) {
+      this.flip.setAttribute("aria-checked", String(state.budget !== null));
+      if (state.budget !== null) this.range.value = (1000 * Math.log(state.budget / DIAL.low)) / Math.log(DIAL.high / DIAL.low);
+    }
+    for (const button of this.holder.children) {
+      const cost = state.costs[button.dataset.preset];
+      button.lastChild.textContent = cost === undefined ? "–" : `${cost.toFixed(cost < 10 ? 1 : 0)} ms`;
+    }
+    this.#draw();
+  }
+
+  #draw() {
+    const ms = this.#ms;
+    const on = this.#on;
+    this.#time.budget = on ? ms : null;
+    document.getElementById("budget-value").textContent = on ? `${ms.toFixed(ms < 10 ? 1 : 0)} ms · ${(1000 / ms).toFixed(0)} a second` : "free";
+    this.range.style.opacity = on ? 1 : 0.5;
+    const costs = Object.entries(this.#state?.costs ?? {});
+    const ticks = document.getElementById("budget-ticks");
+    ticks.replaceChildren(...costs.map(([name, cost]) => {
+      const share = Math.min(Math.max(Math.log(cost / DIAL.low) / Math.log(DIAL.high / DIAL.low), 0), 1);
+      const tick = el("span", { class: on && cost <= ms ? "fits" : "" }, name);
+      tick.style.left = `calc(8px + ${100 * share}% - ${16 * share}px)`;
+      return tick;
+    }));
+    const note = document.getElementById("budget-note");
+    const rungs = (this.#plan?.run ?? []).filter((entry) => entry.rungs.length > 1 && entry.rung !== "default").map((entry) => `${entry.stage} ${entry.rung}`);
+    const cost = this.#state?.costs[this.quality];
+    const parts = [`It buys ${this.quality ?? "…"}${cost === undefined ? "" : ` (${cost.toFixed(1)} ms measured here)`}: ${rungs.join(", ") || "no rungs to choose"}.`];
+    if (on && cost > ms) parts.push("Nothing cheaper is left.");
+    const { difference, compare } = this.#state ?? {};
+    if (difference !== null && difference !== undefined) parts.push(`Against ${compare}, the picture differs by ${difference.toFixed(2)} % of full scale on average.`);
+    else parts.push("Compare with another preset to measure what that costs in accuracy.");
+    note.textContent = parts.join(" ");
+  }
+}
