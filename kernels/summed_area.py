@@ -6,8 +6,18 @@ other, so the sum over a box is exact whenever that sum itself is below 2^32, th
 
     table[i, j] = sum of intensity[0..i, 0..j] mod 2^32
 
-Rows are summed first, then columns. A row belongs to one thread; columns are taken in blocks of neighbours, which on
-CPU share cache lines and on CUDA are one column wide, so that neighbouring threads read neighbouring addresses.
+Two forms. *By rows, then columns* (``sum_area``), for CPU: a row belongs to one thread; columns are taken in blocks of
+neighbours that share cache lines. On CUDA that would be a few thousand threads, each waiting for load after load.
+
+*By tiles* (``sum_area_tiled``), for CUDA: a tile is a strip of rows, and as many columns as a warp has lanes, times
+four. (1) Every tile's row sums and column sums; (2) along each row the sums of the tiles to the left, and along each
+strip the running sums of its columns; (3) every tile runs down its rows,
+
+    table[i, j] = table[i - 1, j] + left[i, tile] + sum of intensity[i, first column of the tile .. j],
+
+where the row above the tile is the sum over the strips above. The frame is read twice, the second time out of the
+cache, and the table written once; sums along a row go from lane to lane. A tile of one lane, as on CPU, is the same
+sum: it is how the form is tested there.
 
 References:
     [Cro84] Crow, "Summed-area tables for texture mapping", SIGGRAPH 1984.
@@ -104,6 +114,181 @@ def sum_along_columns_kernel(
             table_out[i, j] = table_out[i - 1, j] + table_out[i, j]
 
 
+vec4u = wp.types.vector(length=4, dtype=wp.uint32)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int reach = 1; reach < 32; reach *= 2) {
+        const unsigned int below = __shfl_up_sync(0xffffffffu, value, reach);
+        if ((threadIdx.x & 31) >= reach) value += below;
+    }
+#endif
+    return value;
+""")
+def scan_lanes(value: wp.uint32) -> wp.uint32:
+    """Sum of a value over the warp's lanes up to this one; on CPU a warp has one lane."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    value = __shfl_sync(0xffffffffu, value, 31);
+#endif
+    return value;
+""")
+def last_lane(value: wp.uint32) -> wp.uint32:
+    """The last lane's value."""
+
+
+@wp.func_native("""
+    return reinterpret_cast<const unsigned int*>(frame.data)[(size_t(row) * frame.shape[1] + column) / 4 * 3 + word];
+""")
+def load_word(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int32, word: wp.int32) -> wp.uint32:
+    """One of the three words of four pixels; columns and the frame's width are multiples of four."""
+
+
+@wp.func_native("""
+    unsigned int* at = table.data + size_t(row) * table.shape[1] + column;
+#if defined(__CUDA_ARCH__)
+    if (table.shape[1] % 4 == 0) {
+        *reinterpret_cast<uint4*>(at) = make_uint4(value[0], value[1], value[2], value[3]);
+        return;
+    }
+#endif
+    for (int k = 0; k < 4 && column + k < table.shape[1]; ++k) at[k] = value[k];
+""")
+def store_four(table: wp.array2d[wp.uint32], row: wp.int32, column: wp.int32, value: vec4u):
+    """Write four neighbours, in one piece where rows are aligned; those beyond the row's end are dropped."""
+
+
+@wp.func
+def packed_intensity(red: wp.uint32, green: wp.uint32, blue: wp.uint32) -> wp.uint32:
+    """``intensity`` of the lowest bytes of three words."""
+    byte = wp.uint32(255)
+    return (
+        wp.uint32(54) * (red & byte) + wp.uint32(183) * (green & byte) + wp.uint32(19) * (blue & byte) + wp.uint32(128)
+    ) >> wp.uint32(8)
+
+
+@wp.func
+def four_intensities(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int32) -> vec4u:
+    """Intensity of a pixel and the three to its right; 0 beyond the row's end."""
+    width = frame.shape[1]
+    value = vec4u()
+    if width % 4 == 0:
+        if column < width:
+            # R0 G0 B0 R1, G1 B1 R2 G2, B2 R3 G3 B3 from the lowest byte up.
+            a = load_word(frame, row, column, 0)
+            b = load_word(frame, row, column, 1)
+            c = load_word(frame, row, column, 2)
+            value[0] = packed_intensity(a, a >> wp.uint32(8), a >> wp.uint32(16))
+            value[1] = packed_intensity(a >> wp.uint32(24), b, b >> wp.uint32(8))
+            value[2] = packed_intensity(b >> wp.uint32(16), b >> wp.uint32(24), c)
+            value[3] = packed_intensity(c >> wp.uint32(8), c >> wp.uint32(16), c >> wp.uint32(24))
+    else:
+        for k in range(4):
+            if column + k < width:
+                value[k] = intensity(frame[row, column + k])
+    return value
+
+
+@wp.kernel(enable_backward=False)
+def sum_tiles_kernel(
+    # In:
+    lanes: wp.int32,
+    strip: wp.int32,
+    frame: wp.array2d[wp.vec3ub],
+    # Out:
+    row_sums_out: wp.array2d[wp.uint32],
+    column_sums_out: wp.array2d[wp.uint32],
+):
+    """Row sums and column sums of every tile; a warp per tile, four columns per lane."""
+    strip_index, t = wp.tid()
+    column = 4 * t
+    columns = vec4u()
+    for i in range(strip_index * strip, wp.min((strip_index + 1) * strip, frame.shape[0])):
+        value = four_intensities(frame, i, column)
+        columns += value
+        row = scan_lanes(value[0] + value[1] + value[2] + value[3])
+        if t % lanes == lanes - 1:
+            row_sums_out[i, t // lanes] = row
+    if column < frame.shape[1]:
+        store_four(column_sums_out, strip_index, column, columns)
+
+
+@wp.kernel(enable_backward=False)
+def scan_sums_kernel(
+    # In:
+    lanes: wp.int32,
+    # Out (and in: sums of every tile):
+    row_sums_out: wp.array2d[wp.uint32],
+    column_sums_out: wp.array2d[wp.uint32],
+):
+    """A warp per row: what lies left of each tile. A warp per strip: running sums along its columns."""
+    t = wp.tid()
+    line = t // lanes
+    lane = t % lanes
+    carry = wp.uint32(0)
+    if line < row_sums_out.shape[0]:
+        tiles = (column_sums_out.shape[1] + 4 * lanes - 1) // (4 * lanes)
+        for first in range(0, tiles, lanes):
+            own = wp.uint32(0)
+            if first + lane < tiles:
+                own = row_sums_out[line, first + lane]
+            running = scan_lanes(own)
+            if first + lane < tiles:
+                row_sums_out[line, first + lane] = carry + running - own
+            carry += last_lane(running)
+    else:
+        line -= row_sums_out.shape[0]
+        width = column_sums_out.shape[1]
+        for first in range(0, width, 4 * lanes):
+            column = first + 4 * lane
+            sums = vec4u()
+            for k in range(4):
+                if column + k < width:
+                    sums[k] = column_sums_out[line, column + k]
+            sums[1] = sums[1] + sums[0]
+            sums[2] = sums[2] + sums[1]
+            sums[3] = sums[3] + sums[2]
+            running = scan_lanes(sums[3])
+            before = carry + running - sums[3]
+            if column < width:
+                store_four(column_sums_out, line, column, sums + vec4u(before, before, before, before))
+            carry += last_lane(running)
+
+
+@wp.kernel(enable_backward=False)
+def write_tiles_kernel(
+    # In:
+    lanes: wp.int32,
+    strip: wp.int32,
+    frame: wp.array2d[wp.vec3ub],
+    row_sums: wp.array2d[wp.uint32],
+    column_sums: wp.array2d[wp.uint32],
+    # Out:
+    table_out: wp.array2d[wp.uint32],
+):
+    """The table, tile by tile."""
+    strip_index, t = wp.tid()
+    column = 4 * t
+    width = frame.shape[1]
+    total = vec4u()
+    for above in range(strip_index):
+        for k in range(4):
+            if column + k < width:
+                total[k] = total[k] + column_sums[above, column + k]
+    for i in range(strip_index * strip, wp.min((strip_index + 1) * strip, frame.shape[0])):
+        value = four_intensities(frame, i, column)
+        value[1] = value[1] + value[0]
+        value[2] = value[2] + value[1]
+        value[3] = value[3] + value[2]
+        before = row_sums[i, t // lanes] + scan_lanes(value[3]) - value[3]
+        total += value + vec4u(before, before, before, before)
+        if column < width:
+            store_four(table_out, i, column, total)
+
+
 def sum_along_rows(frame: wp.array, table_out: wp.array, *, rows: Rows | None = None) -> None:
     """Write the running sums of every row's intensity; first half of the table.
 
@@ -143,3 +328,40 @@ def sum_area(frame: wp.array, table_out: wp.array) -> None:
     """
     sum_along_rows(frame, table_out)
     sum_along_columns(table_out)
+
+
+def _lanes(device: wp.DeviceLike) -> int:
+    return 1 if wp.get_device(device).is_cpu else 32
+
+
+def tiled_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Shapes of the scratch arrays of ``sum_area_tiled`` for a frame of this size: row sums, column sums."""
+    return (height, -(-width // 4)), (-(-height // strip_rows(height)), width)
+
+
+def strip_rows(height: int) -> int:
+    """Rows of a strip: enough strips to fill a device, few enough that summing those above a tile stays cheap."""
+    return 32 if height <= 1536 else 64
+
+
+def sum_area_tiled(frame: wp.array, row_sums_out: wp.array, column_sums_out: wp.array, table_out: wp.array) -> None:
+    """Write the whole summed-area table of a frame's intensity, by tiles.
+
+    Args:
+        frame: (H, W) vec3ub, RGB, contiguous.
+        row_sums_out: Scratch, uint32, of ``tiled_shapes(H, W)[0]``.
+        column_sums_out: Scratch, uint32, of ``tiled_shapes(H, W)[1]``.
+        table_out: (H, W) uint32, contiguous; entry (i, j) is the sum over rows 0..i and columns 0..j modulo 2^32.
+
+    Raises:
+        ValueError: An array is not contiguous.
+    """
+    if not (frame.is_contiguous and table_out.is_contiguous):
+        raise ValueError("sum_area_tiled: frame and table_out must be contiguous; copy what is a view")
+    height = frame.shape[0]
+    device, lanes, strip = frame.device, _lanes(frame.device), strip_rows(height)
+    tiles = (column_sums_out.shape[0], -(-frame.shape[1] // (4 * lanes)) * lanes)
+    sums = [row_sums_out, column_sums_out]
+    wp.launch(sum_tiles_kernel, tiles, [lanes, strip, frame], sums, device=device)
+    wp.launch(scan_sums_kernel, (height + tiles[0]) * lanes, [lanes], sums, device=device)
+    wp.launch(write_tiles_kernel, tiles, [lanes, strip, frame, *sums], [table_out], device=device)

@@ -53,6 +53,16 @@ def test_intensity_of_grey_is_its_value(device):
     np.testing.assert_array_equal(make_table(grey).numpy()[0], np.arange(256).cumsum())
 
 
+# Widths: one tile, several, a whole number of them; rows aligned to words (multiples of 4) and not; several strips.
+@pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 3), (64, 128), (33, 132), (130, 4400), (1600, 257)])
+def test_tiled_form_matches_twin(device, size):
+    frame = random_frame(*size)
+    table = wp.zeros(size, wp.uint32)
+    sums = [wp.full(shape, 7, dtype=wp.uint32) for shape in summed_area.tiled_shapes(*size)]
+    summed_area.sum_area_tiled(wp.array(frame, dtype=wp.vec3ub), *sums, table)
+    np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 1), (63, 64), (130, 257)])
 def test_matches_twin(device, size):
     frame = random_frame(*size)

@@ -31,14 +31,22 @@ class SummedArea(Stage):
         return Wiring(("frame",), ("summed_area",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The table."""
+        """The table, and the sums on the way to it by tiles."""
         width, height = self.request.size
-        return {"summed_area": ArraySpec((height, width), wp.uint32)}
+        rows, columns = summed_area.tiled_shapes(height, width)
+        return {
+            "summed_area": ArraySpec((height, width), wp.uint32),
+            "summed_area_row_sums": ArraySpec(rows, wp.uint32),
+            "summed_area_column_sums": ArraySpec(columns, wp.uint32),
+        }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Rows in bands of rows, then columns in bands of columns."""
+        """On CPU rows in bands of rows, then columns in bands of columns; on CUDA by tiles."""
         width, height = self.request.size
         frame, table = arrays["frame"], arrays["summed_area"]
+        if not device.is_cpu:
+            sums = arrays["summed_area_row_sums"], arrays["summed_area_column_sums"]
+            return [Pass(lambda rows: summed_area.sum_area_tiled(frame, *sums, table))]
         return [
             Pass(lambda rows: summed_area.sum_along_rows(frame, table, rows=rows), rows=height),
             Pass(lambda columns: summed_area.sum_along_columns(table, columns=columns), rows=width),
