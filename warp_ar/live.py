@@ -98,7 +98,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="address to serve at; one that other machines reach, such as 0.0.0.0, asks them for a token (default: 127.0.0.1)",
+        help="address to serve at (default: 127.0.0.1); one that others reach, such as 0.0.0.0, asks for a token",
     )
     page.add_argument(
         "--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)"
@@ -108,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="?",
         const=True,
         metavar="FILE.pem",
-        help="serve over TLS, which browsers demand before they open a camera to another machine; without a file a certificate is made",
+        help="serve over TLS, without which browsers keep their camera from other machines; makes its own certificate",
     )
     page.add_argument("--no-browser", action="store_true", help="only print the page's address")
     return parser
@@ -183,11 +183,9 @@ def serve_page(options: argparse.Namespace) -> int:
     if options.calibration is not None:
         scene = dataclasses.replace(scene, camera=Camera.load_calibration(options.calibration, scene.camera.transfer))
     local = options.host in LOOPBACK
-    token = options.token if options.token is not None or local else secrets.token_urlsafe(16)
-    if token is not None and not token.isalnum() and options.token is not None:
-        raise UsageError("--token: expected letters and digits only, for it stands in an address")
-    if token == "":
-        raise UsageError("--token: expected a secret, not nothing")
+    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
+        raise UsageError("--token: expected letters and digits, for it stands in an address")
+    token = options.token if options.token is not None or local else secrets.token_hex(16)
     tls = (
         None
         if options.tls is None

@@ -1051,7 +1051,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
             return "{ " + ", ".join(f"{key} = {value(entry)}" for key, entry in item.items()) + " }"
         if isinstance(item, tuple):
             return "[" + ", ".join(map(value, item)) + "]"
-        return repr(item)
+        return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
 
     def table(item: Any, keys: Iterable[str]) -> list[str]:
         """Lines of the keys that have a value."""

@@ -471,7 +471,7 @@ class Host:
         return self._stopped or self._next is not None
 
     def _hold(self, frame: Frame, now: float) -> bool:
-        """While nobody watches, rest; while held, light the same frame again after every edit. False to leave the source."""
+        """Rest while nobody watches; while held, light the same frame again after edits. False to leave the source."""
         while True:
             with self._lock:
                 idle = self._watchers == 0 and self._recording is None and self._frames is None

@@ -1,9 +1,9 @@
 """The focal length of an unknown camera, from the marker that it looks at.
 
 A square seen at a slant tells it: its vanishing points fix the focal length of a camera with square pixels, a central
-principal point and no distortion. Corners are too noisy for that closed form when the view is nearly straight on, so the
-focal length is the one under which the marker's corners, posed anew for each candidate, are reprojected best over many
-views at once.
+principal point and no distortion. Corners are too noisy for that closed form when the view is nearly straight on, so
+the focal length is the one under which the marker's corners, posed anew for each candidate, are reprojected best over
+many views at once.
 
 A first guess good enough to start with; ``python -m warp_ar.calibrate camera`` measures the lens as well.
 """

@@ -1,11 +1,11 @@
 """What the page and the server may say to each other.
 
 From the page come text messages, JSON objects with a ``type``, and binary messages, pictures of the browser's camera.
-Nothing that comes in is trusted: a message that is not exactly one of those below raises ``ProtocolError``, whose text is
-the reason with which its sender is dropped.
+Nothing that comes in is trusted: a message that is not exactly one of those below raises ``ProtocolError``, whose text
+is the reason with which its sender is dropped.
 
-From the server come text messages, and binary ones: four bytes, the length of a JSON header (little endian), the header,
-then the pictures that it names, one after another.
+From the server come text messages, and binary ones: four bytes, the length of a JSON header (little endian), the
+header, then the pictures that it names, one after another.
 """
 
 from __future__ import annotations

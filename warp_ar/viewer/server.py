@@ -1,8 +1,8 @@
 """Serves the page, over HTTP and one WebSocket per viewer.
 
-A viewer is sent a frame only after it has shown an earlier one: two are under way at most, and the newest wins. Pictures
-are encoded once for all viewers, and only if one is ready for them. Nothing that a viewer sends is trusted; one that
-breaks the rules is dropped with a reason, and no other notices.
+A viewer is sent a frame only after it has shown an earlier one: two are under way at most, and the newest wins.
+Pictures are encoded once for all viewers, and only if one is ready for them. Nothing that a viewer sends is trusted;
+one that breaks the rules is dropped with a reason, and no other notices.
 """
 
 from __future__ import annotations

@@ -1,0 +1,881 @@
+"""The page's server: what may be said to it, what it refuses, and that nobody can spoil it for others."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import functools
+import json
+import math
+import random
+import struct
+import threading
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import cv2
+import numpy as np
+import pytest
+
+from tests.test_pipeline import make_scene
+from warp_ar import live
+from warp_ar.errors import SceneError, UsageError, WarpArError
+from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS
+from warp_ar.scene import (
+    Animation,
+    Exposure,
+    Light,
+    Marker,
+    MirrorMaterial,
+    PhongMaterial,
+    Scene,
+    SourceSpec,
+    bundled_scenes,
+    load_scene,
+    loads_scene,
+)
+from warp_ar.sinks import read_environment
+from warp_ar.sources import Synthetic
+from warp_ar.viewer import edits, protocol
+from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.host import Host, Lit, choose_preset
+from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
+from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
+from warp_ar.viewer.server import Address, Server, encode_jpeg
+
+SIZE = (320, 240)
+PATIENCE = 60.0  # seconds that anything may take on a busy machine
+# JPEG at quality 85 against the picture, mean absolute difference of a synthetic desk in levels; measured 1.4.
+JPEG_ERROR = 4.0
+# A corner's noise of 0.2 pixels over a dozen views tells the focal length to about 1 %.
+FOCAL_ERROR = 0.03
+
+
+def page_scene(**changes: Any) -> Scene:
+    return make_scene(source=SourceSpec(synthetic="card"), **changes)
+
+
+# ------------------------------------------------------------------------------------------------------------- protocol
+
+GOOD = [
+    {"type": "ack", "id": 3},
+    {"type": "ping", "sent": 12.5},
+    {"type": "set", "thing": "light", "index": 0, "key": "at", "value": [0.1, 0.2, 0.3]},
+    {"type": "set", "thing": "exposure", "index": 0, "key": "scale", "value": "auto"},
+    {"type": "add", "thing": "object", "kind": "sphere"},
+    {"type": "remove", "thing": "light", "index": 0},
+    {"type": "show", "thing": "object", "index": 1, "on": False},
+    {"type": "effect", "name": "relief", "on": False},
+    {"type": "quality", "name": "low"},
+    {"type": "rung", "stage": "specular", "rung": "box_mip"},
+    {"type": "budget", "ms": 20.0},
+    {"type": "budget", "ms": None},
+    {"type": "compare", "other": "camera"},
+    {"type": "play", "on": True},
+    {"type": "scene", "name": "torus"},
+    {"type": "reset"},
+    {"type": "camera", "width": 640, "height": 480},
+    {"type": "no_camera"},
+    {"type": "record", "on": True},
+]
+
+
+@pytest.mark.parametrize("message", GOOD, ids=lambda m: m["type"])
+def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
+    command = parse_text(json.dumps(message))
+    values = [tuple(v) if isinstance(v, list) else v for k, v in message.items() if k != "type"]
+    assert list(vars(command).values()) == values
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "no JSON"),
+        ("{", "no JSON"),
+        ("[" * 4000, "no JSON"),
+        ("[]", "no known type"),
+        ('{"type": ["ack"]}', "no known type"),
+        ('{"type": "exec", "code": 1}', "no known type"),
+        ('{"type": "ack"}', "ack takes id"),
+        ('{"type": "ack", "id": 1, "more": 1}', "ack takes id"),
+        ('{"type": "ack", "id": true}', "ack: id"),
+        ('{"type": "ack", "id": -1}', "ack: id"),
+        ('{"type": "ack", "id": 1e3}', "ack: id"),
+        ('{"type": "ping", "sent": NaN}', "NaN is no number"),
+        ('{"type": "ping", "sent": 1e999}', "ping: sent"),
+        ('{"type": "budget", "ms": 0}', "budget: ms"),
+        ('{"type": "set", "thing": "camera", "index": 0, "key": "fx", "value": 1}', "set: thing"),
+        ('{"type": "set", "thing": "light", "index": 64, "key": "at", "value": [0, 0, 0]}', "set: index"),
+        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
+        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": [1, 2, "x"]}', "set: value"),
+        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
+        ('{"type": "add", "thing": "object", "kind": "mesh"}', "add: kind"),
+        ('{"type": "add", "thing": "object", "kind": "spot"}', "add: kind"),
+        ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),
+        ('{"type": "quality", "name": "' + "x" * 65 + '"}', "quality: name"),
+        ('{"type": "quality", "name": "' + "x" * 5000 + '"}', "4096 at most"),
+    ],
+)
+def test_what_no_page_says_is_refused_with_a_reason(text: str, reason: str) -> None:
+    with pytest.raises(ProtocolError, match=reason):
+        parse_text(text)
+
+
+def jpeg(width: int = 64, height: int = 48) -> bytes:
+    return encode_jpeg(np.full((height, width, 3), 128, np.uint8))
+
+
+def picture_message(data: bytes, stamp: float = 1.0, number: int = 1) -> bytes:
+    return struct.pack("<dI", stamp, number) + data
+
+
+def test_pictures_are_measured_before_they_are_decoded() -> None:
+    assert protocol.jpeg_size(jpeg()) == (64, 48)
+    progressive = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8), (cv2.IMWRITE_JPEG_PROGRESSIVE, 1))[1].tobytes()
+    assert protocol.jpeg_size(progressive) == (64, 48)
+    picture = parse_picture(picture_message(jpeg(), 7.5, 3), (64, 48))
+    assert (picture.taken, picture.id, picture.jpeg) == (7.5, 3, jpeg())
+    bomb = bytearray(jpeg())
+    start = bomb.index(b"\xff\xc0")
+    bomb[start + 5 : start + 9] = b"\xff\xff\xff\xff"  # 65535 x 65535: 12 GB
+    for data, reason in [
+        (picture_message(bytes(bomb)), "65535x65535"),
+        (picture_message(jpeg(32, 48)), "32x48"),
+        (picture_message(b"\x89PNG"), "no JPEG"),
+        (picture_message(jpeg()[:20]), "no JPEG"),
+        (picture_message(jpeg(), math.nan), "no sensible time"),
+        (picture_message(jpeg(), -1.0), "no sensible time"),
+        (b"12", "holds no picture"),
+        (b"\0" * (protocol.MAX_PICTURE + 1), "at most"),
+    ]:
+        with pytest.raises(ProtocolError, match=reason):
+            parse_picture(data, (64, 48))
+
+
+def test_rate_is_bounded_and_comes_back() -> None:
+    bucket = Bucket(rate=10.0, burst=20.0)
+    assert sum(bucket.take(1.0, 100.0) for _ in range(100)) == 20
+    assert sum(bucket.take(1.0, 100.5) for _ in range(100)) == 5
+    assert not bucket.take(21.0, 1e9)
+
+
+def mutated(rng: random.Random) -> str | bytes:
+    """A message as a broken or hostile page might send it."""
+    if rng.random() < 0.2:
+        return rng.randbytes(rng.randrange(200))
+    message = dict(rng.choice(GOOD))
+    junk = [None, True, -1, 1e308, "", "../../etc/passwd", "x" * 70, [], [1] * 50, {}, {"a": {"b": 1}}, 2**70]
+    for _ in range(rng.randrange(3)):
+        message[rng.choice([*message, "extra"])] = rng.choice(junk)
+    text = json.dumps(message)
+    if rng.random() < 0.3:
+        place = rng.randrange(len(text))
+        text = text[:place] + chr(rng.randrange(0x20, 0x2FF)) + text[place + rng.randrange(3) :]
+    return text
+
+
+def test_ten_thousand_random_messages_are_understood_or_refused() -> None:
+    rng = random.Random(0)
+    understood = 0
+    for _ in range(10_000):
+        message = mutated(rng)
+        with contextlib.suppress(ProtocolError):
+            if isinstance(message, str):
+                understood += parse_text(message) is not None
+            else:
+                parse_picture(message, (64, 48))
+    assert 1000 < understood < 9000  # else the fuzz tries only one of the two
+
+
+# ---------------------------------------------------------------------------------------------------------------- edits
+
+
+def test_edits_are_checked_as_the_file_is() -> None:
+    scene = page_scene()
+    moved = edits.set_value(scene, "light", 0, "at", (0.1, 0.2, 0.3))
+    assert moved.lights[0].at == (0.1, 0.2, 0.3)
+    assert dataclasses.replace(moved, lights=scene.lights) == scene
+    assert edits.set_value(scene, "object", 1, "roughness", 0.7).objects[1].material.roughness == 0.7
+    assert edits.set_value(scene, "object", 0, "model", "mirror").objects[0].material == MirrorMaterial((0.5, 0.4, 0.3))
+    assert isinstance(edits.set_value(scene, "object", 0, "model", "phong").objects[0].material, PhongMaterial)
+    assert edits.set_value(scene, "exposure", 0, "scale", "auto").exposure == Exposure("auto")
+    for thing, index, key, value in [
+        ("light", 0, "intensity", -1.0),
+        ("light", 0, "at", "here"),
+        ("light", 0, "color", 3.0),
+        ("object", 1, "minor_radius", 1.0),
+        ("object", 0, "scale", 0.0),
+        ("object", 1, "metallic", 2.0),
+        ("exposure", 0, "scale", -0.5),
+        ("exposure", 0, "scale", "dark"),
+        ("marker", 0, "dictionary", "DICT_9X9"),
+    ]:
+        with pytest.raises(SceneError):
+            edits.set_value(scene, thing, index, key, value)
+
+
+@pytest.mark.parametrize(
+    ("thing", "key", "value"),
+    [
+        ("object", "file", "secret.ply"),
+        ("object", "material", "x"),
+        ("object", "__class__", "x"),
+        ("object", "base_color", "/etc/passwd"),
+        ("object", "base_color", 0.5),
+        ("object", "shininess", 5.0),
+        ("object", "model", "shiny"),
+        ("light", "animate", 1.0),
+        ("proxy", "file", "secret.ply"),
+    ],
+)
+def test_no_edit_names_a_file_or_what_is_no_key(thing: str, key: str, value: Any) -> None:
+    with pytest.raises(UsageError):
+        edits.set_value(page_scene(), thing, 0, key, value)
+    with pytest.raises(UsageError):
+        edits.set_value(page_scene(), "light", 5, "at", (0.0, 0.0, 0.0))
+
+
+def test_what_is_hidden_stays_hidden_when_something_before_it_goes() -> None:
+    scene = page_scene(lights=(Light("point", 1.0), Light("point", 2.0), Light("point", 3.0)))
+    wanted = Wanted(scene, PRESETS["low"], hidden=frozenset({("light", 0), ("light", 2), ("object", 1)}))
+    after = wanted.without_thing("light", 0)
+    assert after.hidden == {("light", 1), ("object", 1)}
+    assert [light.intensity for light in after.shown_scene().lights] == [2.0]
+    assert [thing.shape for thing in after.shown_scene().objects] == ["sphere"]
+
+
+def test_effects_are_left_out_of_what_is_shown() -> None:
+    wanted = Wanted(page_scene(), PRESETS["low"])
+    for name, empty in [("objects", "objects"), ("lights", "lights"), ("room", "probes"), ("desk", "proxies")]:
+        shown = wanted.with_effect(name, False).shown_scene()
+        assert getattr(shown, empty) == ()
+        assert getattr(wanted.with_effect(name, False).with_effect(name, True).shown_scene(), empty) != ()
+    assert wanted.with_effect("exposure", False).shown_scene().exposure == Exposure()
+    assert wanted.with_effect("relief", False).shown_quality().rung("relight") == "flat"
+    assert wanted.with_effect("room_shadow", False).shown_quality().rung("room_shadow") == "none"
+    assert wanted.with_rung("specular", "box_mip").shown_quality().rung("specular") == "box_mip"
+    assert wanted.with_rung("specular", "box_mip").with_rung("specular", "").shown_quality() == PRESETS["low"]
+    for stage, rung in [("specular", "best"), ("nonsense", "box_mip")]:
+        with pytest.raises(UsageError):
+            wanted.with_rung(stage, rung)
+
+
+@pytest.mark.parametrize("name", sorted(bundled_scenes()))
+def test_every_bundled_scene_is_told_to_the_page_without_a_path(name: str) -> None:
+    record = json.dumps(edits.wanted_record(Wanted(load_scene(name), PRESETS["low"])))
+    assert "/" not in record
+
+
+@pytest.mark.parametrize("kind", [kind for kinds in protocol.KINDS.values() for kind in kinds])
+def test_what_can_be_added_can_be_read_back(kind: str) -> None:
+    thing = "object" if kind in protocol.KINDS["object"] else "light"
+    scene = edits.add_thing(page_scene(), thing, kind)
+    assert edits.checked(scene) == scene
+    for _ in range(edits.MOST_THINGS):
+        with contextlib.suppress(UsageError):
+            scene = edits.add_thing(scene, thing, kind)
+    assert len(scene.objects if thing == "object" else scene.lights) == edits.MOST_THINGS
+
+
+def test_preset_for_a_budget() -> None:
+    assert choose_preset("medium", 10.0, {"medium": 20.0}) == "low"
+    assert choose_preset("low", 1.0, {"low": 20.0}) == "low"  # nothing cheaper is left
+    assert choose_preset("low", 50.0, {"low": 20.0}) == "medium"  # unknown, and there is room
+    assert choose_preset("low", 30.0, {"low": 20.0}) == "low"
+    assert choose_preset("low", 50.0, {"low": 20.0, "medium": 60.0}) == "low"
+    assert choose_preset("low", 100.0, {"low": 60.0, "medium": 80.0}) == "medium"
+    assert choose_preset("reference", 1e4, {"reference": 1.0}) == "reference"
+
+
+# ----------------------------------------------------------------------------------------------------------- intrinsics
+
+
+@pytest.mark.parametrize("field", [45.0, 60.0, 75.0])
+def test_focal_length_from_the_marker(field: float) -> None:
+    rng = np.random.default_rng(1)
+    focal = 320.0 / math.tan(math.radians(field / 2))
+    camera = guessed_camera(640, 480, focal=focal)
+    estimator = FocalEstimator(Marker(size=0.08), 640, 480)
+    assert estimator.estimate() is None
+    half = 0.04
+    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+    for index in range(40):
+        slant, around = math.radians(rng.uniform(25, 60)), 2 * math.pi * index / 13
+        eye = 0.3 * np.array([math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)])
+        forward = -eye / np.linalg.norm(eye)
+        right = np.cross(forward, [0.0, 0.0, 1.0]) / np.linalg.norm(np.cross(forward, [0.0, 0.0, 1.0]))
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        points = square @ rotation.T - rotation @ eye
+        pixels = points[:, :2] / points[:, 2:] * focal + (camera.cx, camera.cy)
+        estimator.add(pixels + rng.normal(0, 0.2, pixels.shape))
+    found = estimator.estimate()
+    assert found is not None
+    assert abs(found.focal / focal - 1) < FOCAL_ERROR
+    assert 0.0 < found.spread < 0.08
+
+
+def test_a_camera_straight_above_does_not_tell_its_focal_length() -> None:
+    rng = np.random.default_rng(2)
+    estimator = FocalEstimator(Marker(size=0.08), 640, 480)
+    for _ in range(40):
+        size = rng.uniform(60, 160)
+        corner = rng.uniform(100, 300, 2)
+        square = corner + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+        estimator.add(square + rng.normal(0, 0.2, (4, 2)))
+    found = estimator.estimate()
+    assert found is None or found.spread > 0.03
+
+
+# ----------------------------------------------------------------------------------------------------------------- host
+
+
+class Running:
+    """A host that runs on a thread, and what it has published."""
+
+    def __init__(self, scene: Scene, **options: Any) -> None:
+        self.frames: list[Lit] = []
+        self.messages: list[dict[str, Any]] = []
+        self.host = Host(
+            scene, device="cpu", quality="low", publish=self.frames.append, notify=self.messages.append, **options
+        )
+        self.thread = threading.Thread(target=self.host.run)
+
+    def __enter__(self) -> Running:
+        self.host.watch(1)
+        self.thread.start()
+        self.until(lambda: self.frames)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.host.stop()
+        self.thread.join(PATIENCE)
+        assert not self.thread.is_alive()
+        self.host.close()
+
+    def until(self, condition: Any) -> Any:
+        deadline = time.monotonic() + PATIENCE
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f"waited in vain; last messages: {self.messages[-5:]}"
+            time.sleep(0.01)
+        return value
+
+    def next(self, count: int = 3) -> Lit:
+        """A frame that was begun after now."""
+        start = len(self.frames)
+        self.until(lambda: len(self.frames) >= start + count)
+        return self.frames[-1]
+
+    def edit(self, **message: Any) -> None:
+        self.host.edit(parse_text(json.dumps(message)), "me")
+
+
+def test_numbers_are_edited_in_place_and_structure_is_swapped_in() -> None:
+    with Running(page_scene()) as running:
+        first = running.next()
+        assert first.plan == 1
+        running.edit(type="set", thing="object", index=0, key="at", value=[0.0, -0.08, 0.03])
+        moved = running.next()
+        assert moved.plan == 1, "moving an object built a new pipeline"
+        running.edit(type="effect", name="objects", on=False)
+        without = running.until(lambda: running.frames[-1].plan == 2 and running.frames[-1])
+        stages = {name for name, _, _ in without.stages}
+        assert {"relight", "track"} <= stages
+        assert "shade" not in stages
+        ids = [frame.id for frame in running.frames]
+        assert ids == list(range(1, len(ids) + 1))
+
+
+def test_an_edited_scene_gives_the_picture_of_its_file() -> None:
+    """Saved and opened anew, the scene gives the same picture, bit for bit, of the same frames."""
+    with Running(page_scene()) as running:
+        running.edit(type="set", thing="object", index=0, key="at", value=[0.0, -0.08, 0.03])
+        running.edit(type="set", thing="object", index=0, key="base_color", value=[0.9, 0.1, 0.1])
+        running.edit(type="add", thing="light", kind="spot")
+        running.edit(type="show", thing="object", index=1, on=False)
+        text = running.host.scene_toml(full_paths=True)
+        saved = loads_scene(text)
+        target = running.host._target()
+    with Synthetic("card", size=SIZE) as card:
+        frame = next(iter(card)).image
+    assert len(saved.objects) == 1
+    assert len(saved.lights) == 2
+    pictures = []
+    for scene in (saved, target.scene):
+        with Pipeline(scene, device="cpu", quality="low", size=SIZE) as pipeline:
+            pictures.append(pipeline(frame).image)
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_a_bad_edit_changes_nothing_and_says_why() -> None:
+    with Running(page_scene()) as running:
+        before = running.host.wanted()
+        with pytest.raises(SceneError, match="intensity"):
+            running.edit(type="set", thing="light", index=0, key="intensity", value=-1)
+        with pytest.raises(UsageError, match="preset"):
+            running.edit(type="quality", name="best")
+        with pytest.raises(UsageError, match="bundled"):
+            running.edit(type="scene", name="../secret")
+        with pytest.raises(UsageError, match="preset"):
+            running.edit(type="compare", other="nothing")
+        assert running.host.wanted() == before
+        running.next()
+
+
+def test_a_held_frame_follows_edits() -> None:
+    with Running(page_scene(lights=())) as running:
+        running.next()
+        running.edit(type="play", on=False)
+        held = running.next(2)
+        running.edit(type="set", thing="object", index=0, key="base_color", value=[0.0, 1.0, 0.0])
+        edited = running.next(2)
+        np.testing.assert_array_equal(held.frame, edited.frame)
+        assert (held.image != edited.image).any()
+
+
+def test_without_viewers_nothing_is_lit() -> None:
+    with Running(page_scene()) as running:
+        running.next()
+        running.host.watch(-1)
+        time.sleep(0.3)
+        count = len(running.frames)
+        time.sleep(0.5)
+        assert len(running.frames) == count
+        running.host.watch(1)
+        running.next()
+
+
+def test_comparisons() -> None:
+    with Running(page_scene()) as running:
+        assert running.next().other is None
+        running.edit(type="compare", other="camera")
+        lit = running.next()
+        np.testing.assert_array_equal(lit.other, lit.frame)
+        running.edit(type="compare", other="paper")
+        running.until(lambda: running.frames[-1].other is not None and running.frames[-1].other is not lit.frame)
+        assert running.next().other.shape == lit.image.shape
+        running.until(lambda: running.host.state_message()["difference"] is not None)
+        running.edit(type="compare", other="")
+        assert running.next().other is None
+
+
+def test_recording_is_a_video() -> None:
+    with Running(page_scene()) as running:
+        with pytest.raises(UsageError, match="nothing was recorded"):
+            running.host.recording()
+        running.edit(type="record", on=True)
+        running.next(5)
+        running.edit(type="record", on=False)
+        path = Path(running.host._folder.name) / "copy.mp4"
+        path.write_bytes(running.host.recording())
+        video = cv2.VideoCapture(str(path))
+        ok, picture = video.read()
+        video.release()
+        assert ok
+        assert picture.shape == running.frames[-1].image.shape
+
+
+def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> None:
+    with Synthetic("card", size=SIZE) as card, Running(page_scene()) as running:
+        frames = [frame.image for frame, _ in zip(card, range(30), strict=False)]
+        host = running.host
+        running.edit(type="camera", width=SIZE[0], height=SIZE[1])
+        assert host.camera_size("me") == SIZE
+        assert host.camera_size("you") is None
+        with pytest.raises(UsageError, match="another viewer"):
+            host.edit(protocol.UseCamera(*SIZE), "you")
+        count = 0
+        while not any(lit.stamp is not None for lit in running.frames):
+            host.push(encode_jpeg(frames[count % 30]), 1000.0 + count, "me")
+            count += 1
+            time.sleep(0.05)
+            assert count < PATIENCE / 0.05
+        lit = next(lit for lit in running.frames if lit.stamp is not None)
+        sent = frames[int(lit.stamp - 1000.0) % 30]
+        assert np.abs(lit.frame.astype(int) - sent).mean() < JPEG_ERROR, "the stamp belongs to another frame"
+        host.push(jpeg(), 5.0, "me")  # of another size: left aside
+        with pytest.raises(ProtocolError, match="decoded"):
+            host.push(b"\xff\xd8 nothing", 5.0, "me")
+        start = len(running.frames)
+        host.leave_camera("you")
+        assert host.camera_size("me") == SIZE
+        host.leave_camera("me")
+        running.until(lambda: len(running.frames) > start + 2 and running.frames[-1].stamp is None)
+
+
+def test_downloads_of_the_light_and_the_picture(tmp_path: Path) -> None:
+    with Running(page_scene()) as running:
+        running.until(lambda: running.host.light() is not None)
+        path = tmp_path / "light.exr"
+        path.write_bytes(running.host.environment_exr())
+        assert read_environment(path).shape == (32, 64, 3)
+        picture = cv2.imdecode(np.frombuffer(running.host.snapshot(), np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == running.frames[-1].image.shape
+
+
+def test_the_scene_moves_on_when_the_source_starts_again() -> None:
+    """The pipeline's clock never runs back, whatever sources do: an animated object goes on turning."""
+    scene = page_scene()
+    spinning = dataclasses.replace(scene.objects[1], animate=Animation(turn=(0.0, 0.0, 90.0)))
+    with Running(dataclasses.replace(scene, objects=(scene.objects[0], spinning))) as running:
+        running.next()
+        running.edit(type="camera", width=SIZE[0], height=SIZE[1])
+        running.edit(type="no_camera")
+        running.next(5)
+        assert not [m for m in running.messages if m["type"] == "notice"]
+
+
+# --------------------------------------------------------------------------------------------------------------- server
+
+
+class Page:
+    """A client as the page is one."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self.socket = socket
+        self.frames = 0
+
+    async def say(self, **message: Any) -> None:
+        await self.socket.send_str(json.dumps(message))
+
+    async def hear(self, *, ack: bool = True) -> tuple[dict[str, Any], list[bytes]]:
+        message = await asyncio.wait_for(self.socket.receive(), PATIENCE)
+        if message.type is aiohttp.WSMsgType.TEXT:
+            return json.loads(message.data), []
+        if message.type is not aiohttp.WSMsgType.BINARY:
+            raise ConnectionError(f"{message.type} {self.socket.close_code} {message.extra}")
+        (length,) = struct.unpack_from("<I", message.data)
+        header, place, pictures = json.loads(message.data[4 : 4 + length]), 4 + length, []
+        for size in header["sizes"]:
+            pictures.append(message.data[place : place + size])
+            place += size
+        assert place == len(message.data)
+        if header["type"] == "frame":
+            self.frames += 1
+            if ack:
+                await self.say(type="ack", id=header["id"])
+        return header, pictures
+
+    async def until(self, kind: str) -> tuple[dict[str, Any], list[bytes]]:
+        while True:
+            header, pictures = await self.hear()
+            if header["type"] == kind:
+                return header, pictures
+
+    async def closed(self) -> tuple[int | None, str]:
+        """Code and reason with which the server closed."""
+        while True:
+            message = await asyncio.wait_for(self.socket.receive(), PATIENCE)
+            if message.type is aiohttp.WSMsgType.CLOSE:
+                return message.data, message.extra
+            if message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR):
+                return self.socket.close_code, ""
+
+
+@dataclasses.dataclass
+class Site:
+    server: Server
+    url: str
+    session: aiohttp.ClientSession
+
+    @contextlib.asynccontextmanager
+    async def page(self, **options: Any) -> AsyncIterator[Page]:
+        async with self.session.ws_connect(f"{self.url}/live", max_msg_size=1 << 24, **options) as socket:
+            yield Page(socket)
+
+
+@contextlib.asynccontextmanager
+async def served(scene: Scene | None = None, **address: Any) -> AsyncIterator[Site]:
+    ready: asyncio.Event = asyncio.Event()
+    make = functools.partial(Host, scene or page_scene(), device="cpu", quality="low")
+    server = Server(make, Address(port=0, **address))
+    task = asyncio.create_task(server.serve(lambda _: ready.set()))
+    waiting = asyncio.create_task(ready.wait())
+    await asyncio.wait({task, waiting}, return_when=asyncio.FIRST_COMPLETED)
+    assert ready.is_set(), task.exception()
+    try:
+        async with aiohttp.ClientSession() as session:
+            yield Site(server, f"http://127.0.0.1:{server.address.port}", session)
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def run(test: Any) -> Any:
+    """Run an asynchronous test."""
+
+    @functools.wraps(test)
+    def wrapper(*arguments: Any, **keywords: Any) -> None:
+        asyncio.run(asyncio.wait_for(test(*arguments, **keywords), 4 * PATIENCE))
+
+    return wrapper
+
+
+@run
+async def test_a_page_is_told_all_and_sees_frames() -> None:
+    async with served() as site, site.page() as page:
+        kinds = set()
+        while not {"hello", "plan", "scene", "state", "light", "frame"} <= kinds:
+            header, pictures = await page.hear()
+            kinds.add(header["type"])
+            if header["type"] == "frame":
+                image = cv2.imdecode(np.frombuffer(pictures[0], np.uint8), cv2.IMREAD_COLOR_RGB)
+                assert image.shape == (header["camera"][1], header["camera"][0], 3)
+                assert len(header["pose"]) == 12
+            if header["type"] == "plan":
+                assert {"stage", "reason", "rungs"} == set(header["left_out"][0])
+        await page.say(type="ping", sent=5.0)
+        header, _ = await page.until("pong")
+        assert header["sent"] == 5.0
+        assert header["clock"] > 0
+
+
+@run
+async def test_files_of_the_page_and_nothing_else() -> None:
+    async with served() as site:
+        async with site.session.get(f"{site.url}/") as response:
+            assert response.status == 200
+            assert "warp_ar" in await response.text()
+            assert "script-src 'self'" in response.headers["Content-Security-Policy"]
+            assert response.headers["X-Content-Type-Options"] == "nosniff"
+        async with site.session.get(f"{site.url}/static/app.js") as response:
+            assert response.headers["Content-Type"].startswith("text/javascript")
+        for path in (
+            "/static/../server.py",
+            "/static/%2e%2e/server.py",
+            "/static/..%2fserver.py",
+            "/static//etc/passwd",
+            "/static/",
+            "/download/../../etc/passwd",
+            "/download/%2fetc%2fpasswd",
+            "/download/scene.toml%00",
+            "/nothing",
+        ):
+            async with site.session.get(aiohttp.client.URL(site.url + path, encoded=True)) as response:
+                assert response.status in (400, 404), path
+        async with site.session.post(f"{site.url}/") as response:
+            assert response.status == 405
+
+
+@run
+async def test_downloads() -> None:
+    async with served() as site, site.page() as page:
+        await page.until("frame")
+        while not (await page.until("light"))[0]["known"]:
+            pass
+        for name, start in [("frame.png", b"\x89PNG"), ("environment.exr", b"v/1\x01"), ("scene.toml", b"schema = 1")]:
+            async with site.session.get(f"{site.url}/download/{name}") as response:
+                assert response.status == 200
+                assert name in response.headers["Content-Disposition"]
+                assert (await response.read()).startswith(start)
+        async with site.session.get(f"{site.url}/download/recording.mp4") as response:
+            assert response.status == 409
+
+
+@run
+async def test_other_sites_are_refused() -> None:
+    async with served() as site:
+        for headers in (
+            {"Origin": "https://evil.example"},
+            {"Origin": "null"},
+            {"Origin": "http://127.0.0.1:1"},
+            {"Host": "evil.example"},  # whose name resolves to this machine
+            {"Sec-Fetch-Site": "cross-site"},
+        ):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+                async with site.page(headers=headers):
+                    pass
+            assert error.value.status == 403, headers
+            async with site.session.get(f"{site.url}/download/frame.png", headers=headers) as response:
+                assert response.status == 403
+        async with site.page(headers={"Origin": site.url}) as page:
+            await page.until("hello")
+
+
+@run
+async def test_token() -> None:
+    async with served(token="5ec2e7") as site:
+        for path in ("/", "/live", "/download/frame.png", "/?token=", "/?token=5ec2e", "/live?token=%ff"):
+            async with site.session.get(aiohttp.client.URL(site.url + path, encoded=True)) as response:
+                assert response.status == 403, path
+                assert "token" in await response.text()
+        async with site.session.get(f"{site.url}/?token=5ec2e7") as response:
+            assert response.status == 200
+            assert response.headers["Referrer-Policy"] == "no-referrer"
+        async with site.session.ws_connect(f"{site.url}/live?token=5ec2e7", max_msg_size=1 << 24) as socket:
+            await Page(socket).until("frame")
+
+
+BAD_MESSAGES: list[tuple[Any, int, str]] = [
+    ("{", 1008, "no JSON"),
+    ('{"type": "exec"}', 1008, "no known type"),
+    ("x" * 5000, 1008, "at most"),
+    (b"\0" * ((1 << 20) + 200), 1009, ""),
+    (json.dumps({"type": "ack", "id": "1"}), 1008, "ack: id"),
+]
+
+
+@run
+async def test_a_bad_message_closes_its_sender_with_a_reason_and_touches_no_other() -> None:
+    async with served() as site, site.page() as good:
+        await good.until("frame")
+        for message, code, reason in BAD_MESSAGES:
+            async with site.page() as bad:
+                if isinstance(message, bytes):
+                    await bad.socket.send_bytes(message)
+                else:
+                    await bad.socket.send_str(message)
+                got, text = await bad.closed()
+                assert got == code
+                assert reason in text
+        await good.until("frame")
+        async with site.page() as bad:  # a picture that was never announced is left aside, a wrong one is not
+            await bad.socket.send_bytes(picture_message(jpeg()))
+            await bad.say(type="camera", width=64, height=48)
+            await bad.until("scene")
+            await asyncio.sleep(0.3)
+            await bad.socket.send_bytes(picture_message(jpeg(32, 32)))
+            assert (await bad.closed())[0] == 1008
+        await good.until("frame")
+
+
+@run
+async def test_too_many_messages_close_their_sender() -> None:
+    async with served() as site, site.page() as good, site.page() as bad:
+        with contextlib.suppress(ConnectionError, aiohttp.ClientError):
+            for _ in range(5000):
+                await bad.say(type="ping", sent=1.0)
+        code, reason = await bad.closed()
+        assert code == 1008 or "messages" in reason
+        await good.until("frame")
+
+
+@run
+async def test_bad_edits_are_answered_and_not_punished() -> None:
+    async with served() as site, site.page() as page:
+        await page.say(type="set", thing="light", index=0, key="intensity", value=-1)
+        header, _ = await page.until("notice")
+        assert "intensity" in header["text"]
+        assert "/" not in header["text"]
+        await page.say(type="scene", name="../../etc/passwd")
+        header, _ = await page.until("notice")
+        assert "no bundled scene" in header["text"]
+        await page.until("frame")
+
+
+@run
+async def test_only_so_many_viewers() -> None:
+    async with served() as site, contextlib.AsyncExitStack() as stack:
+        for _ in range(8):
+            await stack.enter_async_context(site.page())
+        with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+            await stack.enter_async_context(site.page())
+        assert error.value.status == 503
+
+
+@run
+async def test_a_viewer_that_shows_nothing_gets_two_frames_and_slows_nobody() -> None:
+    async with served() as site, site.page() as good, site.page() as slow:
+        await good.until("frame")
+        deadline = time.monotonic() + 2.0
+        seen = 0
+        while time.monotonic() < deadline:
+            with contextlib.suppress(TimeoutError):
+                message = await asyncio.wait_for(slow.socket.receive(), 0.02)
+                seen += message.type is aiohttp.WSMsgType.BINARY and b'"type":"frame"' in message.data[:400]
+            await good.until("frame")
+        assert seen == 2
+        assert good.frames > 10
+
+
+def is_refused(message: str | bytes) -> bool:
+    """Whether a message closes the page that sends it."""
+    try:
+        return isinstance(message, str) and parse_text(message) is None
+    except ProtocolError:
+        return True
+
+
+@run
+async def test_a_thousand_messages_from_hostile_pages_change_nothing_for_the_good_one() -> None:
+    """Every bad one costs its sender the connection, and it comes back; ``bench_live`` sends ten thousand."""
+    rng = random.Random(1)
+    messages = [mutated(rng) for _ in range(1000)]
+    # What is understood is done; these take seconds each.
+    messages = [m for m in messages if isinstance(m, bytes) or not any(f'"{w}"' in m for w in ("record", "scene"))]
+    assert 200 < sum(map(is_refused, messages)) < 900
+    async with served() as site, site.page() as good:
+        await good.until("frame")
+        stop = asyncio.Event()
+
+        async def watch() -> None:
+            while not stop.is_set():
+                await good.hear()
+
+        watching = asyncio.create_task(watch())
+        while messages:
+            async with site.page() as bad:
+                while messages:
+                    message = messages.pop()
+                    await (bad.socket.send_str(message) if isinstance(message, str) else bad.socket.send_bytes(message))
+                    if is_refused(message):
+                        assert (await bad.closed())[0] == 1008, message
+                        break
+        async with site.page() as last:
+            await last.say(type="play", on=True)
+        before = good.frames
+        await asyncio.sleep(2.0)
+        assert not watching.done(), watching.exception()
+        assert good.frames > before
+        stop.set()
+        await watching
+
+
+# -------------------------------------------------------------------------------------------------------------- command
+
+
+def test_address() -> None:
+    assert Address().url == "http://127.0.0.1:8720/"
+    assert Address("0.0.0.0", 80, "abc").url == "http://localhost:80/?token=abc"
+    assert Address("::1", 80).url == "http://[::1]:80/"
+    assert not Address("0.0.0.0").loopback
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--port", "70000"], "--port 70000"),
+        (["--token", "a b"], "--token"),
+        (["--token", ""], "--token"),
+        (["--tls", "/no/such.pem"], "/no/such.pem"),
+        (["--report", "run.json"], "--report needs"),
+        (["--host", "no.such.host.invalid", "--device", "cpu", "--quality", "low"], "cannot serve"),
+    ],
+)
+def test_bad_usage_of_the_page(
+    arguments: list[str],
+    expected: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert live.main(["desk", *arguments]) == 2
+    text = capsys.readouterr().err
+    assert expected in text
+    assert text.count("\n") == 1
+
+
+def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
+    assert live.main(arguments) == 0
+    assert "http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_errors_are_one_of_ours() -> None:
+    assert issubclass(ProtocolError, WarpArError)
