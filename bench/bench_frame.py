@@ -1,0 +1,359 @@
+"""Whole frames: frames per second, every stage beside its floor, scenes of one effect, and the first frame of a run.
+
+On CPU stages are timed by the processor time of one core, which other programs hardly disturb; frames per second by the
+clock. On CUDA stages are timed by events on the device; the whole frame is one captured graph.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+import functools
+import itertools
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+import warp as wp
+
+from bench.common import copy_bandwidth, measure, report
+from warp_ar.geometry import torus_mesh
+from warp_ar.kernels.structs import FrameParams, RayScene
+from warp_ar.pipeline import TRACK, Pipeline
+from warp_ar.quality import PRESETS, Quality
+from warp_ar.scene import Scene, bundled_scenes, load_scene
+from warp_ar.sinks import open_sink
+from warp_ar.sources import open_source
+from warp_ar.tracking import Pose, Tracker
+
+CLIP_FRAMES = 48
+WARM_UP = 6
+LAUNCH_MS = 1.1e-3
+"""Time of one node of a graph that does nothing."""
+SIZES = {"480p": (640, 480), "1080p": (1920, 1080), "4K": (3840, 2160)}
+TRIANGLES = (1_000, 100_000, 1_000_000)
+QUALITIES = {
+    "medium": PRESETS["medium"],
+    "medium, light as clipped": PRESETS["medium"].with_rungs(recover="clipped"),
+    "high": PRESETS["high"],
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """Frames of a scene at some size, with their poses."""
+
+    scene: Scene
+    images: list[np.ndarray]
+    poses: list[Pose]
+
+
+@functools.cache
+def clip(name: str, size: tuple[int, int], count: int = CLIP_FRAMES) -> Clip:
+    """The first frames of a bundled scene, enlarged to ``size``; what a wider picture has more is mirrored."""
+    scene = load_scene(name)
+    camera = scene.camera
+    with open_source(scene.source.path) as source:
+        images = [frame.image.copy() for frame in itertools.islice(source, count)]
+    tracker = Tracker(scene.marker, camera)
+    poses = [tracker.track(image, index / 24.0).pose for index, image in enumerate(images)]
+    if size != (camera.width, camera.height):
+        scale = size[1] / camera.height
+        inner = (round(camera.width * scale), size[1])
+        side = (size[0] - inner[0]) // 2
+        images = [
+            cv2.copyMakeBorder(cv2.resize(image, inner), 0, 0, side, side, cv2.BORDER_REFLECT) for image in images
+        ]
+        scaled = camera.scaled_to(*inner)
+        scene = dataclasses.replace(scene, camera=dataclasses.replace(scaled, width=size[0], cx=scaled.cx + side))
+    return Clip(scene, images, poses)
+
+
+@contextlib.contextmanager
+def count_launches() -> Iterator[list[int]]:
+    """Count kernel launches and device copies."""
+    count = [0]
+    saved = {name: getattr(wp, name) for name in ("launch", "launch_tiled", "copy")}
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            count[0] += 1
+            return function(*args, **kwargs)
+
+        return call
+
+    for name, function in saved.items():
+        setattr(wp, name, counted(function))
+    try:
+        yield count
+    finally:
+        for name, function in saved.items():
+            setattr(wp, name, function)
+
+
+@wp.kernel(enable_backward=False)
+def trace_only_kernel(
+    params: wp.array[FrameParams], rays: wp.array2d[wp.vec2], scene: RayScene, depth_out: wp.array2d[wp.float32]
+):
+    """Nothing but the rays of a rectangle through the first object's mesh."""
+    i, j = wp.tid()
+    rect = params[0].object_rect
+    ray = rays[rect[0] + i, rect[2] + j]
+    shape = scene.objects[0]
+    direction = wp.transpose(shape.rotation) * (params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+    origin = wp.transpose(shape.rotation) * (params[0].camera_position - shape.position) / shape.scale
+    query = wp.mesh_query_ray(shape.mesh, origin, direction / shape.scale, 1.0e3)
+    if query.result:
+        depth_out[i, j] = query.t
+
+
+def _area(rect: Any) -> int:
+    return max(int(rect[1] - rect[0]), 0) * max(int(rect[3] - rect[2]), 0)
+
+
+def floors(pipeline: Pipeline, bandwidth: float) -> dict[str, float]:
+    """Least milliseconds of each stage: its bytes over the copy bandwidth, or its rays over the rate of bare rays."""
+    width, height = pipeline.size
+    pixels, arrays = width * height, pipeline.arrays
+    params = pipeline._block.host("params")[0]
+    objects, lit = _area(params["object_rect"]), _area(params["light_rect"])
+    texels = 2 * pipeline.quality.environment_height**2
+    moved = {
+        "unwrap": 28 * texels,
+        "accumulate": 84 * texels,
+        "fill": 28 * texels,
+        "key_lights": 12 * texels,
+        "diffuse": 12 * texels,
+        "specular": 28 * texels,
+        "visibility": 72 * objects,
+        "summed_area": 7 * pixels,
+        "relight": 39 * lit,
+        "shade": 84 * objects,
+        "composite": 6 * pixels + 12 * lit + 16 * objects,
+        "expose": 6 * pixels + 12 * lit + 16 * objects,
+    }
+    least = {name: 1e3 * count / bandwidth for name, count in moved.items()}
+    if pipeline.scene.objects and objects and pipeline.scene.objects[0].shape == "mesh":
+        rect = params["object_rect"]
+        shape = (int(rect[1] - rect[0]), int(rect[3] - rect[2]))
+        depth = wp.zeros(shape, dtype=wp.float32, device=pipeline.device)
+        inputs = [arrays["params"], arrays["rays"], arrays["ray_scene"]]
+
+        def trace() -> None:
+            wp.launch(trace_only_kernel, shape, inputs, [depth], device=pipeline.device)
+
+        bare = statistics.median(measure({"rays": trace}, pipeline.device)["rays"])
+        covered = int((arrays["hit_object"].numpy() >= 0).sum())
+        least["visibility"] = max(least["visibility"], bare)
+        least["shade"] = max(least["shade"], bare * covered / objects)  # one shadow ray per pixel that shows an object
+        least["relight"] = max(least["relight"], bare * lit / objects * 0.5)  # half of the rectangle is lit
+    return least
+
+
+def measure_stages(pipeline: Pipeline, frames: Clip, count: int) -> dict[str, list[float]]:
+    """Milliseconds of each stage in every frame after warm-up, processor time of one core on CPU."""
+    scheduler = pipeline._scheduler
+    if pipeline.device.is_cpu:
+        scheduler.clock = time.thread_time
+    times: dict[str, list[float]] = collections.defaultdict(list)
+    for index in range(WARM_UP + count):
+        at = index % len(frames.images)
+        result = pipeline(frames.images[at], time_seconds=index / 24.0, pose=frames.poses[at])
+        for name, timing in result.stages.items():
+            if index >= WARM_UP and not timing.skipped:
+                times[name].append(timing.milliseconds)
+    return times
+
+
+def bench_stages(label: str, frames: Clip, device: str, quality: Quality, count: int) -> float:
+    """One line per stage; returns the sum of their medians."""
+    bands = 1 if device == "cpu" else None
+    with Pipeline(frames.scene, device=device, quality=quality, bands=bands, profile=True) as pipeline:
+        times = measure_stages(pipeline, frames, count)
+        launches = {}
+        if pipeline.device.is_cuda:
+            for stage, passes in pipeline._scheduler._stages:
+                with count_launches() as counted:
+                    for step in passes:
+                        step.launch(None)
+                launches[stage.name] = counted[0]
+                for index, step in enumerate(step for step in passes if not step.on_host):
+                    launch = functools.partial(step.launch, None)
+                    report(f"pass {label} {stage.name} {index}", measure({"pass": launch}, device)["pass"], device)
+        least = floors(pipeline, copy_bandwidth(device))
+        for name, values in times.items():
+            floor = least.get(name, 0.0) + LAUNCH_MS * launches.get(name, 0)
+            ratio = statistics.median(values) / floor if floor else 0.0
+            more = {"floor_ms": round(floor, 5), "ratio": round(ratio, 2), "launches": launches.get(name)}
+            report(f"stage {label} {name}", values, device, **more)
+    total = sum(statistics.median(values) for values in times.values())
+    report(f"stages {label} sum", [total], device)
+    return total
+
+
+def bench_graph(label: str, frames: Clip, device: str, quality: Quality, count: int) -> None:
+    """Device time of a whole frame as one graph, and frames per second with both ways over the bus."""
+    poses, images = frames.poses, frames.images
+    with Pipeline(frames.scene, device=device, quality=quality) as pipeline:
+        for index in range(WARM_UP):
+            pipeline(images[index], time_seconds=index / 24.0, pose=poses[index])
+        scheduler, arrays = pipeline._scheduler, pipeline.arrays
+        stream = wp.get_stream(device)
+        begin, end = wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
+        times = []
+        for _ in range(count):
+            for name in ("frame", "pose", "clock"):
+                arrays.touch(name)
+            stream.record_event(begin)
+            scheduler.run()
+            stream.record_event(end)
+            times.append(wp.get_event_elapsed_time(begin, end))
+        report(f"graph {label}", times, device)
+
+        waiting: collections.deque[Any] = collections.deque()
+        submitting, each = [], []
+        last = time.perf_counter()
+        for index in range(count):
+            at = index % len(images)
+            start = time.perf_counter()
+            waiting.append(pipeline.submit(images[at], time_seconds=(WARM_UP + index) / 24.0, pose=poses[at]))
+            submitting.append((time.perf_counter() - start) * 1e3)
+            if len(waiting) > 2:
+                _ = waiting.popleft().image
+            now = time.perf_counter()
+            each.append((now - last) * 1e3)
+            last = now
+        fps = 1e3 / statistics.mean(each[5:])
+        report(
+            f"stream {label}", each[5:], device, fps=round(fps, 1), submit_ms=round(statistics.median(submitting), 4)
+        )
+
+        staging = wp.zeros(images[0].shape[:2], dtype=wp.vec3ub, device="cpu", pinned=True)
+        target = arrays["image"]
+        copies = {"upload": lambda: wp.copy(target, staging), "download": lambda: wp.copy(staging, target)}
+        for name, values in measure(copies, device).items():
+            report(f"bus {label} {name}", values, device)
+
+
+def bench_codec(label: str, frames: Clip, device: str) -> None:
+    """What the host alone does: find the marker, encode."""
+    tracker = Tracker(frames.scene.marker, frames.scene.camera)
+    times = []
+    for index, image in enumerate(frames.images[:24]):
+        start = time.perf_counter()
+        tracker.track(image, index / 24.0)
+        times.append((time.perf_counter() - start) * 1e3)
+    report(f"host {label} track", times[3:], device)
+    with tempfile.TemporaryDirectory() as folder:
+        height, width = frames.images[0].shape[:2]
+        start = time.perf_counter()
+        with open_sink(Path(folder) / "out.mp4", fps=24.0, size=(width, height)) as sink:
+            for image in frames.images[:24]:
+                sink.write(image)
+        report(f"host {label} encode", [(time.perf_counter() - start) * 1e3 / 24], device)
+
+
+def bench_cpu_frames(label: str, frames: Clip, quality: Quality, count: int) -> None:
+    """Frames per second by the clock, tracking included, decoding and encoding not."""
+    with Pipeline(frames.scene, device="cpu", quality=quality) as pipeline:
+        wall, cpu = [], []
+        for index in range(WARM_UP + count):
+            begin, spent = time.perf_counter(), time.process_time()
+            pipeline(frames.images[index % len(frames.images)], time_seconds=index / 24.0)
+            if index >= WARM_UP:
+                wall.append((time.perf_counter() - begin) * 1e3)
+                cpu.append((time.process_time() - spent) * 1e3)
+    fps = 1e3 / statistics.median(wall)
+    load = round(os.getloadavg()[0], 1)
+    report(f"frame {label}", wall, "cpu", fps=round(fps, 1), processor_ms=round(statistics.median(cpu), 2), load=load)
+
+
+def bench_effects(device: str, count: int) -> None:
+    """What a frame costs beyond its stages, for every bundled scene."""
+    for name in bundled_scenes():
+        scene = load_scene(name)
+        frames = clip(name, (scene.camera.width, scene.camera.height), 24)
+        with Pipeline(frames.scene, device=device, bands=1) as pipeline:
+            pipeline._scheduler.clock = time.thread_time
+            whole, parts = [], []
+            for index in range(WARM_UP + count):
+                at = index % len(frames.images)
+                start = time.thread_time()
+                result = pipeline(frames.images[at], time_seconds=index / 24.0, pose=frames.poses[at])
+                whole.append((time.thread_time() - start) * 1e3)
+                parts.append(sum(t.milliseconds for stage, t in result.stages.items() if stage != TRACK))
+        beyond = [a / b - 1.0 for a, b in zip(whole[WARM_UP:], parts[WARM_UP:], strict=True)]
+        stages = [stage.name for stage, _ in pipeline.plan.stages]
+        beyond_share = round(statistics.median(beyond), 3)
+        report(f"effect {name}", whole[WARM_UP:], device, beyond_stages=beyond_share, stages=stages)
+
+
+def bench_start(device: str) -> None:
+    """Seconds from the command to the first frame written: nothing cached, then everything."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "warp_ar.live", "desk", "--headless", "--frames", "1", "--device", device]
+        environment = {**os.environ, "WARP_CACHE_PATH": str(Path(folder) / "cache")}
+        for run in ("first", "second", "third"):
+            start = time.perf_counter()
+            subprocess.run([*command, "--output", str(Path(folder) / run)], env=environment, check=True)
+            load = round(os.getloadavg()[0], 1)
+            report(f"start, {run} run", [(time.perf_counter() - start) * 1e3], device, load=load)
+
+
+def with_triangles(frames: Clip, count: int, folder: Path) -> Clip:
+    """The clip with a torus of about ``count`` triangles in place of its first object."""
+    tolerance = 1.0
+    while len((mesh := torus_mesh(1.6, 0.7, tolerance)).faces) < count:
+        tolerance *= 0.8
+    path = folder / f"torus_{count}.ply"
+    trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False).export(path)
+    item = dataclasses.replace(frames.scene.objects[0], file=path, at=(0.15, 0.055, 0.03))
+    return dataclasses.replace(frames, scene=dataclasses.replace(frames.scene, objects=(item,)))
+
+
+def main(device: str) -> None:
+    """Everything above; parts of it where ``WARP_AR_BENCH`` names them, separated by commas."""
+    parts = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(",")))
+
+    def wanted(part: str) -> bool:
+        return not parts or part in parts
+
+    if wp.get_device(device).is_cpu:
+        frames = clip("desk", SIZES["480p"])
+        if wanted("frame"):
+            bench_cpu_frames("480p medium", frames, PRESETS["medium"], 60)
+        if wanted("stages"):
+            bench_stages("480p medium", frames, device, PRESETS["medium"], 40)
+        if wanted("effects"):
+            bench_effects(device, 24)
+    else:
+        for size in SIZES:
+            frames = clip("desk", SIZES[size])
+            for name, quality in QUALITIES.items():
+                label = f"{size} {name}"
+                if name == "high" and size != "1080p":
+                    continue
+                if wanted("graph"):
+                    bench_graph(label, frames, device, quality, 300)
+                if wanted("stages"):
+                    bench_stages(label, frames, device, quality, 200)
+            if wanted("codec"):
+                bench_codec(size, frames, device)
+        if wanted("triangles"):
+            with tempfile.TemporaryDirectory() as folder:
+                for count in TRIANGLES:
+                    many = with_triangles(clip("desk", SIZES["1080p"]), count, Path(folder))
+                    bench_graph(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 200)
+                    bench_stages(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 60)
+    if wanted("start"):
+        bench_start(device)
