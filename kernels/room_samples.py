@@ -266,6 +266,51 @@ def list_texels_kernel(
     samples_out[i * width + j] = sample
 
 
+@wp.kernel(enable_backward=False)
+def place_lamps_kernel(
+    # In:
+    row_start: wp.int32,
+    lamps: wp.array[wp.vec4],
+    texel: wp.float32,
+    # Out:
+    samples_out: wp.array[RoomSample],
+):
+    """Give the samples that show a lamp the lamp's distance."""
+    index = wp.tid() + row_start
+    sample = samples_out[index]
+    for k in range(lamps.shape[0]):
+        lamp = lamps[k]
+        if lamp[3] > 0.0:
+            to_lamp = wp.vec3(lamp[0], lamp[1], lamp[2]) - sample.origin
+            distance = wp.length(to_lamp)
+            # Tangent of the lamp's half angle, and a texel more: the map shows it that much wider.
+            off = wp.length(wp.cross(to_lamp, sample.direction))
+            along = wp.dot(to_lamp, sample.direction)
+            if along > 0.0 and off <= lamp[3] + texel * distance and distance < sample.distance:
+                samples_out[index].distance = distance
+
+
+def place_lamps(
+    lamps: wp.array[wp.vec4], height: int, samples_out: wp.array[RoomSample], *, rows: Rows | None = None
+) -> None:
+    """Turn the samples of near lamps from directions into places.
+
+    Args:
+        lamps: (k,) position in the world and radius in metres; radius 0: none.
+        height: Rows of the environment that the samples were drawn from.
+        samples_out: (n,) samples; only their distance changes.
+        rows: Range of samples; None means all.
+    """
+    launch_rows(
+        place_lamps_kernel,
+        samples_out.shape,
+        [lamps, math.pi / height],
+        [samples_out],
+        rows=rows,
+        device=samples_out.device,
+    )
+
+
 def sum_environment(
     environment: wp.array2d[wp.vec3],
     cumulative_out: wp.array2d[wp.float32],

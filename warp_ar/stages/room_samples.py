@@ -11,6 +11,7 @@ from warp_ar.kernels import pyramid, room_samples
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 from warp_ar.stages.composite import shades_room
+from warp_ar.stages.recover import Recover
 from warp_ar.stages.shade import sees_near, shade_config
 
 SAMPLES = 1024
@@ -23,6 +24,12 @@ def sample_count(request: Request) -> int:
     """Samples that the rungs of a request read."""
     reference = request.quality.rung("room_shadow") == "brute_force"
     return REFERENCE_SIZE[0] * REFERENCE_SIZE[1] if reference else SAMPLES
+
+
+def knows_lamps(request: Request) -> bool:
+    """Whether a stage finds lamps at a distance: a resource ``lamps`` of (position, radius), ``wp.vec4`` each."""
+    wiring = Recover.wire(request)
+    return isinstance(wiring, Wiring) and "lamps" in wiring.writes
 
 
 class RoomSamples(Stage):
@@ -38,7 +45,8 @@ class RoomSamples(Stage):
         gathers = sees_near(request) and shade_config(request).room_diffuse != "none"
         if not shades_room(request) and not gathers:
             return LeftOut("nothing traces rays to the room's light")
-        return Wiring(("environment",), ("room_samples",))
+        lamps = ("lamps",) if knows_lamps(request) else ()
+        return Wiring(("environment", *lamps), ("room_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The samples, and the sums that are inverted to draw them."""
@@ -65,12 +73,19 @@ class RoomSamples(Stage):
         origin = wp.vec3(*self.request.scene.probes[0].center)
         small = arrays.get("room_samples_map")
         if small is not None:
-            return [
+            rows = small.shape[0]
+            passes = [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
                 Pass(lambda rows: room_samples.list_texels(small, origin, directions, flux, samples)),
             ]
-        cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
-        return [
-            Pass(lambda rows: room_samples.sum_environment(environment, cumulative, sums)),
-            Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, directions, flux, samples)),
-        ]
+        else:
+            rows = environment.shape[0]
+            cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
+            out = directions, flux, samples
+            passes = [
+                Pass(lambda rows: room_samples.sum_environment(environment, cumulative, sums)),
+                Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, *out)),
+            ]
+        if knows_lamps(self.request):
+            passes.append(Pass(lambda _: room_samples.place_lamps(arrays["lamps"], rows, samples)))
+        return passes

@@ -14,7 +14,7 @@ from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room
-from warp_ar.stages.room_samples import REFERENCE_SIZE
+from warp_ar.stages.room_samples import REFERENCE_SIZE, knows_lamps
 from warp_ar.stages.shade import DFG_SIZE, shade_config
 from warp_ar.stages.visibility import GrowingRows
 
@@ -133,7 +133,8 @@ class RoomShadow(Stage):
         forms = room_config(self.request)
         if not rung.bounce:
             forms = dataclasses.replace(forms, diffuse="none", specular=False)
-        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce)
+        near = knows_lamps(self.request)
+        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, near)
         room_shadow.make_room_shadow_kernel(config)
         dfg = arrays.get("room_shadow_dfg")
         if dfg is not None:

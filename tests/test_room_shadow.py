@@ -1,0 +1,455 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import room_shadow as reference
+from tests.test_composite import tables
+from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records, shape
+from warp_ar.graph import make_plan
+from warp_ar.kernels import room_samples, room_shadow
+from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.room_samples import RoomSample
+from warp_ar.kernels.structs import BOX, LAMBERT, PLANE, SPHERE, FrameParams, Material, Probe, RayScene, Shape
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.quality import PRESETS
+from warp_ar.scene import load_scene
+from warp_ar.stages.base import Request
+
+COUNT, SIDE = 64, 4
+ORIGIN = (0.0, 0.0, 0.035)
+# Sums of float32 over up to 2048 terms of like size.
+SUM_ERROR = 2e-5
+# Rays that pass a sphere's rim nearer than this share of its radius may fall on either side of it.
+RIM = 1e-3
+# 1024 stratified samples of a smooth integrand: far below the 1 / sqrt 1024 of independent ones.
+STRATIFIED = 0.01
+# One sample of a sun may fall into the texel of the sky beside it.
+ONE_SAMPLE = 1.0 / 512
+# One set has 64 samples, of which half follow the light: a step of its visibility is 1/32, a few of them its error.
+SET_ERROR = 0.12
+# Mean over all pixels: 192 tiles of all 1024 samples each.
+MEAN_ERROR = 2e-3
+
+
+def draw(environment, count=COUNT * SIDE * SIDE):
+    environment = np.asarray(environment, np.float32)
+    height, width = environment.shape[:2]
+    cumulative, sums = wp.zeros((height, width), wp.float32), wp.zeros(height, wp.vec2)
+    directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
+    samples = wp.zeros(count, RoomSample)
+    source = wp.array(environment, dtype=wp.vec3)
+    room_samples.sum_environment(source, cumulative, sums)
+    room_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), directions, flux, samples)
+    return directions, flux, samples
+
+
+def list_texels(environment):
+    environment = np.asarray(environment, np.float32)
+    count = environment.shape[0] * environment.shape[1]
+    directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
+    samples = wp.zeros(count, RoomSample)
+    room_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), directions, flux, samples)
+    return directions, flux, samples
+
+
+def sky(radiance=1.0, size=(32, 64)):
+    return np.full((*size, 3), radiance, np.float32)
+
+
+def with_sun(row, column, radiance, environment=None):
+    environment = sky() if environment is None else environment
+    environment[row, column] = radiance
+    return environment
+
+
+def sphere(center, radius):
+    return shape(SPHERE, center, (radius, 0, 0))
+
+
+def run(
+    drawn,
+    objects=(),
+    proxies=(DESK,),
+    probes=(),
+    count=COUNT,
+    side=SIDE,
+    stride=1,
+    bounce=False,
+    albedo=1.0,
+    rect=(0, H, 0, W),
+    rows=None,
+    filtered=True,
+    out=None,
+    near=False,
+):
+    kinds = tuple(tuple(sorted({thing["kind"] for thing in things})) for things in (objects, proxies))
+    forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh" if bounce else "none", False, bool(probes))
+    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, near)
+    params = records(
+        FrameParams,
+        {
+            "camera_position": CAMERA,
+            "world_from_camera": LOOK_DOWN,
+            "focal": (60, 60),
+            "principal": ((W - 1) / 2, (H - 1) / 2),
+            "shadow_rect": rect,
+        },
+    )
+    scene = RayScene()
+    objects = [{**thing, "material": 0} for thing in objects]
+    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
+    scene.materials = records(
+        Material, {"model": LAMBERT, "base_color": (albedo,) * 3, "base_texture": -1, "specular_texture": -1}
+    )
+    room = Room()
+    room.environment = wp.array(sky(), dtype=wp.vec3)
+    room.probes = records(Probe, *probes)
+    coefficients = np.zeros((9, 3), np.float32)
+    coefficients[0] = np.pi / 0.28209479
+    room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
+    cells = -(-H // stride), -(-W // stride)
+    ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    room_shadow.shade_room(
+        config, params, rays, frame, tables()[0], scene, room, *drawn, stride, ratio, surface, rows=rows
+    )
+    if not filtered:
+        return ratio.numpy()[..., :3], surface.numpy()
+    averaged = wp.zeros(cells, wp.vec3)
+    room_shadow.filter_ratio(ratio, surface, side, averaged, rows=rows)
+    out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
+    room_shadow.spread_ratio(params, averaged, surface, stride, out)
+    return out.numpy()
+
+
+# --- Samples ----------------------------------------------------------------------------------------------------------
+
+
+def test_samples_of_a_constant_room_sum_to_the_sphere(device):
+    directions, flux, samples = draw(sky(0.7))
+    assert samples.numpy()["measure"].sum() == pytest.approx(4 * np.pi, rel=STRATIFIED)
+    up = np.maximum(directions.numpy()[:, 2], 0) @ flux.numpy()
+    np.testing.assert_allclose(up, 0.7 * np.pi, rtol=STRATIFIED)
+
+
+@pytest.mark.parametrize("row", [0, 3, 14])
+def test_irradiance_of_a_one_texel_sun_over_a_dark_sky(device, row):
+    environment = with_sun(row, 5, 1e6, sky(1e-4))
+    directions, flux, _ = draw(environment)
+    wi, solid_angle = reference.texel_directions(32, 64)
+    expected = (np.maximum(wi[..., 2], 0) * solid_angle)[..., None] * environment
+    up = np.maximum(directions.numpy()[:, 2], 0) @ flux.numpy()
+    np.testing.assert_allclose(up, expected.sum((0, 1)), rtol=STRATIFIED)
+
+
+@pytest.mark.parametrize("size", [(16, 32), (5, 9), (1, 4)])
+def test_every_sample_lies_in_the_texel_that_it_shows(device, size):
+    height, width = size
+    ramp = np.arange(height * width, dtype=np.float32).reshape(size)
+    _, _, samples = draw(np.repeat(ramp[..., None], 3, -1))
+    found = samples.numpy()
+    wi = found["direction"]
+    np.testing.assert_allclose(np.linalg.norm(wi, axis=1), 1, atol=1e-6)
+    row = np.arccos(np.clip(wi[:, 2], -1, 1)) / np.pi * height
+    column = (np.arctan2(wi[:, 1], wi[:, 0]) / np.pi + 1) / 2 * width
+    texel = found["radiance"][:, 0].astype(int)
+    # Half a texel from its middle, and what float32 directions lose.
+    assert np.abs(row - (texel // width + 0.5)).max() < 0.5 + 1e-3
+    off = np.abs(column - (texel % width + 0.5))
+    assert np.minimum(off, width - off).max() < 0.5 + 1e-3
+    assert len(np.unique(texel)) > min(height * width, 1024) // 3
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, -5.0, np.inf])
+def test_samples_stay_finite(device, value):
+    environment = with_sun(4, 9, value, sky(0.0))
+    for drawn in (draw(environment), list_texels(environment)):
+        found = drawn[2].numpy()
+        for name in ("direction", "radiance", "measure"):
+            assert np.isfinite(found[name]).all(), name
+        assert np.isfinite(drawn[1].numpy()).all()
+        assert (found["radiance"] >= 0).all()
+    if value != np.inf:
+        assert found["radiance"].max() == 0
+
+
+def test_sets_are_stratified():
+    points = [(reference.radical_inverse(i), reference.sobol_second(i)) for i in range(1024)]
+    for start in range(0, 1024, 64):
+        cells = {(int(u * 8), int(v * 8)) for u, v in points[start : start + 64]}
+        assert len(cells) == 64
+
+
+def test_sobol_matches_its_twin(device):
+    out = wp.zeros(1024, wp.float32)
+    wp.launch(_sobol_kernel, dim=1024, outputs=[out])
+    np.testing.assert_allclose(out.numpy(), [reference.sobol_second(i) for i in range(1024)], atol=2**-24)
+
+
+@wp.kernel(enable_backward=False)
+def _sobol_kernel(out: wp.array[wp.float32]):
+    i = wp.tid()
+    out[i] = room_samples.sobol_second(wp.uint32(i))
+
+
+def test_texels_list_the_map(device):
+    environment = np.random.default_rng(3).random((8, 16, 3)).astype(np.float32)
+    directions, flux, samples = list_texels(environment)
+    wi, solid_angle = reference.texel_directions(8, 16)
+    np.testing.assert_allclose(directions.numpy().reshape(8, 16, 3), wi, atol=1e-6)
+    np.testing.assert_allclose(flux.numpy().reshape(8, 16, 3), solid_angle[..., None] * environment, rtol=1e-5)
+    np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
+
+
+def test_lamps_give_their_samples_a_place(device):
+    at = np.array([0.3, -0.1, 0.4])
+    _, _, samples = list_texels(sky(size=(64, 128)))
+    room_samples.place_lamps(wp.array([[*at, 0.03], [0, 0, 1, 0]], dtype=wp.vec4), 64, samples)
+    found = samples.numpy()
+    to_lamp = at - ORIGIN
+    angle = np.arccos(found["direction"] @ (to_lamp / np.linalg.norm(to_lamp)))
+    width = np.arctan((0.03 + np.pi / 64 * np.linalg.norm(to_lamp)) / np.linalg.norm(to_lamp))
+    near = found["distance"] < 1e29
+    assert near[angle < 0.95 * width].all()
+    assert not near[angle > 1.05 * width].any()
+    np.testing.assert_allclose(found["distance"][near], np.linalg.norm(to_lamp), rtol=1e-5)
+
+
+# --- Ratio ------------------------------------------------------------------------------------------------------------
+
+
+def test_nothing_virtual_changes_nothing_to_the_bit(device):
+    drawn = draw(with_sun(6, 20, 500.0))
+    far = sphere((0, 0, -3), 0.05)  # below the desk
+    assert (run(drawn, [far], probes=[{"center": (0.1, 0, 0.03), "radius": 0.03}]) == 1).all()
+
+
+def test_sphere_under_an_even_sky(device):
+    center, radius = (0.02, -0.03, 0.09), 0.05
+    expected = 1 - reference.sphere_form_factor(POINTS, center, radius)
+    got = run(draw(sky(0.3)), [sphere(center, radius)])[..., 0]
+    assert np.abs(got - expected).max() < SET_ERROR
+    assert abs((got - expected).mean()) < MEAN_ERROR
+    # A pixel's window holds every set once, but not at one point: what is left is the curvature of the shadow.
+    inner = (got - expected)[8:-8, 8:-8]
+    assert np.sqrt((inner**2).mean()) < STRATIFIED
+
+
+def test_reference_rung_matches_the_twin(device):
+    environment = np.random.default_rng(1).random((32, 64, 3)).astype(np.float32)
+    environment[8, 40] = 300.0
+    drawn = list_texels(environment)
+    spheres, balls = [((0.05, 0.02, 0.06), 0.05), ((-0.1, 0.0, 0.04), 0.04)], [((-0.05, 0.1, 0.035), 0.035)]
+    got = run(
+        drawn,
+        [sphere(*item) for item in spheres],
+        probes=[{"center": c, "radius": r} for c, r in balls],
+        count=2048,
+        side=1,
+        filtered=False,
+    )[0]
+    wi, flux = drawn[0].numpy().astype(np.float64), drawn[1].numpy().astype(np.float64)
+    bright = wi[8 * 64 + 40]
+    checked = 0
+    for row, column in np.random.default_rng(0).integers(0, (H, W), (40, 2)):
+        point = POINTS[row, column]
+        to_ball = point - CAMERA
+        if reference.meets_sphere(CAMERA, (to_ball / np.linalg.norm(to_ball))[None], *balls[0])[0]:
+            continue
+        shadowing = [*spheres, *balls]
+        if min(reference.clearance(point, bright[None], *item)[0] for item in shadowing) < RIM:
+            continue
+        expected = reference.ratio_on_plane(point[None], wi, flux, spheres, balls)[0]
+        # A ray at a rim may fall on either side: one of 2048, none bright but the sun, which is clear of them.
+        assert np.abs(got[row, column] - expected).max() < 2e-3
+        checked += 1
+    assert checked > 20
+
+
+def test_light_that_the_physical_hides_is_not_hidden_again(device):
+    # The sun stands above -y; a mirror ball and, behind it, a virtual ball are in its way to the same pixels.
+    environment = with_sun(12, 16, 3000.0, sky(0.2))
+    sun = reference.texel_directions(32, 64)[0][12, 16]
+    ball = 0.03 * np.array([0, 0, 1]) + 0.0
+    drawn = draw(environment)
+    objects = [sphere(ball + 0.2 * sun, 0.027)]
+    alone = run(drawn, objects)[..., 0]
+    behind = run(drawn, objects, probes=[{"center": ball, "radius": 0.03}])[..., 0]
+    shaded = alone < 0.5
+    assert shaded.sum() > 20
+    # What is left is sky: the virtual ball's share of it.
+    assert behind[shaded].min() > 0.85
+
+
+def test_proxies_hide_light(device):
+    environment = with_sun(12, 16, 3000.0, sky(0.2))
+    sun = reference.texel_directions(32, 64)[0][12, 16]
+    wall = shape(BOX, tuple(0.6 * sun), (0.1, 0.1, 0.1))
+    objects = [sphere(0.15 * sun, 0.03)]
+    drawn = draw(environment)
+    alone, behind = run(drawn, objects)[..., 0], run(drawn, objects, proxies=(DESK, wall))[..., 0]
+    shaded = alone < 0.3
+    assert shaded.sum() > 20
+    assert behind[shaded].min() > 0.6
+
+
+def test_sun_in_shadow_leaves_the_sky(device):
+    environment = with_sun(4, 30, 400.0, sky(0.5))
+    wi, solid_angle = reference.texel_directions(32, 64)
+    center, radius = 0.3 * wi[4, 30], 0.04
+    flux = (np.maximum(wi[..., 2], 0) * solid_angle)[..., None] * environment
+    hidden = reference.sphere_form_factor(np.zeros(3), center, radius) * 0.5 * np.pi
+    expected = 1 - (flux[4, 30, 0] + hidden) / flux[..., 0].sum()
+    got = run(draw(environment), [sphere(center, radius)])
+    at = np.unravel_index(np.linalg.norm(POINTS, axis=-1).argmin(), (H, W))
+    assert got[at][0] == pytest.approx(expected, abs=0.02)
+
+
+def test_black_room_and_deep_contact(device):
+    assert (run(draw(sky(0.0)), [sphere((0, 0, 0.05), 0.05)]) == 1).all()
+    # A slab that lies on the desk leaves nothing under it.
+    slab = shape(BOX, (0, 0, 0.02), (0.2, 0.2, 0.02 - 1e-5))
+    dark = run(draw(sky(1.0)), [slab])
+    at = np.unravel_index(np.linalg.norm(POINTS, axis=-1).argmin(), (H, W))
+    assert dark[at].max() < 1e-3
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.8, 1.0])
+def test_bounce(device, albedo):
+    item = [sphere((0, 0, 0.08), 0.05)]
+    drawn = draw(sky(1.0))
+    black, lit = run(drawn, item)[..., 0], run(drawn, item, bounce=True, albedo=albedo)[..., 0]
+    if albedo == 0.0:
+        np.testing.assert_allclose(lit, black, atol=SUM_ERROR)
+    else:
+        # In a white furnace a white sphere is as bright as the sky but for what the shadow under it takes.
+        hidden = 1 - black
+        back = (lit - black)[hidden > 0.1] / hidden[hidden > 0.1]
+        assert back.max() < albedo + SET_ERROR
+        assert albedo * 0.7 < back.mean() < albedo + MEAN_ERROR
+
+
+def test_near_lamps_cast_their_own_shadow(device):
+    # A lamp 0.4 m above the ball: straight up as the environment has it, aslant from elsewhere.
+    environment = sky(1e-3, (64, 128))
+    environment[:1] = 5000.0
+    lamp = np.array([0, 0, 0.435])
+    directions, flux, samples = draw(environment)
+    item = [sphere((0.1, 0, 0.1), 0.03)]
+    distant = run((directions, flux, samples), item)[..., 0]
+    room_samples.place_lamps(wp.array([[*lamp, 0.02]], dtype=wp.vec4), 64, samples)
+    near = run((directions, flux, samples), item, near=True)[..., 0]
+    # Centre of the shadow: where the line through lamp and object meets the desk.
+    expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)
+    for got, center in ((distant, (0.1, 0.0)), (near, expected[:2])):
+        weight = (got < 0.5).astype(float)
+        assert weight.sum() > 10
+        found = (POINTS[..., :2] * weight[..., None]).sum((0, 1)) / weight.sum()
+        assert np.abs(found - center).max() < 0.012  # a pixel is 10 mm
+
+
+# --- Cells ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+def test_bands_of_rows_and_rectangles(device, stride):
+    drawn = draw(with_sun(6, 20, 100.0))
+    item = [sphere((0, 0, 0.05), 0.05)]
+    whole = run(drawn, item, stride=stride)
+    assert whole.min() < 0.6
+    rect = (7, 31, 12, 50)
+    part = run(drawn, item, stride=stride, rect=rect)
+    inside = np.zeros((H, W), bool)
+    inside[7:31, 12:50] = True
+    np.testing.assert_array_equal(part[inside], whole[inside])
+    assert (part[~inside] == 1).all()
+    assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
+
+
+def test_half_resolution_agrees(device):
+    drawn = draw(sky(1.0))
+    item = [sphere((0, 0, 0.09), 0.05)]
+    full, half = run(drawn, item), run(drawn, item, stride=2)
+    assert np.abs(full - half).max() < SET_ERROR
+    assert abs((full - half).mean()) < MEAN_ERROR
+
+
+def test_bands_agree_with_the_whole(device):
+    drawn = draw(sky(1.0))
+    item = [sphere((0, 0, 0.09), 0.05)]
+    whole, key = run(drawn, item, filtered=False)
+    for rows in ((0, 13), (13, H)):
+        part, part_key = run(drawn, item, filtered=False, rows=rows)
+        np.testing.assert_array_equal(part[slice(*rows)], whole[slice(*rows)])
+        np.testing.assert_array_equal(part_key[slice(*rows)], key[slice(*rows)])
+
+
+def test_filter_keeps_surfaces_apart(device):
+    ratio = np.ones((16, 16, 4), np.float32)
+    ratio[:, 8:, :3] = 0.25
+    surface = np.zeros((16, 16), np.int32)
+    surface[:, 8:] = 8
+    surface[3, :] = -1
+    out = wp.full((16, 16), wp.vec3(5.0, 5.0, 5.0), dtype=wp.vec3)
+    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), wp.array(surface, dtype=wp.int32), 4, out)
+    expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
+    expected[3] = 5.0
+    np.testing.assert_array_equal(out.numpy(), expected)
+
+
+def test_filter_weights_every_set_alike(device):
+    # Each set has its own value; away from borders the mean of all is exact wherever the window lies.
+    rows, columns = np.mgrid[:24, :24]
+    ratio = np.zeros((24, 24, 4), np.float32)
+    ratio[..., :3] = ((rows % 4) * 4 + columns % 4)[..., None]
+    out = wp.zeros((24, 24), wp.vec3)
+    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), wp.zeros((24, 24), wp.int32), 4, out)
+    np.testing.assert_allclose(out.numpy()[2:-2, 2:-2], 7.5, rtol=1e-6)
+
+
+def test_spread_is_a_ramp(device):
+    # Cells hold the column of the pixel that they were estimated at: between them a ramp has no steps and no shift.
+    for stride in (1, 2, 3):
+        cells = (9, 12)
+        columns = np.arange(cells[1]) * stride + stride // 2
+        values = np.repeat(np.broadcast_to(columns, cells)[..., None], 3, -1).astype(np.float32)
+        size = (cells[0] * stride, cells[1] * stride)
+        params = records(FrameParams, {"shadow_rect": (0, size[0], 0, size[1])})
+        out = wp.zeros(size, wp.vec3)
+        room_shadow.spread_ratio(params, wp.array(values, dtype=wp.vec3), wp.zeros(cells, wp.int32), stride, out)
+        got = out.numpy()[..., 0]
+        np.testing.assert_allclose(got, np.clip(np.arange(size[1]), columns[0], columns[-1])[None] + 0 * got, atol=1e-5)
+
+
+def test_count_must_fill_chunks():
+    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+    with pytest.raises(ValueError, match="count is 100"):
+        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 100, 4, False))
+
+
+# --- Stage ------------------------------------------------------------------------------------------------------------
+
+
+def stages(scene, rung, **changes):
+    scene = dataclasses.replace(scene, **changes)
+    quality = PRESETS["medium"].with_rungs(room_shadow=rung)
+    plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
+    return {stage.name for stage, _ in plan.stages}, dict(plan.left_out)
+
+
+def test_stage_says_why_it_is_left_out():
+    scene = load_scene("torus")
+    run_stages, _ = stages(scene, "coarse")
+    assert {"room_samples", "room_shadow"} <= run_stages
+    for changes, rung, reason in (
+        ({"objects": ()}, "coarse", "no virtual object"),
+        ({"proxies": ()}, "coarse", "no proxy"),
+        ({}, "none", "leaves out"),
+    ):
+        names, left_out = stages(scene, rung, **changes)
+        assert "room_shadow" not in names
+        assert "room_samples" not in names
+        assert reason in left_out["room_shadow"]
