@@ -1,20 +1,23 @@
-"""What else the frame says about the room's light: brightness of surfaces, and how much light each part of the room sends to them.
+"""What else the frame says about the room's light: how bright surfaces are, and which part of the room lights them.
 
-The ball clips where lamps and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or not there, and are
-lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the radiance L receives
+The ball clips where lamps and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
+not there, and are lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the
+radiance L receives
 
     E(x) = pi L / rho = sum over the room's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle visibility.
 
-The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps`` the same for lamps at
-finite distances. ``warp_ar.recovery`` solves for what is missing in the clipped cells, ``add_excess`` puts it into the map.
+The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps``
+the same for lamps at finite distances. ``warp_ar.recovery`` solves for what is missing in the clipped cells,
+``add_excess`` puts it into the map.
 
-**Cells.** The room is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with its mean radiance, its
-share at clipping, and the direction in which that share lies.
+**Cells.** The room is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with
+its mean radiance, its share at clipping, and the direction in which that share lies.
 
-**Visibility.** From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size, the ball as an edge in
-front of it. What the ball hides it replaces: the ray is mirrored, and the share goes to the cell that it then meets. Where a proxy is in the
-way, its radiance is what the ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left
-for what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+**Visibility.** From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own
+size, the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex
+mirror does; that is kept apart, for real balls scatter some of it. Where a proxy is in the way, its radiance is what
+the ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left for
+what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
 """
 
 from __future__ import annotations
@@ -190,6 +193,7 @@ def add_excess_kernel(
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
+    """Texel plus its share of its cell's excess."""
     band_row, j = wp.tid()
     i = row_start + band_row
     more = excess[i * excess.shape[0] // radiance.shape[0], j * excess.shape[1] // radiance.shape[1]]
@@ -244,7 +248,8 @@ def hidden_share(
 ) -> wp.float32:
     """Share of a disc of angular radius ``cell_angle`` around ``direction`` that a ball hides.
 
-    Both are taken to meet along a straight edge: (3 t - t^3) / 4 + 1 / 2 with t in -1..1 is within 2 % of a disc's exact share.
+    Both are taken to meet along a straight edge: (3 t - t^3) / 4 + 1 / 2 with t in -1..1 is within 2 % of a disc's
+    exact share.
     """
     to_center = center - origin
     away = wp.length(to_center)
@@ -261,8 +266,9 @@ def hidden_share(
 def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp.float32:
     """Irradiance at a surface point by way of a ball, per unit irradiance of a parallel beam from direction ``light``.
 
-    The ball's point with normal n that mirrors the beam to x halves the angle a between both. There a convex mirror has the focal lengths
-    R cos a / 2 (in the plane of incidence) and R / (2 cos a) (across it); at the distance s the beam is wider by
+    The ball's point with normal n that mirrors the beam to x halves the angle a between both. There a convex mirror
+    has the focal lengths R cos a / 2 (in the plane of incidence) and R / (2 cos a) (across it); at the distance s the
+    beam is wider by
 
         (1 + 2 s / (R cos a)) (1 + 2 s cos a / R).
     """
@@ -363,19 +369,21 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         scene: RayScene,
         # Out:
         transfer_out: wp.array2d[wp.float32],
+        mirrored_out: wp.array2d[wp.float32],
     ):
         index = row_start + wp.tid()
         rows = cells.shape[0]
         columns = cells.shape[1]
         for m in range(rows * columns):
             transfer_out[index, m] = 0.0
+            mirrored_out[index, m] = 0.0
         if observations[index].visible > 0.0:
             point = points[index]
             for m in range(rows * columns):
                 cell = cells[m // columns, m % columns]
                 for k in range(probes.shape[0]):
                     more = cell.solid_angle * mirrored_irradiance(probes[k], point, cell.direction)
-                    transfer_out[index, m] = transfer_out[index, m] + more
+                    mirrored_out[index, m] = mirrored_out[index, m] + more
                 cosine = wp.dot(cell.direction, point.normal)
                 if cosine > 0.0:
                     share = cosine * cell.solid_angle
@@ -472,6 +480,7 @@ def trace_transfer(
     probes: wp.array,
     scene: RayScene,
     transfer_out: wp.array,
+    mirrored_out: wp.array,
     *,
     proxies: tuple[int, ...],
     rows: Rows | None = None,
@@ -484,7 +493,8 @@ def trace_transfer(
         cells: ``Cell`` (rows, columns): directions and solid angles.
         probes: ``Probe`` (P), at least one; the room is the one that the first sees.
         scene: Its proxies hide the room.
-        transfer_out: ``wp.float32`` (n, rows * columns).
+        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
+        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
         proxies: Kinds of proxy in the scene.
         rows: Band of points, None for all.
     """
@@ -492,7 +502,7 @@ def trace_transfer(
         make_kernels(proxies)[1],
         points.shape,
         [points, observations, cells, probes, scene],
-        [transfer_out],
+        [transfer_out, mirrored_out],
         rows=rows,
         device=transfer_out.device,
     )

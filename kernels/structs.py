@@ -130,3 +130,12 @@ class KeyLight:
     direction: wp.vec3  # unit, toward the light
     irradiance: wp.vec3  # on a surface that faces it, from the texels that belong to it
     dominance: wp.float32  # 0 ambient room .. 1 all light from this direction
+
+
+@wp.struct
+class RoomLamp:
+    """A lamp of the room whose light clips in the ball; distant ones are directions."""
+
+    direction: wp.vec3  # unit, from the first ball; zero where there is no lamp
+    distance: wp.float32  # metres from the ball, infinite for a distant one
+    power: wp.vec3  # radiance times solid angle at the ball, beyond what the camera captured; times distance^2: radiant intensity

@@ -1,32 +1,36 @@
 """Light that clipping lost in the ball, found again from surfaces that the same light falls on.
 
-**Unknowns.** Cells of the room that clip (``kernels/recover.py``) are grouped to regions: connected ones, split where they are wider than
-``REGION`` steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the ball shows. Beside regions stand *peaks*: lamps or a
-sun within a region, or where no ball sees, each with its power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction
-and a distance. A surface k has the unknown reflectance 1 / u_k; the card's is known.
+**Unknowns.** Cells of the room that clip (``kernels/recover.py``) are grouped to regions: connected ones, split where
+they are wider than ``REGION`` steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the ball
+shows. Beside regions stand *peaks*: lamps or a sun within a region, or where no ball sees, each with its power p_j >=
+0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the unknown
+reflectance 1 / u_k; the card's is known.
 
 **Equations.** A surface point x that shows the radiance L receives
 
     pi L(x) u_k = e(x) + sum_r a_r(x) s_r + sum_j b_j(x) p_j,     e = T radiance,  a_r = T clipped over the cells of r,
 
-linear in the unknowns, none of which is negative. Divided by pi L and by u's last estimate a residual is a relative error: the surface's
-texture, transport that the model leaves out. Points that clip bind from one side only: they count while the prediction is under what they show.
-Where the card clips in whole, the sum of the energy has a lower bound only, and the estimate says so; ink, a twentieth as bright, and
-surfaces in shadow then carry it as far as priors on their reflectances allow.
+linear in the unknowns, none of which is negative. Divided by pi L and by u's last estimate a residual is a relative
+error: the surface's texture, transport that the model leaves out. Points that clip bind from one side only: they count
+while the prediction is under what they show. Where the card clips in whole, the sum of the energy has a lower bound
+only, and the estimate says so; ink, a twentieth as bright, and surfaces in shadow then carry it as far as priors on
+their reflectances allow.
 
-**Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that about one mean of all,
-times (solid angle)^-1/2: halfway between lamps of equal radiance and lamps of equal power, for what is small and still clips tends to be
-brighter than what is wide. The common mean is free; where nothing but the card is used it is what makes the card right, and that alone is the
-rung ``white_card``. Clipped pixels that show a modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping.
-Channels share their distribution: a second pass draws each to the mean of all three, in the hue of their totals.
+**Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
+about one mean of all, times (solid angle)^-1/2: halfway between lamps of equal radiance and lamps of equal power, for
+what is small and still clips tends to be brighter than what is wide. The common mean is free; where nothing but the
+card is used it is what makes the card right, and that alone is the rung ``white_card``. Clipped pixels that show a
+modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
+distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
-**Peaks** are chosen one by one, among all directions that may lack light and a grid of distances, by how far they lower the cost to second
-order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then moved to neighbouring cells and distances while
-that helps, and kept if the cost falls by more than ``EVIDENCE``. A lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the
-falling off of its light tell D.
+**Peaks** are chosen one by one, among all directions that may lack light and a grid of distances, by how far they
+lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then
+moved to neighbouring cells and distances while that helps, and kept if the cost falls by more than ``EVIDENCE``. A
+lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D.
 
-**Solution.** Iteratively reweighted least squares with Cauchy weights; each quadratic problem with non-negative unknowns is solved by an
-active set that starts from the last solution. Some 400 equations and 60 unknowns. Equal input gives equal output.
+**Solution.** Iteratively reweighted least squares with Cauchy weights; each quadratic problem with non-negative
+unknowns is solved by an active set that starts from the last solution. Some 400 equations and 60 unknowns. Equal input
+gives equal output.
 """
 
 from __future__ import annotations
@@ -69,6 +73,8 @@ EVIDENCE: Final = 7.0
 """Fall of the cost (twice a log likelihood) that a peak must be worth."""
 PEAKS: Final = 4
 """Most peaks at a time."""
+SEARCH_EVERY: Final = 3
+"""Frames between searches for one more peak; the first frame searches for all."""
 MOST_CANDIDATES: Final = 160
 """Directions that are tried for a peak."""
 DISTANCES: Final = np.array([2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.26, 0.2])
@@ -77,6 +83,8 @@ PEAK_ANGLE: Final = 0.12
 """Radians around a peak's direction that share its light."""
 LAMP_SHARE: Final = 0.06
 """Radius of a lamp as a share of its distance: of a disc as wide as a cell."""
+MIRROR_TRUST: Final = 0.5
+"""Relative standard deviation of light that comes by way of a ball: dents, scratches and dust scatter it."""
 ITERATIONS: Final = 6
 WARM_ITERATIONS: Final = 3
 LOST: Final = 0.02
@@ -98,6 +106,8 @@ class Kind(enum.IntEnum):
     """One face of a box proxy."""
 
 
+_ONE_THREAD: Final = 1 << 17
+"""Multiplications below which OpenBLAS, MKL and Accelerate use one thread."""
 _NOISE: Final = np.array([0.02, 0.04, 0.12, 0.04])
 """Relative standard deviation of one equation, by kind."""
 _SHARED: Final = np.array([4.0, 8.0, 6.0, 6.0])
@@ -150,7 +160,7 @@ Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of lamps (q, 4: position, radius), (n, q)."""
 
 
-# ---- surface points -------------------------------------------------------------------------------------------------------------
+# ---- surface points --------------------------------------------------------------------------------------------------
 
 
 class _Collector:
@@ -160,7 +170,9 @@ class _Collector:
         self.kinds: list[int] = []
         self.groups: list[int] = []
 
-    def add(self, positions: Sequence[Array], normal: Array, tangent: Array, half: float, kind: Kind, group: int) -> None:
+    def add(
+        self, positions: Sequence[Array], normal: Array, tangent: Array, half: float, kind: Kind, group: int
+    ) -> None:
         self.rows += [(position, normal, tangent, half) for position in positions]
         self.surface += [len(self.kinds)] * len(positions)
         self.kinds.append(kind)
@@ -176,8 +188,9 @@ class _Collector:
 def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     """Points on everything physical that the scene models: the printed card, planes and boxes.
 
-    On the card: the centres of all cells, and its quiet zone. On planes: rings around each ball, where its shadow and reflection fall, and a
-    grid around the origin; not on the card (whose size beyond the quiet zone is not known) and not under boxes. On boxes: 5 x 5 per face.
+    On the card: the centres of all cells, and its quiet zone. On planes: rings around each ball, where its shadow and
+    reflection fall, and a grid around the origin; not on the card (whose size beyond the quiet zone is not known) and
+    not under boxes. On boxes: 5 x 5 per face.
 
     Args:
         scene: What is modelled.
@@ -188,7 +201,9 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     z, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
     along = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
-    corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array(
+        [[-1, 1], [1, 1], [1, -1], [-1, -1]]
+    )
     ring = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     paper = [*cells[white], *np.column_stack([ring, np.zeros(len(ring))])]
     found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
@@ -238,12 +253,12 @@ def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
     return inside
 
 
-# ---- regions --------------------------------------------------------------------------------------------------------------------
+# ---- regions ---------------------------------------------------------------------------------------------------------
 
 
 def connected_regions(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Number of the connected part that each cell of a latlong mask belongs to, -1 for none; across the seam and the poles."""
-    height, width = mask.shape
+    """Connected part that each cell of a latlong mask belongs to, across the seam and the poles; -1 for none."""
+    height = len(mask)
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     parent = list(range(count))
 
@@ -302,13 +317,27 @@ def split_regions(
     return parts, count
 
 
-# ---- the least-squares problem --------------------------------------------------------------------------------------------------
+def small_product(a: Array, b: Array) -> Array:
+    """Product a' b, summed over blocks of rows so small that a BLAS library keeps to one thread.
+
+    The products here take microseconds; waking threads for them costs more than they do, and a hundredfold where cores
+    are busy.
+    """
+    step = max(1, _ONE_THREAD // max(a.shape[1] * b.shape[1], 1))
+    total = np.zeros((a.shape[1], b.shape[1]))
+    for start in range(0, len(a), step):
+        total += a[start : start + step].T @ b[start : start + step]
+    return total
+
+
+# ---- the least-squares problem ---------------------------------------------------------------------------------------
 
 
 def solve_nonnegative(hessian: Array, gradient: Array, start: Array | None = None) -> Array:
     """Minimise x' H x / 2 - g' x over x >= 0.
 
-    Block pivoting: free unknowns that turn negative are held at zero; once none does, held ones that pull upward are let go.
+    Block pivoting: free unknowns that turn negative are held at zero; once none does, held ones that pull upward are
+    let go.
 
     Args:
         hessian: H, positive definite, (n, n).
@@ -359,7 +388,8 @@ class _Problem:
     def __init__(
         self,
         cells: NDArray[Any],
-        transfer: Array,
+        transfer: NDArray[Any],
+        mirrored: NDArray[Any],
         observations: NDArray[Any],
         surfaces: Surfaces,
         white: float,
@@ -399,14 +429,25 @@ class _Problem:
         self.surface = surfaces.surface[seen]
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
-        self.transfer = transfer[seen].astype(float)
+        through_balls = mirrored[seen]
+        self.transfer = transfer[seen] + through_balls
         self.light = np.pi * shown["radiance"].astype(float)
         # Patches on a clutter's edge, or half in a sharp shadow, say nothing.
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > DARK) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
         self.captured = self.transfer @ self.radiance
-        self.columns = np.stack([self.transfer @ (self.member * self.lacking[:, [c]]) for c in range(3)])
+        order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
+        starts = np.unique(self.part[order], return_index=True)[1]
+        columns = [np.zeros((len(self.index), 0))] * 3
+        if self.parts:
+            sent = self.transfer[:, order]
+            columns = [np.add.reduceat(sent * self.lacking[order, c], starts, axis=1) for c in range(3)]
+        self.columns = np.stack(columns)
+        # With what clips taken to be some ten times as bright: only the order of magnitude matters.
+        bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
+        total = np.maximum(self.transfer @ bright, 1e-9)
+        self.mirrored_share = (through_balls @ bright) / total
         self.peaks: list[_Peak] = []
         self.peak_columns = np.zeros((3, len(self.index), 0))
         self.ties = [
@@ -438,7 +479,7 @@ class _Problem:
             means[c] = mean
         return means, (bounds[0], bounds[1], bounds[2])
 
-    # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of every surface.
+    # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of each surface.
 
     @property
     def first_mean(self) -> int:
@@ -465,10 +506,14 @@ class _Problem:
     def fit(self, c: int, z: Array, iterations: int, centre: Array | None = None) -> _Fit:
         """Solve for one channel from a start; ``centre`` draws parts and peaks to itself instead of to means."""
         parts, mean_at, u_at = self.parts, self.first_mean, self.first_surface
-        peaks, count = len(self.peaks), len(self.kinds)
+        count = len(self.kinds)
         usable = np.bincount(self.surface[self.exact[:, c]], minlength=count) >= 4
         known = self.kind == Kind.CARD
-        rows = np.flatnonzero((self.exact[:, c] & (usable[self.surface] | known)) | (self.bound[:, c] & usable[self.surface]) | (self.bound[:, c] & known))
+        rows = np.flatnonzero(
+            (self.exact[:, c] & (usable[self.surface] | known))
+            | (self.bound[:, c] & usable[self.surface])
+            | (self.bound[:, c] & known)
+        )
         light, surface, kind = self.light[rows, c], self.surface[rows], self.kind[rows]
         exact = self.exact[rows, c]
         matrix = np.zeros((len(rows), len(z)))
@@ -500,7 +545,7 @@ class _Problem:
             prior[row, u_at + a], prior[row, u_at + b] = 1.0, -1.0
 
         one_sided = ~exact
-        sigma, shared = _NOISE[kind], _SHARED[kind]
+        sigma, shared = np.hypot(_NOISE[kind], MIRROR_TRUST * self.mirrored_share[rows]), _SHARED[kind]
         deviation = np.ones(len(prior))
         hessian = np.zeros((len(z), len(z)))
         weights = np.zeros(len(rows))
@@ -519,7 +564,7 @@ class _Problem:
             for row, (a, b) in enumerate(self.ties, start=len(own)):
                 deviation[row] = TIE * 0.5 * (u[a] + u[b])
             scaled = prior / deviation[:, None]
-            hessian = scaled.T @ scaled
+            hessian = small_product(scaled, scaled)
             gradient = scaled.T @ (prior_target / deviation)
             # Log-normal prior of 1 / reflectance, about the last estimate.
             hessian[diagonal, diagonal] += 1.0 / (u * spread_u) ** 2
@@ -528,7 +573,7 @@ class _Problem:
             weights = 1.0 / (1.0 + 0.25 * relative**2) / ((u[surface] * sigma) ** 2 * shared)
             weights[one_sided & (relative > 0.0)] = 0.0
             weighted = weights[:, None] * matrix
-            hessian += matrix.T @ weighted
+            hessian += small_product(matrix, weighted)
             gradient += weighted.T @ target
             z = solve_nonnegative(hessian, gradient, z)
         u = np.maximum(z[u_at:], 1e-3)
@@ -549,13 +594,13 @@ class _Problem:
         overlap = fit.matrix[:, free].T @ weighted
         own = (added * weighted).sum(axis=0)
         own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
-        return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0))
+        return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0), np.float64)
 
     def power_columns(self, peaks: Sequence[_Peak]) -> Array:
         """Irradiance per unit power of peaks, (points, q)."""
         cells = np.array([peak.cell for peak in peaks])
         distances = np.array([peak.distance for peak in peaks])
-        columns = self.transfer[:, cells] / self.solid_angle[cells]
+        columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
         near = np.isfinite(distances)
         if self._trace is not None and near.any():
             at = self._center + distances[near, None] * self.direction[cells[near]]
@@ -568,7 +613,7 @@ class _Problem:
         near = (self.direction @ self.direction[cell] > np.cos(PEAK_ANGLE)) & self.may_hold_peak
         near[cell] = True
         total = self.solid_angle[near] @ self.lacking[near]
-        return near[:, None] / np.maximum(total, 1e-6)
+        return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
     def push(self, peak: _Peak) -> None:
         """Add a peak to the unknowns."""
@@ -603,7 +648,9 @@ class _Problem:
             peak = candidates[place]
             if gain[place] < 0.5 * EVIDENCE or len(seen) == 5:
                 break
-            if any(peak.distance == s.distance and self.direction[peak.cell] @ self.direction[s.cell] > 0.95 for s in seen):
+            if any(
+                peak.distance == s.distance and self.direction[peak.cell] @ self.direction[s.cell] > 0.95 for s in seen
+            ):
                 continue
             seen.append(peak)
             cost = self.tried(peak, fit.z, c, 4).cost
@@ -673,17 +720,23 @@ class Recovery:
         self._frames = 0
 
     def update(
-        self, cells: NDArray[Any], transfer: NDArray[Any], observations: NDArray[Any], trace: Trace | None = None
+        self,
+        cells: NDArray[Any],
+        transfer: NDArray[Any],
+        mirrored: NDArray[Any],
+        observations: NDArray[Any],
+        trace: Trace | None = None,
     ) -> Estimate:
         """Estimate from one frame.
 
         Args:
             cells: Records of ``kernels.recover.Cell``, (rows, columns).
-            transfer: From ``trace_transfer``, (n, rows * columns).
+            transfer: From ``trace_transfer``, straight, (n, rows * columns).
+            mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
             trace: Traces lamps at finite distances; None: all light is distant.
         """
-        problem = _Problem(cells, transfer, observations, self.surfaces, self._white, trace, self._center)
+        problem = _Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, self._center)
         means, bounds = problem.card_means()
         if self.rung == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
             excess = problem.member @ (problem.expected[problem.component][:, None] * means)
@@ -694,9 +747,9 @@ class Recovery:
         for peak in self._peaks:
             if problem.may_hold_peak[peak.cell]:
                 problem.push(peak)
-        if self._frames == 0:
-            problem.find_peaks(best, problem.start(means[best]), PEAKS)
-        self._peaks = list(problem.peaks)
+        if self._frames % SEARCH_EVERY == 0:
+            most = PEAKS if self._frames == 0 else 1
+            problem.find_peaks(best, problem.start(means[best]), min(most, PEAKS - len(problem.peaks)))
         self._frames += 1
 
         bright = problem.first_mean
@@ -713,9 +766,12 @@ class Recovery:
             solution = np.stack(
                 [problem.fit(c, first[c], WARM_ITERATIONS, centre=shared * total[c]).z[:bright] for c in range(3)], -1
             )
+        # A lamp that gives nothing in any channel has gone out, or never was.
+        powers = solution[problem.parts :]
+        self._peaks = [peak for peak, power in zip(problem.peaks, powers, strict=True) if power.any()]
         excess = problem.member @ solution[: problem.parts]
         lamps = []
-        for peak, power in zip(problem.peaks, solution[problem.parts :], strict=True):
+        for peak, power in zip(problem.peaks, powers, strict=True):
             excess += problem.patch(peak.cell) * power
             lamps.append(Lamp(problem.direction[peak.cell], peak.distance, power))
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))

@@ -63,6 +63,11 @@ class RunLog:
         """Frames in which ``stage`` was skipped because nothing that it reads had changed."""
         return self._skipped.get(stage, 0)
 
+    def _recovered(self) -> Any:
+        """What the light's last estimate rests on; None where the plan has none."""
+        status = self._pipeline.arrays.get("recover_status")
+        return None if status is None else status()
+
     def report(self) -> dict[str, Any]:
         """The run as plain data, ready for JSON."""
         plan = self._pipeline.plan
@@ -73,6 +78,7 @@ class RunLog:
             "fps": round(self.fps, 3),
             "frames": self._frames,
             "stages_run": stage_names(plan),
+            "recovered": self._recovered(),
             "stages_left_out": [{"stage": stage, "reason": reason} for stage, reason in left_out(plan)],
         }
 

@@ -11,6 +11,7 @@ import warp as wp
 from warp_ar import recovery
 from warp_ar.kernels import environment
 from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.structs import RoomLamp
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.unwrap import NO_PROBE
@@ -21,13 +22,13 @@ MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
 class Recover(Stage):
     """Estimates what clipped texels lack from surfaces that the same light falls on.
 
-    It comes after filling, not before: what the surfaces receive depends on the whole room, the part behind the ball included, and a lamp's
-    recovered energy must not be spread into the unseen by filling.
+    It comes after filling, not before: what the surfaces receive depends on the whole room, the part behind the ball
+    included, and a lamp's recovered energy must not be spread into the unseen by filling.
     """
 
     name: ClassVar[str] = "recover"
     rungs: ClassVar[tuple[str, ...]] = recovery.RUNGS
-    summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by the white card and what else it falls on"
+    summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
@@ -37,7 +38,8 @@ class Recover(Stage):
         if not recovers(request):
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
-            ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"), ("environment",)
+            ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
+            ("environment", "lamps"),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -49,11 +51,13 @@ class Recover(Stage):
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
+            "lamps": ArraySpec((recovery.PEAKS,), RoomLamp),
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
             "recover_observations": ArraySpec((points,), kernels.Observation),
             "recover_transfer": ArraySpec((points, cells[0] * cells[1]), wp.float32),
+            "recover_mirrored": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_lamps": ArraySpec((MOST_LAMPS,), wp.vec4),
             "recover_lamp_transfer": ArraySpec((points, MOST_LAMPS), wp.float32),
             "recover_published": ArraySpec(shape, wp.vec3),
@@ -71,6 +75,7 @@ class Recover(Stage):
         cells = arrays["recover_cells"]
         points = len(self._surfaces.points)
         self.estimate: recovery.Estimate | None = None
+        arrays.add("recover_status", self.status)
 
         def condense(rows: Rows | None) -> None:
             kernels.condense_cells(
@@ -105,6 +110,7 @@ class Recover(Stage):
                 arrays["probes"],
                 arrays["ray_scene"],
                 arrays["recover_transfer"],
+                arrays["recover_mirrored"],
                 proxies=proxies,
                 rows=rows,
             )
@@ -126,9 +132,18 @@ class Recover(Stage):
 
         def solve(rows: Rows | None) -> None:
             self.estimate = solver.update(
-                cells.numpy(), arrays["recover_transfer"].numpy(), arrays["recover_observations"].numpy(), trace
+                cells.numpy(),
+                arrays["recover_transfer"].numpy(),
+                arrays["recover_mirrored"].numpy(),
+                arrays["recover_observations"].numpy(),
+                trace,
             )
             arrays["recover_excess"].assign(self.estimate.excess)
+
+            records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
+            for record, lamp in zip(records, self.estimate.lamps, strict=False):
+                record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
+            arrays["lamps"].assign(records)
 
         def add(rows: Rows | None) -> None:
             kernels.add_excess(
@@ -156,7 +171,7 @@ class Recover(Stage):
 
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``."""
-        if not self._on_cpu:
+        if not self._on_cpu or name == "lamps":
             return True
         if not self._arrays["recover_difference"].numpy().max() > 1.0:
             return False
