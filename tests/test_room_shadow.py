@@ -411,17 +411,17 @@ def test_filter_weights_every_set_alike(device):
 
 
 def test_spread_is_a_ramp(device):
-    # Cells hold the column of the pixel that they were estimated at: between them a ramp has no steps and no shift.
+    # Cells hold the row and column of the pixel that they were estimated at: between them a ramp has no step, no shift.
     for stride in (1, 2, 3):
         cells = (9, 12)
-        columns = np.arange(cells[1]) * stride + stride // 2
-        values = np.repeat(np.broadcast_to(columns, cells)[..., None], 3, -1).astype(np.float32)
         size = (cells[0] * stride, cells[1] * stride)
+        axes = [np.arange(n) * stride + stride // 2 for n in cells]
+        values = np.stack([*np.meshgrid(*axes, indexing="ij"), np.zeros(cells)], -1).astype(np.float32)
         params = records(FrameParams, {"shadow_rect": (0, size[0], 0, size[1])})
         out = wp.zeros(size, wp.vec3)
         room_shadow.spread_ratio(params, wp.array(values, dtype=wp.vec3), wp.zeros(cells, wp.int32), stride, out)
-        got = out.numpy()[..., 0]
-        np.testing.assert_allclose(got, np.clip(np.arange(size[1]), columns[0], columns[-1])[None] + 0 * got, atol=1e-5)
+        expected = [np.clip(np.arange(n), axis[0], axis[-1]) for n, axis in zip(size, axes, strict=True)]
+        np.testing.assert_allclose(out.numpy()[..., :2], np.stack(np.meshgrid(*expected, indexing="ij"), -1), atol=1e-5)
 
 
 def test_count_must_fill_chunks():

@@ -1,0 +1,209 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import object_light as reference
+from tests.test_composite import tables
+from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
+from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
+from warp_ar.graph import make_plan
+from warp_ar.kernels import object_light, reflect
+from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
+from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+from warp_ar.quality import PRESETS
+from warp_ar.scene import load_scene
+from warp_ar.stages.base import Request
+
+# Float32 sums of 64 terms, and directions that float32 puts on either side of the picture's border: at most two of 64.
+TWIN_ERROR = 0.06
+# Sampling error of one set of 64 for a cosine lobe of any direction.
+FURNACE_ERROR = 0.15
+BALL = (0.0, 0.0, 0.06)
+RADIUS = 0.05
+LEVEL_HEIGHT = 8
+
+
+def run(objects, materials, code=255, filtered=True, ratio=None, added=None, rows=None, environment=None):
+    models = tuple(sorted({m["model"] for m in materials}))
+    forms = RoomConfig(
+        TraceConfig((SPHERE,), (DESK["kind"],)),
+        models,
+        False,
+        "sh" if set(models) - {MIRROR} else "none",
+        bool(set(models) - {LAMBERT}),
+        False,
+    )
+    config = object_light.ObjectLightConfig(forms, COUNT, 4, SIDE, ratio is not None, added is not None)
+    params = records(
+        FrameParams,
+        {
+            "camera_position": CAMERA,
+            "world_from_camera": LOOK_DOWN,
+            "focal": (60, 60),
+            "principal": ((W - 1) / 2, (H - 1) / 2),
+            "object_rect": (0, H, 0, W),
+            "light_rect": (0, H, 0, W),
+        },
+    )
+    scene = RayScene()
+    scene.objects = records(Shape, *[{**thing, "material": k} for k, thing in enumerate(objects)])
+    scene.proxies = records(Shape, DESK)
+    scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **m} for m in materials])
+    room = Room()
+    environment = sky() if environment is None else environment
+    room.environment = wp.array(environment, dtype=wp.vec3)
+    coefficients = np.zeros((9, 3), np.float32)
+    coefficients[0] = np.pi / 0.28209479
+    room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
+    room.level_height = LEVEL_HEIGHT
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
+    trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
+    drawn = draw(environment)
+    frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
+    irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
+    layers = [None if layer is None else wp.array(layer, dtype=wp.vec3) for layer in (ratio, added)]
+    object_light.light_objects(
+        config,
+        params,
+        rays,
+        frame,
+        tables()[0],
+        *layers,
+        scene,
+        room,
+        drawn[2],
+        hit_object,
+        hits,
+        irradiance,
+        mirrored,
+        rows=rows,
+    )
+    if filtered:
+        raw = irradiance, mirrored
+        irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
+        object_light.filter_object_light(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
+    return irradiance.numpy(), mirrored.numpy(), hit_object.numpy(), hits.numpy(), drawn
+
+
+CHALK = {"model": LAMBERT, "base_color": (1, 1, 1)}
+CHROME = {"model": MIRROR, "base_color": (1, 1, 1)}
+
+
+def test_white_furnace(device):
+    irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK])
+    inside = irradiance[found >= 0]
+    assert len(inside) > 50
+    np.testing.assert_allclose(inside.mean(0), np.pi, rtol=0.02)
+    np.testing.assert_allclose(inside, np.pi, rtol=FURNACE_ERROR)
+
+
+@pytest.mark.parametrize("code", [0, 255])
+def test_matches_the_twin(device, code):
+    irradiance, _, found, hits, drawn = run([sphere(BALL, RADIUS)], [CHALK], code=code, filtered=False)
+    directions, flux = drawn[0].numpy().astype(np.float64), drawn[1].numpy()[:, 0].astype(np.float64)
+    reach_x, reach_y = CAMERA[2] * RAYS[..., 0].max(), CAMERA[2] * RAYS[..., 1].max()
+
+    def seen(x, y):
+        return (np.abs(x) < reach_x) & (np.abs(y) < reach_y)
+
+    checked = 0
+    for row, column in np.argwhere(found >= 0)[::7]:
+        first = ((row % SIDE) * SIDE + column % SIDE) * COUNT
+        part = slice(first, first + COUNT)
+        hit = hits[row, column]
+        expected = reference.irradiance_over_plane(
+            hit["point"], hit["normal"], directions[part], SIDE * SIDE * flux[part], seen, code / 255
+        )
+        assert irradiance[row, column, 0] == pytest.approx(expected, abs=TWIN_ERROR * np.pi)
+        checked += 1
+    assert checked > 10
+
+
+def test_dark_desk_darkens_the_flanks_not_the_top(device):
+    irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0)
+    up = hits["normal"][..., 2]
+    assert irradiance[(found >= 0) & (up > 0.97)].mean() > 0.95 * np.pi
+    flank = irradiance[(found >= 0) & (up < 0.4)]
+    assert len(flank) > 5
+    assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
+
+
+def test_mirror_shows_the_picture_of_the_desk(device):
+    # A mirror ball next to a chalk ball: rays that go down see the desk, others the room (share 0) or the other ball.
+    things = [sphere(BALL, RADIUS), sphere((0.14, 0.0, 0.06), RADIUS)]
+    ratio = np.full((H, W, 3), 0.5, np.float32)
+    added = np.full((H, W, 3), 0.25, np.float32)
+    _, plain, found, hits, _ = run(things, [CHROME, CHALK])
+    _, layered, _, _, _ = run(things, [CHROME, CHALK], ratio=ratio, added=added)
+    ball = found == 0
+    share = plain[..., 3]
+    assert set(np.unique(share[ball])) == {0.0, 1.0}
+    np.testing.assert_allclose(plain[ball & (share == 1), :3], 1, atol=1e-5)
+    changed = ball & (share == 1) & (np.abs(layered[..., 0] - 1) > 1e-6)
+    np.testing.assert_allclose(layered[changed, :3], 0.75, atol=1e-5)
+    # Reflected straight up from the top; to the desk beyond 45 degrees of tilt.
+    up = hits["normal"][..., 2]
+    assert (share[ball & (up > 0.95)] == 0).all()
+    assert changed.sum() > 5
+    # What stays 1 in spite of the layers is the chalk ball, unoccluded under a sky of 1.
+    chalk = ball & (share == 1) & ~changed
+    assert chalk.sum() >= 1
+    assert POINTS[chalk][:, 0].mean() > 0
+
+
+def test_glossy_share_is_between(device):
+    glossy = {"model": PHONG, "base_color": (0, 0, 0), "specular": (1, 1, 1), "shininess": 20.0}
+    _, mirrored, found, hits, _ = run([sphere(BALL, RADIUS)], [glossy])
+    share = mirrored[..., 3]
+    assert share.min() >= 0
+    assert share.max() <= 1 + 1e-6
+    ring = (found >= 0) & (np.abs(hits["normal"][..., 2] - np.cos(np.pi / 4)) < 0.1)
+    assert 0.1 < share[ring].mean() < 0.9
+    np.testing.assert_allclose(mirrored[found >= 0][:, :3], share[found >= 0][:, None].repeat(3, 1), atol=1e-5)
+
+
+def test_garbage_in_the_room_stays_finite(device):
+    environment = sky()
+    environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
+    irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
+    assert np.isfinite(irradiance).all()
+    assert (irradiance >= 0).all()
+
+
+def test_bands_agree_with_the_whole(device):
+    whole = run([sphere(BALL, RADIUS)], [CHALK], filtered=False)[0]
+    part = run([sphere(BALL, RADIUS)], [CHALK], filtered=False, rows=(5, 25))[0]
+    np.testing.assert_array_equal(part[5:25], whole[5:25])
+    assert not part[25:].any()
+
+
+def test_nearest_pixel_of_an_object(device):
+    found = wp.array(np.array([[-1, 3, -1], [-1, -1, -1], [-1, 5, 5]], np.int32), dtype=wp.int32)
+    out = wp.zeros(4, wp.vec2i)
+    wp.launch(_nearest_kernel, dim=1, inputs=[found], outputs=[out])
+    assert out.numpy().tolist() == [[0, 1], [2, 1], [-1, -1], [2, 2]]
+
+
+@wp.kernel(enable_backward=False)
+def _nearest_kernel(found: wp.array2d[wp.int32], out: wp.array[wp.vec2i]):
+    out[0] = reflect.nearest_of_object(found, 1, 1, 3)
+    out[1] = reflect.nearest_of_object(found, 1, 1, 5)
+    out[2] = reflect.nearest_of_object(found, 1, 1, 7)
+    out[3] = reflect.nearest_of_object(found, 2, 2, 5)
+
+
+def test_stage_follows_the_rung_of_shade():
+    scene = load_scene("mirror")
+    for rung, expected in (("environment", False), ("one_bounce", True)):
+        quality = PRESETS["medium"].with_rungs(shade=rung)
+        plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
+        assert ("object_light" in {stage.name for stage, _ in plan.stages}) == expected
+    bare = dataclasses.replace(scene, objects=())
+    plan = make_plan(Request(bare, quality, (scene.camera.width, scene.camera.height)))
+    assert "no virtual object" in dict(plan.left_out)["object_light"]
