@@ -55,7 +55,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle, wrap_texel
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
 from warp_ar.kernels.structs import FrameParams, KeyLight
 
 wp.set_module_options({"enable_backward": False})
@@ -913,11 +913,11 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
         outputs=[cells_out],
         device=device,
     )
-    wp.launch_tiled(
+    launch_tiles(
         find_key_lights_kernel,
-        dim=[1],
-        inputs=[environment, sums_out],
-        outputs=[cells_out, key_lights_out],
+        [1],
+        [environment, sums_out],
+        [cells_out, key_lights_out],
         block_dim=KEY_BLOCK,
         device=device,
     )

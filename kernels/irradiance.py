@@ -64,7 +64,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
 from warp_ar.kernels.pyramid import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -476,19 +476,19 @@ def project_irradiance_sh(
         row_sums_out: (H, 2 order + 1) scratch.
         irradiance_sh_out: ((order + 1)^2,).
     """
-    wp.launch_tiled(
+    launch_tiles(
         sum_columns_kernel,
-        dim=row_sums_out.shape,
-        inputs=[environment, tables.columns],
-        outputs=[row_sums_out],
+        row_sums_out.shape,
+        [environment, tables.columns],
+        [row_sums_out],
         block_dim=BLOCK,
         device=environment.device,
     )
-    wp.launch_tiled(
+    launch_tiles(
         sum_rows_kernel,
-        dim=irradiance_sh_out.shape,
-        inputs=[row_sums_out, tables.rows, tables.fourier],
-        outputs=[irradiance_sh_out],
+        irradiance_sh_out.shape,
+        [row_sums_out, tables.rows, tables.fourier],
+        [irradiance_sh_out],
         block_dim=BLOCK,
         device=environment.device,
     )
@@ -553,11 +553,11 @@ def sum_clusters(
     """
     start, stop = rows if rows is not None else (0, irradiance_map_out.shape[0])
     if stop > start:
-        wp.launch_tiled(
+        launch_tiles(
             sum_clusters_kernel,
-            dim=(stop - start, irradiance_map_out.shape[1]),
-            inputs=[start, clusters],
-            outputs=[irradiance_map_out],
+            (stop - start, irradiance_map_out.shape[1]),
+            [start, clusters],
+            [irradiance_map_out],
             block_dim=BLOCK,
             device=clusters.device,
         )

@@ -7,6 +7,8 @@ its first thread index.
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -38,3 +40,31 @@ def launch_rows(
     start, stop = rows if rows is not None else (0, shape[0])
     if stop > start:
         wp.launch(kernel, dim=(stop - start, *shape[1:]), inputs=[start, *inputs], outputs=outputs, device=device)
+
+
+# Warp's CPU tiles take their memory from one arena per module, which nothing guards: two threads in one tile kernel
+# overrun it (seen with 1.19: an assertion in tile.h, or a crash).
+_CPU_TILES = threading.Lock()
+
+
+def launch_tiles(
+    kernel: wp.Kernel,
+    dim: Sequence[int],
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    *,
+    block_dim: int,
+    device: wp.DeviceLike,
+) -> None:
+    """Launch a kernel whose blocks work together, one block per element of ``dim``; on CPU never two at a time.
+
+    Args:
+        kernel: Kernel that uses tiles.
+        dim: Blocks along each axis.
+        inputs: Arguments before the outputs.
+        outputs: Arrays that the kernel writes.
+        block_dim: Threads per block on CUDA; on CPU a block is one thread.
+        device: Where the arrays live.
+    """
+    with _CPU_TILES if wp.get_device(device).is_cpu else contextlib.nullcontext():
+        wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, device=device)

@@ -64,7 +64,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels.latlong import latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
 from warp_ar.kernels.pyramid import level_count, safe_radiance, sample_packed, sample_packed_smooth
 from warp_ar.kernels.sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
 
@@ -685,19 +685,19 @@ def measure_energy(
         row_energy_out: (lobe_rows(height),) scratch.
         energy_out: (lobe_count(height),).
     """
-    wp.launch_tiled(
+    launch_tiles(
         sum_level_rows_kernel,
-        dim=row_energy_out.shape,
-        inputs=[levels, height],
-        outputs=[row_energy_out],
+        row_energy_out.shape,
+        [levels, height],
+        [row_energy_out],
         block_dim=BLOCK,
         device=levels.device,
     )
-    wp.launch_tiled(
+    launch_tiles(
         sum_levels_kernel,
-        dim=energy_out.shape,
-        inputs=[row_energy_out, height],
-        outputs=[energy_out],
+        energy_out.shape,
+        [row_energy_out, height],
+        [energy_out],
         block_dim=BLOCK,
         device=levels.device,
     )

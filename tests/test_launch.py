@@ -1,0 +1,46 @@
+"""Launching: bands of rows, and blocks that work together from several threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_ar.kernels import irradiance
+from warp_ar.kernels.launch import launch_rows
+
+ROWS = 13
+
+
+@wp.kernel(enable_backward=False)
+def count_rows_kernel(row_start: wp.int32, amount: wp.int32, counts_out: wp.array2d[wp.int32]):
+    band_row, column = wp.tid()
+    counts_out[row_start + band_row, column] += amount
+
+
+@pytest.mark.parametrize("edges", [(0, ROWS), (0, 5, ROWS), (0, 0, 1, 12, ROWS)])
+def test_bands_touch_each_row_once(device: str, edges: tuple[int, ...]) -> None:
+    counts = wp.zeros((ROWS, 3), dtype=wp.int32, device=device)
+    for band in zip(edges[:-1], edges[1:], strict=True):
+        launch_rows(count_rows_kernel, counts.shape, [2], [counts], rows=band, device=device)
+    np.testing.assert_array_equal(counts.numpy(), 2)
+    launch_rows(count_rows_kernel, counts.shape, [1], [counts], rows=None, device=device)
+    np.testing.assert_array_equal(counts.numpy(), 3)
+
+
+def test_tiles_from_several_threads() -> None:
+    """Warp's CPU tiles share one unguarded arena: without the lock this crashes the process within a few dozen rounds."""
+    environment = wp.array(np.random.default_rng(1).random((16, 32, 3), np.float32), dtype=wp.vec3, device="cpu")
+    clusters = wp.zeros(8 * 16, dtype=irradiance.Cluster, device="cpu")
+    irradiance.gather_clusters(environment, (8, 16), clusters)
+    expected, actual = (wp.zeros((64, 64), dtype=wp.vec3, device="cpu") for _ in range(2))
+    irradiance.sum_clusters(clusters, expected)
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(100):
+            actual.zero_()
+            list(
+                pool.map(lambda band: irradiance.sum_clusters(clusters, actual, rows=(band, band + 16)), range(0, 64, 16))
+            )
+            np.testing.assert_array_equal(actual.numpy(), expected.numpy())
