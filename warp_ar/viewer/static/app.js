@@ -20,6 +20,7 @@ const quality = new QualityPanel(connection, time);
 let state = {};
 let scene = null;
 let camera = null;
+let pose = null;
 
 // ------------------------------------------------------------------------------------------------------------- messages
 
@@ -96,7 +97,7 @@ connection.addEventListener("lost", ({ detail }) => {
 view.addEventListener("shown", ({ detail: frame }) => {
   $("veil").hidden = true;
   camera = cameraOf(frame.camera);
-  const pose = poseOf(frame.pose);
+  pose = poseOf(frame.pose);
   handles.frame(camera, pose);
   light.pose = pose;
   light.draw();
@@ -235,4 +236,4 @@ document.addEventListener("keydown", (event) => {
 
 connection.open();
 // What the tests read.
-window.warpAr = { view, handles, connection, get scene() { return scene; }, get state() { return state; }, get camera() { return camera; } };
+window.warpAr = { view, handles, connection, get scene() { return scene; }, get state() { return state; }, get camera() { return camera; }, get pose() { return pose; } };

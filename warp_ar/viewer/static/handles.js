@@ -78,6 +78,14 @@ export class Handles extends EventTarget {
   #rebuild() {
     this.#svg.replaceChildren();
     this.#items = [];
+    // Lights last: a lamp or its target over an object's ring is the smaller thing to hit.
+    this.#scene.objects.forEach((object, index) => {
+      const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
+      item.halo = make("path", { class: "halo" }, item.group);
+      item.ring = this.#part(item, "at", make("path", { class: "ring" }, item.group));
+      item.knob = make("circle", { class: "knob", r: 6 }, item.group);
+      item.knobHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
+    });
     this.#scene.lights.forEach((light, index) => {
       const item = this.#group("light", index, `${light.kind} light ${index + 1}`);
       item.stem = make("line", { class: "stem" }, item.group);
@@ -89,13 +97,6 @@ export class Handles extends EventTarget {
       }
       item.lamp = make("circle", { class: "lamp", r: 10 }, item.group);
       item.hit = this.#part(item, "at", make("circle", { class: "hit", r: 24 }, item.group));
-    });
-    this.#scene.objects.forEach((object, index) => {
-      const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
-      item.halo = make("path", { class: "halo" }, item.group);
-      item.ring = this.#part(item, "at", make("path", { class: "ring" }, item.group));
-      item.knob = make("circle", { class: "knob", r: 6 }, item.group);
-      item.knobHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
     });
   }
 

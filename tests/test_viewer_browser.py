@@ -1,0 +1,354 @@
+"""The live page in a real browser: what it shows, what dragging and switching do, and a fake camera from end to end.
+
+Screenshots are kept in the folder that WARP_AR_ARTEFACTS names, else in pytest's own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
+from warp_ar.sources import open_source
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
+
+PATIENCE = 90.0  # seconds that anything may take on a busy machine
+FRAMES = 48
+BITS, CELL = 8, 12  # the time code: squares along the picture's bottom edge, black or white
+# Half way between black and white, which JPEG moves by a few levels.
+THRESHOLD = 128
+# A drawn picture against the same place after an edit: what an 8-bit picture changes by when nothing has, JPEG included.
+UNCHANGED = 6.0
+
+
+def mark(image: np.ndarray, index: int) -> np.ndarray:
+    """The picture with its number as a time code."""
+    image = image.copy()
+    for bit in range(BITS):
+        image[-CELL:, bit * CELL : (bit + 1) * CELL] = 255 * (index >> bit & 1)
+    return image
+
+
+CODE = f"""() => {{
+  const canvas = document.getElementById("canvas");
+  const row = canvas.height - {CELL // 2};
+  const data = canvas.getContext("2d").getImageData(0, row, {BITS * CELL}, 1).data;
+  let code = 0;
+  for (let bit = 0; bit < {BITS}; bit++) if (data[4 * (bit * {CELL} + {CELL // 2})] > {THRESHOLD}) code |= 1 << bit;
+  return {{ code, id: warpAr.view.stats.id }};
+}}"""
+PIXELS = """([x, y, w, h]) => {
+  const canvas = document.getElementById("canvas");
+  return [...canvas.getContext("2d").getImageData(x, y, w, h).data];
+}"""
+
+
+@pytest.fixture(scope="module")
+def clip() -> list[np.ndarray]:
+    with open_source(load_scene("desk").source.path) as source:  # type: ignore[union-attr, arg-type]
+        return [mark(frame.image, frame.index) for frame, _ in zip(source, range(FRAMES), strict=False)]
+
+
+@pytest.fixture(scope="module")
+def scene_file(clip: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bundled desk with time-coded frames."""
+    folder = tmp_path_factory.mktemp("desk")
+    (folder / "frames").mkdir()
+    for index, image in enumerate(clip):
+        cv2.imwrite(str(folder / "frames" / f"{index:04d}.png"), image[..., ::-1])
+    scene: Scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(path=folder / "frames", fps=24.0))
+    (folder / "scene.toml").write_text(dumps_scene(scene))
+    return folder / "scene.toml"
+
+
+@pytest.fixture(scope="module")
+def camera_file(clip: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What Chromium's fake camera plays: JPEGs one after another."""
+    path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    with path.open("wb") as file:
+        for image in clip:
+            file.write(cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+    return path
+
+
+@pytest.fixture
+def url(scene_file: Path) -> Iterator[str]:
+    """The page of a server of its own."""
+    command = [sys.executable, "-m", "warp_ar.live", str(scene_file), "--device", "cpu", "--quality", "low"]
+    options = ["--port", "0", "--no-browser"]
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"http://\S+", line)
+        assert found, (line, process.poll())
+        yield found[0]
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130, errors
+    assert errors == ""
+
+
+@pytest.fixture(scope="module")
+def browser(camera_file: Path) -> Iterator[Any]:
+    fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+    arguments = ["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={camera_file}"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path_factory.mktemp("screenshots"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+class Tab:
+    """A page, and the errors that it reports."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.errors: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+
+    def until(self, expression: str, what: str = "") -> Any:
+        """Wait until an expression of JavaScript holds; returns it. The page's policy forbids doing that inside."""
+        deadline = time.monotonic() + PATIENCE
+        while not (value := self.page.evaluate(expression)):
+            assert time.monotonic() < deadline, f"{what or expression} in vain; errors: {self.errors}"
+            self.page.wait_for_timeout(50)
+        return value
+
+    def shown(self, more: int = 3) -> None:
+        """Wait until so many further frames are on the screen."""
+        count = self.page.evaluate("warpAr.view.stats.shown")
+        self.until(f"warpAr.view.stats.shown >= {count + more}")
+
+    def hold(self) -> None:
+        self.page.click("#play")
+        self.until("warpAr.state.playing === false")
+        self.shown(3)
+
+    def pixels(self, x: float, y: float, size: int = 24) -> np.ndarray:
+        """RGB around a pixel of the picture."""
+        box = [round(x) - size // 2, round(y) - size // 2, size, size]
+        return np.array(self.page.evaluate(PIXELS, box)).reshape(size, size, 4)[..., :3].astype(float)
+
+    def on_screen(self, selector: str) -> tuple[float, float]:
+        """Middle of an element on the screen."""
+        box = self.page.locator(selector).first.bounding_box()
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+@pytest.fixture
+def open_tab(browser: Any, url: str) -> Iterator[Callable[..., Tab]]:
+    with contextlib.ExitStack() as stack:
+        tabs = []
+
+        def make(**options: Any) -> Tab:
+            size = {"viewport": {"width": 1360, "height": 860}}
+            context = browser.new_context(**{**size, **options}, permissions=["camera"])
+            stack.callback(context.close)
+            tab = Tab(context.new_page())
+            tabs.append(tab)
+            tab.page.goto(url)
+            tab.until("!!window.warpAr && warpAr.view.stats.shown > 5 && !!warpAr.scene", "the first frames")
+            return tab
+
+        yield make
+        for tab in tabs:
+            assert tab.errors == []
+
+
+def test_the_picture_is_the_frame_that_its_header_says(open_tab: Callable[..., Tab]) -> None:
+    tab = open_tab()
+    for _ in range(10):
+        seen = tab.page.evaluate(CODE)
+        # Frames before the first viewer are none: the first frame has id 1 and code 0.
+        assert seen["code"] == (seen["id"] - 1) % FRAMES
+        tab.shown(1)
+    stats = tab.page.evaluate("warpAr.view.stats")
+    assert stats["fps"] > 0
+    assert stats["latency"] > 0
+
+
+def test_dragging_switching_and_the_dial(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    tab = open_tab()
+    page = tab.page
+    page.screenshot(path=artefacts / "scene.png")
+    tab.hold()
+
+    # The teapot goes where its ring is dragged.
+    at = page.evaluate("warpAr.scene.objects[0].at")
+    place = page.evaluate(
+        "import('/static/geometry.js').then(g => g.project(warpAr.camera, warpAr.pose, [0.15, 0.055, 0.03]))"
+    )
+    with_teapot = tab.pixels(*place[:2])
+    ring = page.locator('[data-key="object 0"] .ring')
+    box = ring.bounding_box()
+    start = (box["x"] + 0.2 * box["width"], box["y"] + box["height"] / 2)
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(start[0] - 60, start[1] + 40, steps=4)
+    page.mouse.move(start[0] - 220, start[1] + 90, steps=4)
+    page.mouse.up()
+    moved = page.evaluate("warpAr.scene.objects[0].at")
+    assert np.hypot(moved[0] - at[0], moved[1] - at[1]) > 0.03
+    tab.until(f"JSON.stringify(warpAr.scene.objects[0].at) === '{_json(moved)}'")
+    tab.shown(4)
+    assert np.abs(tab.pixels(*place[:2]) - with_teapot).mean() > UNCHANGED, "the teapot is still where it was"
+    page.screenshot(path=artefacts / "dragged.png")
+
+    # The lamp: dragged by its foot, raised by the wheel and by a key.
+    before = page.evaluate("warpAr.scene.lights[0].at")
+    foot = tab.on_screen('[data-key="light 0"] .ring')
+    page.mouse.move(*foot)
+    page.mouse.down()
+    page.mouse.move(foot[0] + 90, foot[1] + 20, steps=5)
+    page.mouse.up()
+    dragged = page.evaluate("warpAr.scene.lights[0].at")
+    assert np.hypot(dragged[0] - before[0], dragged[1] - before[1]) > 0.02
+    assert dragged[2] == before[2]
+    page.mouse.wheel(0, 240)
+    tab.until(f"warpAr.scene.lights[0].at[2] < {before[2]} - 0.01")
+    low = page.evaluate("warpAr.scene.lights[0].at[2]")
+    page.focus('[data-key="light 0"]')
+    page.keyboard.press("PageUp")
+    tab.until(f"warpAr.scene.lights[0].at[2] > {low}")
+
+    # Without virtual things the picture is the camera's.
+    lit = tab.pixels(320, 240, 200)
+    for name in ("objects", "lights"):
+        page.click(f"#effect-{name}")
+        tab.until(f"warpAr.scene.effects.{name} === false")
+    page.click("#compare")  # opened by hand, chosen below
+    page.select_option("#compare", "camera")
+    tab.until("warpAr.state.compare === 'camera' && !warpAr.state.building")
+    tab.shown(4)
+    page.evaluate("document.getElementById('split').value = 1000")
+    page.locator("#split").dispatch_event("input")
+    bare = tab.pixels(320, 240, 200)
+    page.evaluate("document.getElementById('split').value = 0")
+    page.locator("#split").dispatch_event("input")
+    camera = tab.pixels(320, 240, 200)
+    assert np.abs(bare - camera).mean() < 0.5, "what is left is not the camera's picture"
+    assert np.abs(lit - camera).mean() > UNCHANGED
+    for name in ("objects", "lights"):
+        page.click(f"#effect-{name}")
+    page.select_option("#compare", "")
+    tab.until("warpAr.state.compare === '' && !warpAr.state.building")
+    page.click("#play")
+
+    # Stages: those left out are grey and say why; a switched-off effect joins them.
+    page.click("#tab-quality")
+    tab.until("document.querySelectorAll('#stages li.out').length > 0")
+    expose = page.locator('#stages li[data-stage="expose"]')
+    assert "out" in (expose.get_attribute("class") or "")
+    assert "exposure is 1" in (expose.get_attribute("title") or "")
+    tab.until("parseFloat(document.querySelector('#stages li[data-stage=shade] b').style.width) > 0")
+    page.screenshot(path=artefacts / "time.png")
+
+    # A dial that leaves much room climbs; one that leaves none goes back down.
+    set_dial = "v => { const r = document.getElementById('budget'); r.value = v; r.dispatchEvent(new Event('input')); }"
+    page.evaluate(set_dial, 1000)
+    tab.until("warpAr.scene.quality !== 'low'", "a better preset")
+    page.evaluate(set_dial, 0)
+    tab.until("warpAr.scene.quality === 'low'", "the cheapest preset")
+    assert "low" in page.inner_text("#budget-note")
+
+
+def test_saving(open_tab: Callable[..., Tab], tmp_path: Path) -> None:
+    tab = open_tab()
+    for name in ("frame.png", "scene.toml"):
+        with tab.page.expect_download() as download:
+            tab.page.click("#save > summary")
+            tab.page.click(f'[data-download="{name}"]')
+        download.value.save_as(tmp_path / name)
+    assert cv2.imread(str(tmp_path / "frame.png")).shape == (480, 640, 3)
+    assert load_scene(tmp_path / "scene.toml").objects == load_scene("desk").objects
+
+
+def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    tab = open_tab()
+    page = tab.page
+    page.click("#use-camera")
+    tab.until("warpAr.state.camera === true && warpAr.view.stats.stamped", "the camera's frames")
+    tab.until("document.getElementById('track-state').classList.contains('tracked')", "the marker")
+    tab.shown(10)
+    codes = set()
+    for _ in range(12):
+        codes.add(page.evaluate(CODE)["code"])
+        tab.shown(1)
+    assert len(codes) > 4, "the picture stands still"
+    assert page.evaluate("warpAr.view.stats.latency") > 0
+    # The teapot is there: where it stands, lit and camera's frame differ.
+    page.select_option("#compare", "camera")
+    tab.until("warpAr.state.compare === 'camera'")
+    tab.hold()
+    place = page.evaluate(
+        "import('/static/geometry.js').then(g => g.project(warpAr.camera, warpAr.pose, [0.15, 0.055, 0.03]))"
+    )
+    split = "v => { const s = document.getElementById('split'); s.value = v; s.dispatchEvent(new Event('input')); }"
+    page.evaluate(split, 1000)
+    lit = tab.pixels(*place[:2])
+    page.evaluate(split, 0)
+    assert np.abs(lit - tab.pixels(*place[:2])).mean() > UNCHANGED
+    page.evaluate(split, 500)
+    page.screenshot(path=artefacts / "camera.png")
+    page.click("#use-clip")
+    tab.until("warpAr.state.camera === false")
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_on_a_phone(open_tab: Callable[..., Tab], scheme: str, artefacts: Path) -> None:
+    tab = open_tab(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme=scheme)
+    page = tab.page
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390, "the page is wider than the phone"
+    for name in ("scene", "quality", "light"):
+        page.tap(f"#tab-{name}")
+        assert page.locator(f"#panel-{name}").is_visible()
+        page.wait_for_timeout(400)
+        page.screenshot(path=artefacts / f"phone_{name}_{scheme}.png")
+
+
+def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
+    tab = open_tab()
+    page = tab.page
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.dataset?.key") == "object 0":
+            break
+    else:
+        pytest.fail("Tab never reaches the teapot")
+    x, y, _ = page.evaluate("warpAr.scene.objects[0].at")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("ArrowUp")
+    tab.until(f"Math.hypot(warpAr.scene.objects[0].at[0] - {x}, warpAr.scene.objects[0].at[1] - {y}) > 0.005")
+    page.keyboard.press("]")
+    tab.until("warpAr.scene.objects[0].rotate[2] === -20")
+    page.keyboard.press(" ")
+    tab.until("warpAr.state.playing === false")
+
+
+def _json(values: list[float]) -> str:
+    return "[" + ",".join(f"{value:g}" if value != int(value) else str(int(value)) for value in values) + "]"
