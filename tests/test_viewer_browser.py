@@ -34,7 +34,7 @@ FRAMES = 48
 BITS, CELL = 8, 12  # the time code: squares along the picture's bottom edge, black or white
 # Half way between black and white, which JPEG moves by a few levels.
 THRESHOLD = 128
-# A drawn picture against the same place after an edit: what an 8-bit picture changes by when nothing has, JPEG included.
+# Levels by which a picture changes at most where nothing was edited: JPEG, and the light, which goes on settling.
 UNCHANGED = 6.0
 
 
