@@ -110,20 +110,28 @@ def directions() -> np.ndarray:
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     lengths = np.linalg.norm(vertices, axis=1, keepdims=True)
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), (vertices / np.maximum(lengths, 1e-9)).astype(np.float32))
+    return Mesh(
+        vertices.astype(np.float32), faces.astype(np.int32), (vertices / np.maximum(lengths, 1e-9)).astype(np.float32)
+    )
 
 
 def closed_sphere(subdivisions: int) -> Mesh:
     """Closed sphere of radius 1: 20 * 4^subdivisions triangles that share all vertices."""
     golden = (1 + 5**0.5) / 2
-    vertices = np.array([p for a in (-1, 1) for b in (-golden, golden) for p in ((0, a, b), (a, b, 0), (b, 0, a))]) / math.hypot(1, golden)
+    vertices = np.array(
+        [p for a in (-1, 1) for b in (-golden, golden) for p in ((0, a, b), (a, b, 0), (b, 0, a))]
+    ) / math.hypot(1, golden)
     near = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1) < 1.1
-    faces = np.array([(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]])
+    faces = np.array(
+        [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]]
+    )
     normals = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     inward = (normals * vertices[faces[:, 0]]).sum(1) < 0
     faces[inward] = faces[inward][:, ::-1]
     for _ in range(subdivisions):
-        edges, inverse = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_inverse=True)
+        edges, inverse = np.unique(
+            np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_inverse=True
+        )
         middle = vertices[edges].mean(1)
         m = len(vertices) + inverse.reshape(-1, 3)
         vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
@@ -146,12 +154,17 @@ def spoilt(mesh: Mesh, kind: str) -> Mesh:
     elif kind == "half inverted":
         faces = np.where((np.arange(len(faces)) % 2)[:, None] == 1, faces[:, ::-1], faces)
     elif kind == "duplicated":
-        faces = np.concatenate([faces, faces[:: 3, ::-1], faces[::2]])
+        faces = np.concatenate([faces, faces[::3, ::-1], faces[::2]])
     elif kind == "zero area":
         point, line = faces[:, [0, 0, 0]], faces[:, [0, 1, 1]]
         faces = np.concatenate([point, faces, line])
     elif kind == "shuffled":
-        faces = np.stack([np.roll(face, turn) for face, turn in zip(faces[rng.permutation(len(faces))], rng.integers(0, 3, len(faces)), strict=True)])
+        faces = np.stack(
+            [
+                np.roll(face, turn)
+                for face, turn in zip(faces[rng.permutation(len(faces))], rng.integers(0, 3, len(faces)), strict=True)
+            ]
+        )
     else:
         raise ValueError(f"kind: no way {kind!r} to spoil a mesh")
     return dataclasses.replace(mesh, faces=np.ascontiguousarray(faces, np.int32))
@@ -178,7 +191,13 @@ def lights() -> dict[str, dict[str, object]]:
     """Virtual lights of hard case 9 as fields of ``structs.Light``; the scene's desk is z = 0, its first object at (0.09, 0, 0.03)."""
     from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT
 
-    base = {"kind": POINT, "position": (0.05, 0.02, 0.2), "direction": (0, 0, -1), "intensity": (1, 1, 1), "inner_angle": 0.0}
+    base = {
+        "kind": POINT,
+        "position": (0.05, 0.02, 0.2),
+        "direction": (0, 0, -1),
+        "intensity": (1, 1, 1),
+        "inner_angle": 0.0,
+    }
     base |= {"outer_angle": 0.0, "attenuation": (0, 0, 1), "radius": 0.0}
     spot = {**base, "kind": SPOT}
     return {

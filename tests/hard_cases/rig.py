@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -33,7 +34,7 @@ from warp_ar.scene import (
     Scene,
 )
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Pass, Request, Stage
+from warp_ar.stages.base import Arrays, Pass, Request, Stage, Wiring
 from warp_ar.tracking import Pose, Track, TrackState
 
 SIZE = (48, 36)
@@ -77,11 +78,27 @@ def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any)
         camera=Camera(*SIZE, 50.0, 50.0, 23.5, 17.5),
         marker=Marker(size=0.08),
         probes=(Probe(at(-0.09, 0.02, 0.04), scale * 0.04),),
-        proxies=(Proxy("plane", at=at(0, 0, 0), size=metres(1.0, 1.0)), Proxy("box", at=at(0.0, 0.13, 0.03), size=metres(0.1, 0.05, 0.06))),
+        proxies=(
+            Proxy("plane", at=at(0, 0, 0), size=metres(1.0, 1.0)),
+            Proxy("box", at=at(0.0, 0.13, 0.03), size=metres(0.1, 0.05, 0.06)),
+        ),
         objects=(
-            Object("sphere", radius=scale * 0.03, at=at(0.09, 0.0, 0.03), material=PhongMaterial((0.5, 0.4, 0.3), (0.3, 0.3, 0.3), 40.0)),
-            Object("box", size=metres(0.04, 0.04, 0.04), at=at(0.0, -0.08, 0.02), rotate=(0.0, 0.0, 30.0), material=LambertMaterial((0.7, 0.7, 0.7))),
-            Object("torus", major_radius=scale * 0.03, minor_radius=scale * 0.01, at=at(0.05, 0.08, 0.02), material=rough),
+            Object(
+                "sphere",
+                radius=scale * 0.03,
+                at=at(0.09, 0.0, 0.03),
+                material=PhongMaterial((0.5, 0.4, 0.3), (0.3, 0.3, 0.3), 40.0),
+            ),
+            Object(
+                "box",
+                size=metres(0.04, 0.04, 0.04),
+                at=at(0.0, -0.08, 0.02),
+                rotate=(0.0, 0.0, 30.0),
+                material=LambertMaterial((0.7, 0.7, 0.7)),
+            ),
+            Object(
+                "torus", major_radius=scale * 0.03, minor_radius=scale * 0.01, at=at(0.05, 0.08, 0.02), material=rough
+            ),
             Object("sphere", radius=scale * 0.02, at=at(-0.02, 0.03, 0.02), material=MirrorMaterial((0.9, 0.9, 0.9))),
         ),
         lights=(
@@ -142,14 +159,25 @@ class FixedPose:
 class Rig:
     """One pipeline, and its stages one by one."""
 
-    def __init__(self, device: str, stage: str | None = None, rung: str = "default", *, bands: int = 1, pose: Pose = POSE, **changes: Any) -> None:
+    def __init__(
+        self,
+        device: str,
+        stage: str | None = None,
+        rung: str = "default",
+        *,
+        bands: int = 1,
+        pose: Pose = POSE,
+        **changes: Any,
+    ) -> None:
         request = request_for(stage, rung) if stage is not None else None
         if request is None:
             request = Request(make_scene(), make_quality(), SIZE)
         if changes:
             request = dataclasses.replace(request, scene=dataclasses.replace(request.scene, **changes))
         self.device = device
-        self.pipeline = Pipeline(request.scene, device=device, quality=request.quality, outputs=("image", "environment"), bands=bands)
+        self.pipeline = Pipeline(
+            request.scene, device=device, quality=request.quality, outputs=("image", "environment"), bands=bands
+        )
         self.tracker = FixedPose(pose)
         self.pipeline._tracker = self.tracker  # type: ignore[assignment]
         self.arrays = self.pipeline.arrays
@@ -196,6 +224,13 @@ class Rig:
         stage = stage or self.stage(name)[0]
         return {output: self.get(output) for output in stage.wiring.writes}
 
+    def set_params(self, **values: Any) -> None:
+        """Change fields of the frame's values, as the next frame would."""
+        params = self.get("params")
+        for field, value in values.items():
+            params[field] = value
+        self.arrays["params"].assign(params)
+
     def state(self) -> dict[str, np.ndarray]:
         """Copies of all arrays, to be put back with ``restore``."""
         return {name: self.get(name) for name, array in self.arrays.items() if isinstance(array, wp.array)}
@@ -215,7 +250,7 @@ def _bands(rows: int | None, bands: int) -> list[tuple[int, int] | None]:
     if rows is None or bands == 1:
         return [None]
     edges = [rows * band // bands for band in range(bands + 1)]
-    return [(start, stop) for start, stop in zip(edges, edges[1:], strict=False) if stop > start]
+    return [(start, stop) for start, stop in itertools.pairwise(edges) if stop > start]
 
 
 def numbers(values: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
@@ -242,10 +277,39 @@ def assert_same_bits(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -
     assert one.keys() == other.keys()
     for name, values in one.items():
         for (part, a), (_, b) in zip(numbers(values), numbers(other[name]), strict=True):
-            np.testing.assert_array_equal(a.view(f"u{a.itemsize}") if a.dtype.kind == "f" else a, b.view(f"u{b.itemsize}") if b.dtype.kind == "f" else b, err_msg=name + part)
+            assert a.tobytes() == b.tobytes(), f"{name}{part}: {(a != b).mean():.3%} of the values differ"
 
 
 def solid_angles(height: int, width: int) -> np.ndarray:
     """Solid angle of every texel of a row, (height, 1)."""
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return ((edges[:-1] - edges[1:]) * 2.0 * math.pi / width)[:, None]
+
+
+class LoneStage:
+    """A stage of the room's light by itself, with an environment of any height."""
+
+    def __init__(self, device: str, name: str, rung: str, height: int) -> None:
+        request = request_for(name, rung)
+        assert request is not None
+        request = dataclasses.replace(request, quality=dataclasses.replace(request.quality, environment_height=height))
+        kind = next(stage for stage in STAGES if stage.name == name)
+        wiring = kind.wire(request)
+        assert isinstance(wiring, Wiring)
+        self.stage = kind(request, wiring)
+        self.arrays = Arrays()
+        with wp.ScopedDevice(device):
+            for read in wiring.reads:
+                dtype = wp.float32 if read.endswith("confidence") else wp.vec3
+                self.arrays.add(read, wp.zeros((height, 2 * height), dtype=dtype))
+            for own, spec in self.stage.arrays().items():
+                self.arrays.add(own, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
+            self.passes = self.stage.build(self.arrays, wp.get_device(device))
+
+    def run(self, **inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """Run on the given inputs; returns copies of what the stage writes."""
+        for name, values in inputs.items():
+            self.arrays[name].assign(np.ascontiguousarray(values, np.float32))
+        for step in self.passes:
+            step.launch(None)
+        return {name: np.array(self.arrays[name].numpy()) for name in self.stage.wiring.writes}

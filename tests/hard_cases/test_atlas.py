@@ -14,7 +14,18 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 def test_every_row_is_covered_at_every_rung_of_every_stage(tmp_path: pathlib.Path) -> None:
     collected = tmp_path / "atlas.json"
-    command = [sys.executable, "-m", "pytest", "tests", "--collect-only", "-q", "-p", "no:cacheprovider", "--atlas", str(collected)]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "tests",
+        "--collect-only",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--atlas",
+        str(collected),
+    ]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
     covered = json.loads(collected.read_text())
@@ -25,4 +36,6 @@ def test_every_row_is_covered_at_every_rung_of_every_stage(tmp_path: pathlib.Pat
 def test_tests_that_stand_elsewhere_exist() -> None:
     for name in atlas.ELSEWHERE:
         file, function = name.split("::")
-        assert f"def {function}(" in (ROOT / "tests" / file).read_text(), f"{name} is named in the atlas and does not exist"
+        assert f"def {function}(" in (ROOT / "tests" / file).read_text(), (
+            f"{name} is named in the atlas and does not exist"
+        )

@@ -18,7 +18,7 @@ def test_run_to_run_and_in_any_bands(rig_for, stage, rung):
     rig = rig_for(stage, rung)
     state = rig.state()
     first = rig.run(stage)
-    for bands in (1, 2, 3, 5, 16):
+    for bands in range(1, 17):
         rig.restore(state)
         assert_same_bits(first, rig.run(stage, bands=bands))
 
@@ -56,7 +56,7 @@ def test_a_graph_replayed_is_the_stages_launched(device):
 
 
 @pytest.mark.atlas(row=17, stage="pipeline")
-@pytest.mark.parametrize("bands", range(2, 17))
+@pytest.mark.parametrize("bands", [2, 3, 7, 16])
 def test_bands_of_threads(bands):
     """The thread pool's bands, over the rows that matter only."""
     with Rig("cpu", bands=bands) as rig, Rig("cpu", bands=1) as whole:

@@ -1,0 +1,145 @@
+"""Ten thousand frames: no drift, no growth of memory, the same after a loop as after one.
+
+    python -m tests.hard_cases.long_run [CASE ...] [--frames N] [--device D]
+
+prints one JSON line per case. ``drift`` is the largest difference, in 8-bit codes, between the pictures of the last loop
+of a sequence and those of an early one; ``growth`` the growth of resident (and device) memory since warm-up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import pathlib
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import warp as wp
+
+from tests.hard_cases import generators
+from tests.hard_cases.rig import SIZE, Rig
+from warp_ar.scene import Animation, Light, load_scene
+from warp_ar.sources import open_source
+from warp_ar.tracking import Pose
+
+DRIFT = 1.0
+"""Codes: the light settles exponentially toward its loop, and the last bit of a code may go either way."""
+GROWTH = 0.01
+"""Share of the memory after warm-up."""
+LOOP = 24
+"""Frames after which a synthetic sequence starts again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What a long run showed."""
+
+    case: str
+    frames: int
+    drift: float
+    finite: bool
+    growth: float
+    """Of resident or device memory, whichever grew more."""
+    resident_mb: float
+    frames_per_second: float
+
+
+def resident_bytes() -> int:
+    """Memory of this process that lies in RAM; 0 where the system does not tell."""
+    status = pathlib.Path("/proc/self/statm")
+    return int(status.read_text().split()[1]) * 4096 if status.exists() else 0
+
+
+def device_bytes(device: str) -> int:
+    """Memory in use on a CUDA device; 0 on the CPU."""
+    found = wp.get_device(device)
+    return found.total_memory - found.free_memory if found.is_cuda else 0
+
+
+def looped_clip(rig: Rig, count: int) -> Iterator[np.ndarray]:
+    """The bundled clip's first frames in a loop, cut to size."""
+    spec = load_scene("desk").source
+    assert spec is not None
+    assert spec.path is not None
+    with open_source(spec.path) as source:
+        clip = [frame.image[::13, ::13][: SIZE[1], : SIZE[0]].copy() for frame in itertools.islice(source, LOOP)]
+    yield from itertools.islice(itertools.cycle(clip), count)
+
+
+def switching_lights(rig: Rig, count: int) -> Iterator[np.ndarray]:
+    """The room's light on and off every frame, the virtual ones moving."""
+    frames = generators.frames(SIZE[1], SIZE[0])
+    yield from itertools.islice(itertools.cycle([frames["white"], frames["black"]]), count)
+
+
+def lost_and_found(rig: Rig, count: int) -> Iterator[np.ndarray]:
+    """The marker out of sight for a third of every loop."""
+    frames = list(generators.frames(SIZE[1], SIZE[0]).values())
+    seen: Pose | None = rig.tracker.pose
+    for index in range(count):
+        rig.tracker.pose = None if index % LOOP > 2 * LOOP // 3 else seen
+        yield frames[index % LOOP % 4]
+
+
+def corrupt_frames(rig: Rig, count: int) -> Iterator[np.ndarray]:
+    """One frame of garbage in a hundred."""
+    frames = generators.frames(SIZE[1], SIZE[0])
+    for index in range(count):
+        yield frames["torn"] if index % 100 == 50 else frames["ramp"]
+
+
+CASES = {
+    "looped clip": (looped_clip, LOOP),
+    "lights switching each frame": (switching_lights, LOOP),
+    "tracking lost and found": (lost_and_found, LOOP),
+    "one corrupt frame in a hundred": (corrupt_frames, 100),
+}
+
+
+def run(case: str, *, frames: int, device: str) -> Report:
+    """Run one case; the first pictures to compare with are taken once the light has settled."""
+    sequence, loop = CASES[case]
+    early_at = 5 * loop if 5 * loop < frames // 2 else loop
+    sway = Animation(sway=(0.02, 0.0, 0.0), period=loop / 30.0)
+    lights = (Light("point", 0.1, at=(0.0, -0.1, 0.3), animate=sway),)
+    rig = Rig(device, bands=2, lights=lights)
+    early: dict[int, np.ndarray] = {}
+    drift, warm, finite = 0.0, (0, 0), True
+    last_loop = (frames // loop - 1) * loop
+    start = time.perf_counter()
+    with rig:
+        for index, image in enumerate(sequence(rig, frames)):
+            picture = rig.frame(image).astype(np.int16)
+            if index == min(frames // 2, 1000):
+                warm = resident_bytes(), device_bytes(device)
+            if early_at <= index < early_at + loop:
+                early[index % loop] = picture
+            if last_loop <= index < last_loop + loop:
+                drift = max(drift, float(np.abs(picture - early[index % loop]).max()))
+        for name in ("environment", "environment_radiance", "environment_confidence"):
+            finite &= bool(np.isfinite(rig.get(name)).all())
+        used = resident_bytes(), device_bytes(device)
+    growth = max((now - before) / before if before else 0.0 for now, before in zip(used, warm, strict=True))
+    rate = frames / (time.perf_counter() - start)
+    return Report(case, frames, drift, finite, round(growth, 5), round(used[0] / 1e6, 1), round(rate, 1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Long runs of hard sequences; one JSON line per case.")
+    parser.add_argument("cases", nargs="*", default=list(CASES), metavar="CASE", help=", ".join(CASES))
+    parser.add_argument("--frames", type=int, default=10_000)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    wp.init()
+    for case in options.cases:
+        report = run(case, frames=options.frames, device=options.device)
+        good = report.drift <= DRIFT and report.growth <= GROWTH and report.finite
+        print(json.dumps({**dataclasses.asdict(report), "good": good}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Row 7: what is kept from frame to frame neither drifts nor decays, and forgets a bad frame.
+
+Ten thousand frames of the whole pipeline are ``python -m tests.hard_cases.long_run``; here, a few hundred small ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.hard_cases import generators, long_run
+from tests.hard_cases.rig import RUNGS, SIZE, Rig
+from warp_ar.scene import Exposure
+
+FRAMES = generators.frames(SIZE[1], SIZE[0])
+
+
+@pytest.mark.atlas(row=7, stage="pipeline")
+@pytest.mark.atlas(row=15, stage="pipeline")
+@pytest.mark.parametrize("case", long_run.CASES)
+def test_long_runs(device, case, request):
+    """No drift, no growth, and outputs after a loop equal to those after one."""
+    long = request.config.getoption("--long")
+    report = long_run.run(case, frames=10_000 if long else 240, device=device)
+    assert report.drift <= long_run.DRIFT, report
+    assert report.finite, report
+    if long:  # a short run has not warmed up
+        assert report.growth <= long_run.GROWTH, report
+
+
+@pytest.mark.atlas(row=7, stage="expose")
+@pytest.mark.parametrize("rung", RUNGS["expose"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
+def test_an_automatic_exposure_that_was_spoilt_heals(device, rung, bad):
+    """Whatever stands in the scale, a second of good frames brings it back to where it belongs."""
+    with Rig(device, "expose", rung, exposure=Exposure("auto")) as rig:
+        for _ in range(5):
+            image = rig.frame(FRAMES["ramp"])
+        expected = rig.get("expose_scale")
+        rig.poke("expose_scale", bad)
+        for _ in range(120):  # 4 seconds, time constant 0.3
+            image = rig.frame(FRAMES["ramp"])
+        np.testing.assert_allclose(rig.get("expose_scale"), expected, rtol=1e-3)
+        assert image.any()
+
+
+@pytest.mark.atlas(row=7, stage="accumulate")
+@pytest.mark.parametrize("bad", ["white", "black", "noise", "checkers"])
+def test_one_corrupt_frame_is_forgotten(device, bad):
+    """A frame of garbage in a still sequence: after a second the light is within a code of what it was."""
+    with Rig(device) as rig:
+        for _ in range(40):
+            rig.frame(FRAMES["ramp"])
+        before = rig.get("environment")
+        rig.frame(FRAMES[bad])
+        for _ in range(30):
+            rig.frame(FRAMES["ramp"])
+        np.testing.assert_allclose(rig.get("environment"), before, atol=1.5 / 255)

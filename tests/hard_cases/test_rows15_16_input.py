@@ -1,0 +1,94 @@
+"""Rows 15 and 16: markers lost and found, frames that are none. Most of it stands in test_tracking.py and test_sources.py."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.hard_cases import generators
+from tests.hard_cases.rig import SIZE, Rig
+from warp_ar.errors import UsageError
+from warp_ar.scene import Camera, Marker
+from warp_ar.tracking import Tracker, TrackState
+
+FRAMES = generators.frames(SIZE[1], SIZE[0])
+
+
+@pytest.mark.atlas(row=15, stage="track")
+@given(name=st.sampled_from(sorted(FRAMES)), rows=st.integers(1, 90), columns=st.integers(1, 90))
+def test_no_picture_of_any_size_breaks_the_tracker(name, rows, columns):
+    """From a single pixel up: lost, without an exception."""
+    image = np.resize(FRAMES[name], (rows, columns, 3))
+    tracker = Tracker(Marker(size=0.08), Camera(columns, rows, 50.0, 50.0, columns / 2, rows / 2))
+    for frame in range(3):
+        found = tracker.track(image, frame / 30)
+        assert found.state is TrackState.LOST
+        assert found.pose is None
+
+
+@pytest.mark.atlas(row=15, stage="pipeline")
+@pytest.mark.parametrize("pattern", ["10", "110", "100", "01"])
+def test_lost_and_found_every_frame(device, pattern):
+    """While lost the frame passes to the bit and the light stays; found again, the picture is that of an unbroken run."""
+    with Rig(device) as rig:
+        pose = rig.tracker.pose
+        light = None
+        for frame in range(24):
+            seen = pattern[frame % len(pattern)] == "1"
+            rig.tracker.pose = pose if seen else None
+            picture = rig.frame(FRAMES["ramp"])
+            if seen:
+                light = rig.get("environment")
+                assert (picture != FRAMES["ramp"]).any()
+            else:
+                np.testing.assert_array_equal(picture, FRAMES["ramp"])
+                if light is not None:
+                    np.testing.assert_array_equal(rig.get("environment"), light)
+
+
+@pytest.mark.atlas(row=16, stage="pipeline")
+@given(
+    shape=st.sampled_from(
+        [
+            (36, 48),
+            (36, 48, 1),
+            (36, 48, 4),
+            (35, 48, 3),
+            (36, 49, 3),
+            (0, 48, 3),
+            (36, 0, 3),
+            (0,),
+            (),
+            (48, 36, 3),
+            (1, 36, 48, 3),
+        ]
+    ),
+    kind=st.sampled_from([np.uint8, np.uint16, np.float32, np.float64, np.int8, bool]),
+)
+def test_what_is_no_frame_is_refused_and_the_next_one_works(rig_for, shape, kind):
+    """Grey, RGBA, 16 bit, float with NaN, empty and of another size: one error that says what would be right."""
+    rig = rig_for("fill", "default")
+    image = np.zeros(shape, kind)
+    if image.dtype.kind == "f":
+        image[...] = np.nan
+    with pytest.raises(UsageError, match=r"expected uint8 RGB \(36, 48, 3\)"):
+        rig.pipeline(image)
+    assert rig.frame(FRAMES["ramp"]).shape == (36, 48, 3)
+
+
+@pytest.mark.atlas(row=16, stage="pipeline")
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_the_right_shape_of_the_wrong_type_is_refused(rig_for, kind):
+    with pytest.raises(UsageError, match="expected uint8 RGB"):
+        rig_for("fill", "default").pipeline(np.full((SIZE[1], SIZE[0], 3), np.nan if kind == np.float32 else 7, kind))
+
+
+@pytest.mark.atlas(row=16, stage="pipeline")
+def test_frames_that_are_not_contiguous_are_frames(device):
+    """Views of a larger or mirrored picture give what their copies give."""
+    large = np.random.default_rng(0).integers(0, 256, (2 * SIZE[1], 2 * SIZE[0], 3), dtype=np.uint8)
+    with Rig(device) as one, Rig(device) as other:
+        for view in (large[::2, ::2], large[::-2, ::-2], large[: SIZE[1], : SIZE[0], ::-1]):
+            np.testing.assert_array_equal(one.pipeline(view).image, other.pipeline(view.copy()).image)
