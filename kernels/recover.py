@@ -29,7 +29,7 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import PI, direction_from_latlong, latlong_from_direction, texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.probe import is_clipped, project
+from warp_ar.kernels.probe import is_clipped, project, reflecting_normal
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import TraceConfig, make_trace
 
@@ -44,6 +44,10 @@ BALL_MARGIN = wp.constant(wp.float32(1.08))
 """How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel counts as seen; as for filling."""
+FAR_FROM_BALL = wp.constant(wp.float32(10.0))
+"""Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
+GRAZING = wp.constant(wp.float32(1.0e-3))
+"""Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -196,7 +200,10 @@ def add_excess_kernel(
     """Texel plus its share of its cell's excess."""
     band_row, j = wp.tid()
     i = row_start + band_row
-    more = excess[i * excess.shape[0] // radiance.shape[0], j * excess.shape[1] // radiance.shape[1]]
+    # The cell r whose texels begin at or before i: r h // R <= i.
+    row = ((i + 1) * excess.shape[0] - 1) // radiance.shape[0]
+    column = ((j + 1) * excess.shape[1] - 1) // radiance.shape[1]
+    more = excess[row, column]
     share = lacking(clipped[i, j], trust(confidence[i, j]))
     recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
@@ -273,16 +280,25 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
         (1 + 2 s / (R cos a)) (1 + 2 s cos a / R).
     """
     to_point = point.position - probe.center
-    away = wp.normalize(to_point)
-    normal = wp.normalize(light + away)
-    for _step in range(3):
-        away = wp.normalize(to_point - probe.radius * normal)
-        normal = wp.normalize(light + away)
+    distance = wp.length(to_point) / probe.radius
+    if distance < 1.001 or distance > FAR_FROM_BALL:
+        return 0.0
+    axis = wp.normalize(to_point)
+    cos_psi = wp.dot(light, axis)
+    side = light - cos_psi * axis
+    sin_psi = wp.length(side)
+    least = 1.0 / distance
+    if cos_psi <= -wp.sqrt((1.0 - least) * (1.0 + least)):
+        return 0.0  # the point lies in the ball's shadow, where no ray is mirrored to
+    if sin_psi > 1.0e-6:
+        side = side / sin_psi
+    n = reflecting_normal(distance, cos_psi, sin_psi)
+    normal = n[0] * axis + n[1] * side
     leave = to_point - probe.radius * normal
     s = wp.length(leave)
     cos_a = wp.dot(normal, light)
     cosine = -wp.dot(leave, point.normal) / s
-    if cos_a < 0.05 or cosine <= 0.0 or wp.dot(leave, normal) <= 0.0:
+    if cos_a < GRAZING or cosine <= 0.0 or wp.dot(leave, normal) <= 0.0:
         return 0.0
     spread = (1.0 + 2.0 * s / (probe.radius * cos_a)) * (1.0 + 2.0 * s * cos_a / probe.radius)
     grey = (probe.reflectance[0] + probe.reflectance[1] + probe.reflectance[2]) / 3.0

@@ -1,0 +1,95 @@
+"""Recovery of clipped light: the kernels, and the solution on the host.
+
+The answer is checked first: a uniform room gives open surface points the irradiance pi.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from bench.common import measure, report
+from warp_ar import recovery
+from warp_ar.kernels import recover as kernels
+from warp_ar.kernels import structs
+from warp_ar.ray_scene import HostScene, trace_config
+from warp_ar.scene import load_scene
+
+HEIGHTS = (64, 128)
+
+
+@dataclasses.dataclass
+class Setup:
+    """A uniform room around the bundled desk, with a lamp that clips."""
+
+    height: int
+    device: str
+
+    def __post_init__(self) -> None:
+        scene = load_scene("desk")
+        self.scene = HostScene(dataclasses.replace(scene, objects=()), self.device).ray_scene
+        self.proxies = trace_config(scene).proxies
+        surfaces = recovery.find_surfaces(scene)
+        count, shape = len(surfaces.points), (self.height, 2 * self.height)
+        probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
+        probe = scene.probes[0]
+        probes["center"], probes["radius"], probes["reflectance"] = probe.center, probe.radius, probe.reflectance
+        clipped = np.zeros((*shape, 3), np.float32)
+        clipped[shape[0] // 4 : shape[0] // 4 + shape[0] // 16, shape[1] // 4 : shape[1] // 4 + shape[0] // 16] = 1.0
+        with wp.ScopedDevice(self.device):
+            self.points = wp.array(surfaces.points, dtype=kernels.SurfacePoint)
+            self.probes = wp.array(probes, dtype=structs.Probe)
+            self.radiance = wp.full(shape, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
+            self.clipped = wp.array(clipped, dtype=wp.vec3)
+            self.confidence = wp.full(shape, 1.0, dtype=wp.float32)
+            self.recovered = wp.zeros(shape, dtype=wp.vec3)
+            self.cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell)
+            self.excess = wp.zeros(self.cells.shape, dtype=wp.vec3)
+            seen = np.zeros(count, np.dtype(kernels.Observation.numpy_dtype()))
+            seen["visible"], seen["radiance"] = 1.0, 0.25
+            self.seen = wp.array(seen, dtype=kernels.Observation)
+            self.transfer = wp.zeros((count, self.cells.size), dtype=wp.float32)
+            self.mirrored = wp.zeros_like(self.transfer)
+        self.solver = recovery.Recovery(surfaces, scene.marker.white, probe.center)
+
+    def condense(self) -> None:
+        """Condense the map."""
+        arrays = (self.radiance, self.confidence, self.clipped, self.probes, self.scene, self.cells)
+        kernels.condense_cells(*arrays, proxies=self.proxies)
+
+    def trace(self) -> None:
+        """Trace all surface points."""
+        arrays = (self.points, self.seen, self.cells, self.probes, self.scene, self.transfer, self.mirrored)
+        kernels.trace_transfer(*arrays, proxies=self.proxies)
+
+    def add(self) -> None:
+        """Apply an excess."""
+        kernels.add_excess(self.radiance, self.confidence, self.clipped, self.excess, self.recovered)
+
+    def solve(self) -> recovery.Estimate:
+        """Solve on the host, warm after the first call."""
+        arrays = (array.numpy() for array in (self.cells, self.transfer, self.mirrored, self.seen))
+        return self.solver.update(*arrays)
+
+
+def check(setup: Setup) -> None:
+    setup.condense()
+    setup.trace()
+    setup.add()
+    total = (setup.transfer.numpy() + setup.mirrored.numpy()).sum(axis=1).max()
+    if abs(total / np.pi - 1.0) > 0.02 or not np.isfinite(setup.solve().excess).all():
+        raise AssertionError(f"the largest irradiance of a uniform room is {total}, not pi")
+
+
+def main(device: str) -> None:
+    for height in HEIGHTS:
+        setup = Setup(height, device)
+        check(setup)
+        for name in ("condense", "trace", "add"):
+            work = getattr(setup, name)
+            report(f"recover/{name}/{height}", measure({name: work}, device)[name], device, points=len(setup.points))
+        if wp.get_device(device).is_cpu:
+            times = measure({"solve": setup.solve}, device)["solve"]
+            report(f"recover/solve/{height}", times, device, points=len(setup.points))
