@@ -23,12 +23,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Options of this suite."""
     parser.addoption("--update-golden", action="store_true", help="write the golden frames anew instead of comparing")
     parser.addoption("--long", action="store_true", help="hard cases at full length: millions of rays, 10,000 frames")
-    parser.addoption("--atlas", type=pathlib.Path, metavar="FILE", help="write which tests cover which hard cases, as JSON")
+    parser.addoption("--atlas", type=pathlib.Path, metavar="FILE", help="write what covers which hard case, as JSON")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Name the marker by which tests say what they cover."""
-    config.addinivalue_line("markers", "atlas(row, stage, rung): the hard case that a test covers; see tests/hard_cases/atlas.py")
+    config.addinivalue_line("markers", "atlas(row, stage, rung): hard case that a test covers; see hard_cases")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,4 +1,4 @@
-"""Rigs that tests of hard cases share: built once per stage and rung, put back into their first state for every test."""
+"""Rigs that tests of hard cases share: built once per stage and rung, put back into their first state every time."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ SPOILT = ("inverted", "half inverted", "duplicated", "zero area", "shuffled")
 
 
 def rays_at_edges(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points on shared edges, every tenth a vertex: float64 (count, 3), and the face normals and centres they are from."""
+    """Points on shared edges, every tenth a vertex, and the normals and centres of their faces: (count, 3) each."""
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     chosen = corners[rng.integers(len(corners), size=count)]
     weight = rng.random((count, 1))
@@ -188,7 +188,7 @@ def rays_at_edges(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[np.
 
 
 def lights() -> dict[str, dict[str, object]]:
-    """Virtual lights of hard case 9 as fields of ``structs.Light``; the scene's desk is z = 0, its first object at (0.09, 0, 0.03)."""
+    """Virtual lights of hard case 9, as fields of ``structs.Light``, about the scene of ``rig.make_scene``."""
     from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT
 
     base = {

@@ -2,8 +2,8 @@
 
     python -m tests.hard_cases.long_run [CASE ...] [--frames N] [--device D]
 
-prints one JSON line per case. ``drift`` is the largest difference, in 8-bit codes, between the pictures of the last loop
-of a sequence and those of an early one; ``growth`` the growth of resident (and device) memory since warm-up.
+prints one JSON line per case. ``drift`` is the largest difference, in 8-bit codes, between the pictures of the last
+loop of a sequence and those of an early one; ``growth`` the growth of resident (and device) memory since warm-up.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ POSE = look_at((0.02, -0.3, 0.35))
 
 
 def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any) -> Scene:
-    """Every effect: four materials, sphere, box and mesh, two kinds of proxy, three kinds of light, a ball, an exposure.
+    """Every effect: four materials, sphere, box and mesh, two kinds of proxy, three kinds of light, a ball.
 
     Args:
         scale: Metres per unit: everything is that much larger and farther.

@@ -1,4 +1,4 @@
-"""Row 6: suns over dark skies, outliers, black maps, NaN, Inf, negative and denormal pixels; and what garbage may reach.
+"""Row 6: suns over dark skies, outliers, black maps, NaN, Inf, negative and denormal pixels; what garbage may reach.
 
 Bounds: a finite answer everywhere, no light below zero, and no pixel or texel changed that the bad one cannot reach.
 """

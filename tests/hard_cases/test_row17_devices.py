@@ -1,4 +1,4 @@
-"""Row 17: CPU and CUDA agree: integers bit for bit, floats within a stated bound. Skipped where there is no CUDA device.
+"""Row 17: CPU and CUDA agree: integers bit for bit, floats within a stated bound. Skipped without a CUDA device.
 
 Every stage gets the same inputs, those of the CPU, so errors do not add up from stage to stage. CUDA contracts
 multiplications and additions and has its own sine and exponential: a few units in the last place each.

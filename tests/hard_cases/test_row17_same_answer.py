@@ -1,4 +1,4 @@
-"""Row 17: the same input gives the same bits: run to run, in 1 to 16 bands, replayed from a captured graph or launched."""
+"""Row 17: the same input gives the same bits: run to run, in 1 to 16 bands, replayed from a graph or launched."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, rung):
 
 @pytest.mark.atlas(row=17, stage="pipeline")
 def test_a_graph_replayed_is_the_stages_launched(device):
-    """Frames that change which stages run, through captured graphs and launched one by one; on CPU both are launched."""
+    """Frames that change which stages run, replayed from graphs and launched one by one; on CPU both are launched."""
     with Rig(device) as replayed, Rig(device) as eager:
         eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
         for name in ("noise", "noise", "white", "black", "noise", "ramp", "noise"):

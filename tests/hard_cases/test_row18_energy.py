@@ -19,7 +19,7 @@ HEIGHT = ENVIRONMENT_HEIGHT
 MAP = (HEIGHT, 2 * HEIGHT)
 FURNACE = 5e-4
 make_lone = functools.lru_cache(maxsize=64)(LoneStage)
-# The paper's own filter reads a box pyramid bilinearly: near a pole a lamp's weight depends on where in its texel it is.
+# The paper's own filter reads a box pyramid bilinearly: near a pole a lamp's weight depends on where it stands.
 BOX_MIP = 0.35
 
 
@@ -50,7 +50,7 @@ def test_a_constant_room_under_any_mask(rig_for, seed, hidden, exponent):
 )
 @given(row=st.integers(0, HEIGHT - 1), column=st.integers(0, 2 * HEIGHT - 1), sky=st.sampled_from([0.0, 1e-4, 1.0]))
 def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, rung, row, column, sky):
-    """The integral over all directions, wherever the lamp stands: irradiance holds pi times the flux, each level the flux."""
+    """The integral over all directions, wherever the lamp stands: pi times the flux, each level the flux."""
     room = np.full((*MAP, 3), sky, np.float32)
     room[row, column] = 1e6
     flux = float((solid_angles(*MAP)[..., None] * room.astype(float)).sum((0, 1))[0])

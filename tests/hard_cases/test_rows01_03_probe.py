@@ -1,6 +1,6 @@
 """Rows 1 to 3: straight back through the ball, the blind cone, the rim; a ball that is near, cut, hidden or tiny.
 
-Bounds: what is unwrapped lies within the range of the frame, and a constant frame gives a constant map, to the furnace's
+Bounds: what is unwrapped lies within the frame's range, and a constant frame gives a constant map, to the furnace's
 0.05 %; where the ball says nothing the confidence is 0, and the light of before is kept.
 """
 
@@ -41,6 +41,7 @@ def assert_sane(outputs, low=0.0, high=1.0):
 
 
 @pytest.mark.atlas(row=1, stage="unwrap")
+@pytest.mark.atlas(row=4, stage="unwrap")
 @pytest.mark.atlas(row=5, stage="unwrap")
 @pytest.mark.parametrize("rung", RUNGS["unwrap"])
 @pytest.mark.parametrize("axis", AXES, ids=str)

@@ -146,7 +146,7 @@ def test_a_room_without_direction_says_nothing_about_relief(rig_for, rung):
 @pytest.mark.atlas(row=10, stage="relight")
 @pytest.mark.parametrize("rung", RUNGS["relight"])
 def test_relief_from_one_end_of_alpha_to_the_other(rig_for, rung):
-    """The key light turned from along the virtual one to against it: bounded, continuous, and at the ends what the text asks for."""
+    """The key light turned from along the virtual one to against it: bounded, continuous, and the ends differ."""
     rig = rig_for("relight", rung)
     if "key_lights" not in rig.stage("relight")[0].wiring.reads:
         return  # a rung that does not ask

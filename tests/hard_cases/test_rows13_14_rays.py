@@ -1,4 +1,4 @@
-"""Rows 13 and 14: rays through edges and vertices, broken meshes; self-shadowing at 1 mm, 1 km and 1 km from the origin.
+"""Rows 13 and 14: rays through edges and vertices, broken meshes; self-shadowing at 1 mm, 1 km and 1 km away.
 
 Closed meshes never leak: ``--long`` sends 10 million rays at shared edges and vertices, a plain run 300,000.
 """
@@ -150,7 +150,11 @@ def test_a_mesh_without_surface_is_an_error_or_nothing(device, faces, tmp_path):
     try:
         mesh = load_mesh(file)
     except SceneError as error:
-        assert "nothing.ply" in str(error)
+        refusal = str(error)
+    else:
+        refusal = ""
+    if refusal:
+        assert "nothing.ply" in refusal
         return
     hits, _, occluded = shoot(
         World(device).add("mesh", mesh=mesh).scene(), [(0.5, 0.3, 5), (0.5, 0, 5)], [(0, 0, -1)], device

@@ -1,4 +1,4 @@
-"""Rows 15 and 16: markers lost and found, frames that are none. Most of it stands in test_tracking.py and test_sources.py."""
+"""Rows 15 and 16: markers lost and found, frames that are none. More stands in test_tracking.py, test_sources.py."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_no_picture_of_any_size_breaks_the_tracker(name, rows, columns):
 @pytest.mark.atlas(row=15, stage="pipeline")
 @pytest.mark.parametrize("pattern", ["10", "110", "100", "01"])
 def test_lost_and_found_every_frame(device, pattern):
-    """While lost the frame passes to the bit and the light stays; found again, the picture is that of an unbroken run."""
+    """While lost the frame passes to the bit and the light stays; found again, it is lit again."""
     with Rig(device) as rig:
         pose = rig.tracker.pose
         light = None
