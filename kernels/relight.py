@@ -61,7 +61,7 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.shadow import make_shadow, sample_light
+from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean
 from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
@@ -97,6 +97,8 @@ class RelightConfig:
     """Form of the room's irradiance, for ``reflectance``."""
     probes: bool = False
     """Whether there are mirror balls, which hide the desk and throw shadows of virtual light."""
+    soft: bool = False
+    """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
 
     def __post_init__(self) -> None:
         if self.rung not in RUNGS:
@@ -168,6 +170,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
     is_lit = make_shadow(config.trace)
+    visible_share = make_visible_share(config.trace) if config.soft else None
     rung = config.rung
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -220,8 +223,15 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
             n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
             if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
                 continue
-            if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
-                continue
+            visible = float(1.0)
+            if wp.static(config.soft):
+                turn = tile_turn(i, j)
+                visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
+                if visible <= 0.0:
+                    continue
+            else:
+                if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                    continue
             if wp.static(config.probes):
                 if meets_probe(probes, hit.point, light.wi, light.distance):
                     continue
@@ -257,7 +267,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
                     response = n_dot_l * relief_factor(m, alpha * dominance)
                 else:
                     response = n_dot_l * turned_relief(m, alpha, dominance)
-            added += response * light.irradiance_normal
+            added += visible * response * light.irradiance_normal
         physical_added_out[i, j] = wp.cw_mul(kd, added) * _INV_PI
 
     return relight_kernel

@@ -28,7 +28,7 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.reflect import nearest_of_object
-from warp_ar.kernels.shadow import make_sample_light, make_shadow
+from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import Hit, TraceConfig, inside_rect, make_primary
 
@@ -62,6 +62,8 @@ class ShadeConfig:
     """Whether the prefiltered environment is read."""
     edge_samples: int
     """Samples per pixel along edges: a square number; 1 leaves edges hard."""
+    soft: bool = False
+    """Whether lights with a radius cast soft shadows."""
     near: bool = False
     """Whether ``object_light`` says what surrounds the objects at close range."""
 
@@ -70,12 +72,13 @@ class ShadeConfig:
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
-    ``pixel`` is where ``object_light`` has seen the object, or negative.
+    ``pixel`` is where ``object_light`` has seen the object, or negative; ``turn`` is for ``visible_share``.
     """
     surface_at = make_surface(config.models, config.textures)
     reflect_direct = make_reflect_direct(config.models)
     sample_light = make_sample_light(config.lights)
     is_lit = make_shadow(config.trace)
+    visible_share = make_visible_share(config.trace) if config.soft else None
 
     @wp.func(module="unique")
     def shade_hit(
@@ -91,6 +94,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         near_irradiance: wp.array2d[wp.vec3],
         near_mirrored: wp.array2d[wp.vec4],
         pixel: wp.vec2i,
+        turn: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
         normal = hit.normal
@@ -136,8 +140,12 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                 if wp.max(light.irradiance_normal) > 0.0:
                     reflected = reflect_direct(surface, normal, wo, light.wi)
                     if wp.max(reflected) > 0.0:
-                        if is_lit(scene, hit.point, geometric, hit.error, light):
-                            radiance += wp.cw_mul(reflected, light.irradiance_normal)
+                        if wp.static(config.soft):
+                            visible = visible_share(scene, hit.point, geometric, hit.error, lights[index], light, turn)
+                            radiance += visible * wp.cw_mul(reflected, light.irradiance_normal)
+                        else:
+                            if is_lit(scene, hit.point, geometric, hit.error, light):
+                                radiance += wp.cw_mul(reflected, light.irradiance_normal)
         return radiance
 
     return shade_hit
@@ -243,6 +251,7 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
                         near_irradiance,
                         near_mirrored,
                         pixel,
+                        tile_turn(i, j),
                     )
                     result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
             if samples > 1:

@@ -8,9 +8,11 @@ distance d has linear camera value I / (pi d^2), so the irradiance of a surface 
 from __future__ import annotations
 
 import functools
+import math
 
 import warp as wp
 
+from warp_ar.kernels.sampling import frame_from_normal
 from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT, Light, RayScene
 from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace, offset_origin
 
@@ -19,6 +21,12 @@ wp.set_module_options({"enable_backward": False})
 # 1 / d^2 has no limit at the light itself, real lights have: no point receives more than at this distance, or at the
 # emitting sphere's radius where that is larger. 0.1 mm keeps an intensity of 1e6 at 1e14, far inside float32.
 MIN_DISTANCE = wp.constant(wp.float32(1.0e-4))
+
+PROBE_RAYS = 8
+"""Rays to the rim of a sized light and its centre; where they agree, the light is taken as wholly seen or hidden."""
+SOFT_RAYS = 32
+"""Rays to a light that is partly hidden."""
+GOLDEN_ANGLE = wp.constant(wp.float32(math.pi * (3.0 - math.sqrt(5.0))))
 
 
 @wp.struct
@@ -105,3 +113,66 @@ def make_shadow(config: TraceConfig) -> wp.Function:
         return not occluded(scene, origin, sample.wi, sample.distance - 2.0 * error)
 
     return is_lit
+
+
+@functools.cache
+def make_visible_share(config: TraceConfig) -> wp.Function:
+    """``visible_share(scene, point, geometric_normal, error, light, sample, turn) -> float32``: 0 hidden .. 1 seen.
+
+    A sized light is the disk that it shows to the point. Its centre and rim are tried first; only a penumbra gets the
+    full sunflower of rays, each of which stands for the same part of the disk. ``turn`` rotates the pattern, in turns:
+    given another for every pixel of a small tile, the steps of 1 / ``SOFT_RAYS`` become a fine grain. A light without
+    size, or around the point, is seen or not, as ``make_shadow`` has it.
+    """
+    is_lit = make_shadow(config)
+    occluded = make_trace(config).occluded
+
+    @wp.func(module="unique")
+    def visible_share(
+        scene: RayScene,
+        point: wp.vec3,
+        geometric_normal: wp.vec3,
+        error: wp.float32,
+        light: Light,
+        sample: LightSample,
+        turn: wp.float32,
+    ) -> wp.float32:
+        if light.radius <= 0.0 or light.kind == DIRECTIONAL or sample.distance <= light.radius:
+            return wp.where(is_lit(scene, point, geometric_normal, error, sample), 1.0, 0.0)
+        basis = frame_from_normal(sample.wi)
+        seen = wp.int32(0)
+        count = wp.int32(PROBE_RAYS)
+        k = wp.int32(0)
+        while k < count:
+            # The last of the probes is the centre, the others lie on the rim; then the sunflower begins anew.
+            radius = wp.where(k < wp.static(PROBE_RAYS - 1), light.radius, 0.0)
+            angle = 2.0 * wp.pi * (wp.float32(k) / wp.static(float(PROBE_RAYS - 1)) + turn)
+            if count > wp.static(PROBE_RAYS):
+                n = wp.float32(k - wp.static(PROBE_RAYS))
+                radius = light.radius * wp.sqrt((n + 0.5) / wp.static(float(SOFT_RAYS)))
+                angle = GOLDEN_ANGLE * n + 2.0 * wp.pi * turn
+            on_disk = basis * wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), sample.distance)
+            distance = wp.length(on_disk)
+            direction = on_disk / distance
+            # What lies below the surface that receives the light is hidden by that surface.
+            if wp.dot(direction, geometric_normal) > 0.0:
+                origin = offset_origin(point, geometric_normal, direction, error)
+                if not occluded(scene, origin, direction, distance - 2.0 * error):
+                    seen += 1
+            k += 1
+            if k == wp.static(PROBE_RAYS) and count == k and seen > 0 and seen < k:
+                count = wp.static(PROBE_RAYS + SOFT_RAYS)
+                seen = 0
+        if count == wp.static(PROBE_RAYS):
+            return wp.where(seen > 0, 1.0, 0.0)
+        return wp.float32(seen) / wp.static(float(SOFT_RAYS))
+
+    return visible_share
+
+
+@wp.func
+def tile_turn(row: wp.int32, column: wp.int32) -> wp.float32:
+    """Rotation of a pixel's pattern, in turns: all sixteenths in every tile of 4 x 4, neighbours far apart (Bayer)."""
+    mixed = row ^ column
+    rank = ((mixed & 1) << 3) | ((row & 1) << 2) | (mixed & 2) | ((row & 2) >> 1)
+    return wp.float32(rank) / 16.0

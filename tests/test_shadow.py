@@ -9,8 +9,17 @@ import pytest
 import warp as wp
 
 from tests.test_visibility import GENERAL, World
-from warp_ar.kernels.shadow import MIN_DISTANCE, LightSample, make_sample_light, make_shadow, sample_light
-from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT, Light, RayScene
+from warp_ar.kernels.shadow import (
+    MIN_DISTANCE,
+    SOFT_RAYS,
+    LightSample,
+    make_sample_light,
+    make_shadow,
+    make_visible_share,
+    sample_light,
+    tile_turn,
+)
+from warp_ar.kernels.structs import BOX, DIRECTIONAL, POINT, SPHERE, SPOT, Light, RayScene, Shape
 
 # A dozen float32 roundings; a spot's fall divides the angle's rounding (1e-7) by the width of its rim.
 TOLERANCE = 2e-6
@@ -164,3 +173,83 @@ def test_light_inside_an_object_and_on_a_surface(device):
     ground = World(device).add("plane", extent=(1, 1, 0)).scene(proxies=True)
     assert lit(ground, light(position=(0, 0, 0)), [(0, 0, 0), (0.5, 0, 0)], device) == [1, 1]
     assert lit(ground, light(position=(0.3, 0, 1)), [(0, 0, 0), (0.5, 0, 0)], device) == [1, 1]
+
+
+# --- Sized lights -----------------------------------------------------------------------------------------------------
+
+
+SHARE = make_visible_share(GENERAL)
+
+
+@wp.kernel(enable_backward=False)
+def share_kernel(
+    scene: RayScene,
+    lights: wp.array[Light],
+    points: wp.array[wp.vec3],
+    turn: wp.float32,
+    share_out: wp.array[wp.float32],
+):
+    i = wp.tid()
+    light = lights[0]
+    share_out[i] = SHARE(scene, points[i], wp.vec3(0.0, 0.0, 1.0), 1.0e-6, light, sample_light(light, points[i]), turn)
+
+
+def shares(points, radius, shapes=(), position=(0.0, 0.0, 1.0), turn=0.0):
+    dtype = np.dtype(Light.numpy_dtype())
+    light = np.zeros(1, dtype)
+    light["kind"], light["position"], light["radius"] = POINT, position, radius
+    light["intensity"], light["attenuation"] = 1.0, (0, 0, 1)
+    objects = np.zeros(len(shapes), np.dtype(Shape.numpy_dtype()))
+    for record, (kind, at, extent) in zip(objects, shapes, strict=True):
+        record["kind"], record["position"], record["extent"] = kind, at, extent
+        record["rotation"], record["scale"] = np.eye(3), 1.0
+    scene = RayScene()
+    scene.objects = wp.array(objects, dtype=Shape)
+    scene.proxies = wp.zeros(0, dtype=Shape)
+    where = wp.array(np.asarray(points, np.float32), dtype=wp.vec3)
+    out = wp.zeros(len(points), wp.float32)
+    wp.launch(share_kernel, dim=len(points), inputs=[scene, wp.array(light, dtype=Light), where, turn], outputs=[out])
+    return out.numpy()
+
+
+# An edge may cut one ray of the sunflower more or less than the area says, at a few places of its way across.
+SUNFLOWER = 2.5 / SOFT_RAYS
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_half_plane_hides_the_area_that_it_covers(device, turn):
+    # A wall half way up, over x > 0: seen from (x, 0, 0) its edge crosses the light's disk at 2 * 0 - x.
+    radius = 0.1
+    x = np.linspace(-0.14, 0.14, 57)
+    got = shares(np.stack([x, 0 * x, 0 * x], -1), radius, [(BOX, (5, 0, 0.5), (5, 5, 1e-4))], turn=turn)
+    edge = np.clip(-x / radius, -1, 1)  # the part of the disk below this is seen
+    expected = 1 - (np.arccos(edge) - edge * np.sqrt(1 - edge**2)) / np.pi
+    np.testing.assert_allclose(got, expected, atol=SUNFLOWER)
+    assert got[0] == 1
+    assert got[-1] == 0
+
+
+def test_points_and_enclosing_lights_are_seen_or_not(device):
+    ball = [(SPHERE, (0, 0, 0.5), (0.1, 0, 0))]
+    points = [(0, 0, 0), (0.5, 0, 0)]
+    assert shares(points, 0.0, ball).tolist() == [0, 1]
+    assert shares([(0, 0, 0.99)], 0.1).tolist() == [1]
+
+
+def test_light_at_the_horizon_is_half_set(device):
+    got = shares([(0, 0, 0)], 0.1, position=(1.0, 0.0, 0.0))
+    assert got[0] == pytest.approx(0.5, abs=SUNFLOWER)
+
+
+def test_tile_holds_every_turn(device):
+    out = wp.zeros((8, 8), wp.float32)
+    wp.launch(turn_kernel, dim=(8, 8), outputs=[out])
+    for row, column in ((0, 0), (4, 0), (2, 3)):
+        tile = out.numpy()[row : row + 4, column : column + 4]
+        assert sorted((tile * 16).ravel().astype(int)) == list(range(16))
+
+
+@wp.kernel(enable_backward=False)
+def turn_kernel(out: wp.array2d[wp.float32]):
+    i, j = wp.tid()
+    out[i, j] = tile_turn(i, j)

@@ -34,6 +34,9 @@ EMPTY: Final[Rect] = (0, 0, 0, 0)
 BOX_MARGIN: Final = 2.0**-18
 """How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
 
+BVH_CONSTRUCTOR: Final = "sah"
+BVH_LEAF_SIZE: Final = 4
+
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
 _LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
 _MODELS: Final[dict[type, int]] = {
@@ -74,6 +77,11 @@ def shape_kind(thing: scenes.Object | scenes.Proxy) -> int:
 def light_kind(light: scenes.Light) -> int:
     """Kind of ``structs.Light`` that a light becomes."""
     return _LIGHTS[light.kind]
+
+
+def has_sized_lights(scene: scenes.Scene) -> bool:
+    """Whether any virtual light has a radius, and so a soft shadow."""
+    return any(light.radius > 0.0 for light in scene.lights)
 
 
 def trace_config(scene: scenes.Scene) -> TraceConfig:
@@ -163,6 +171,7 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
     The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
     refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
+    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest.
 
     Args:
         mesh: The triangles.
@@ -177,7 +186,7 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
     points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
-    ray_mesh = wp.Mesh(points=points, indices=indices)
+    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=BVH_LEAF_SIZE)
     wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
     uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
     return RayMesh(ray_mesh, center, half, mesh.normals[mesh.faces].reshape(-1, 3), uvs[mesh.faces].reshape(-1, 2))
@@ -238,6 +247,9 @@ class HostScene:
         self._place_objects()
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: list[FloatArray] | None = None
+        self._placed = b""  # the objects that the polygons below are of
+        self._outlines: list[FloatArray] = []
+        self._shaded: list[FloatArray] | None = None
         self._lights_edited = False
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -368,7 +380,16 @@ class HostScene:
             pose: ``camera_from_world``.
             camera: The camera of the frames.
         """
-        return screen_rect([face for record in self._objects for face in _faces(record)], pose, camera)
+        self._follow_objects()
+        return screen_rect(self._outlines, pose, camera)
+
+    def _follow_objects(self) -> None:
+        """Forget what was found out about objects that have moved since; clipping polygons takes longer than a kernel."""
+        placed = self._objects.tobytes()
+        if placed != self._placed:
+            self._placed = placed
+            self._outlines = [face for record in self._objects for face in _faces(record)]
+            self._shaded = None
 
     def light_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where virtual light or its shadows can fall on proxies on screen; arguments as ``object_rect``."""
@@ -380,9 +401,13 @@ class HostScene:
 
     def shadow_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where virtual objects can change the room's light on proxies on screen; arguments as ``object_rect``."""
-        proxies = [_faces(record) for record in self._proxies]
-        polygons = [part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)]
-        return screen_rect(polygons, pose, camera)
+        self._follow_objects()
+        if self._shaded is None:
+            proxies = [_faces(record) for record in self._proxies]
+            self._shaded = [
+                part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)
+            ]
+        return screen_rect(self._shaded, pose, camera)
 
 
 def _dtype(struct: Any) -> Any:

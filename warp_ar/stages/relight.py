@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import relight
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.shade import casts_soft
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -46,7 +47,9 @@ class Relight(Stage):
         """One pass over the rows that light can reach."""
         form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
         scene = self.request.scene
-        config = relight.RelightConfig(relight_rung(self.request), trace_config(scene), form, bool(scene.probes))
+        config = relight.RelightConfig(
+            relight_rung(self.request), trace_config(scene), form, bool(scene.probes), casts_soft(self.request)
+        )
         relight.make_relight_kernel(config)
 
         def launch(rows: Rows | None) -> None:

@@ -11,6 +11,7 @@ from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.shade import RoomDiffuse, ShadeConfig, make_shade_kernel, shade
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.ray_scene import (
+    has_sized_lights,
     has_textures,
     light_kind,
     material_model,
@@ -40,8 +41,14 @@ def shade_config(request: Request) -> ShadeConfig:
         room_diffuse=diffuse,
         room_specular=bool(scene.probes) and any(map(reflects_glossily, materials)),
         edge_samples=request.quality.edge_samples,
+        soft=casts_soft(request),
         near=bool(scene.probes) and sees_near(request),
     )
+
+
+def casts_soft(request: Request) -> bool:
+    """Whether sized virtual lights cast soft shadows: ``light_shadow`` names a way of two stages, hard or soft."""
+    return request.quality.rung("light_shadow") == "soft" and has_sized_lights(request.scene)
 
 
 def sees_near(request: Request) -> bool:
