@@ -31,6 +31,8 @@ import warp as wp
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pyramid import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
+from warp_ar.kernels.structs import RoomLamp
+from warp_ar.kernels.structs import RoomLamp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,6 +43,10 @@ FAR_AWAY = wp.constant(wp.float32(1.0e30))
 """Distance of light that is part of the environment."""
 
 
+LAMP_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
+"""Cosine of the largest angle between a lamp's direction and light that belongs to it."""
+MIN_LAMP_DISTANCE = wp.constant(wp.float32(0.05))
+"""Metres from the ball within which no lamp is taken to be."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
 TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
@@ -270,45 +276,35 @@ def list_texels_kernel(
 def place_lamps_kernel(
     # In:
     row_start: wp.int32,
-    lamps: wp.array[wp.vec4],
-    texel: wp.float32,
+    lamps: wp.array[RoomLamp],
     # Out:
     samples_out: wp.array[RoomSample],
 ):
-    """Give the samples that show a lamp the lamp's distance."""
+    """Give the samples that show a lamp the distance of the lamp that they are nearest to."""
     index = wp.tid() + row_start
     sample = samples_out[index]
+    if wp.max(sample.radiance) < 1.0:
+        return
+    nearest = LAMP_COSINE
     for k in range(lamps.shape[0]):
         lamp = lamps[k]
-        if lamp[3] > 0.0:
-            to_lamp = wp.vec3(lamp[0], lamp[1], lamp[2]) - sample.origin
-            distance = wp.length(to_lamp)
-            # Tangent of the lamp's half angle, and a texel more: the map shows it that much wider.
-            off = wp.length(wp.cross(to_lamp, sample.direction))
-            along = wp.dot(to_lamp, sample.direction)
-            if along > 0.0 and off <= lamp[3] + texel * distance and distance < sample.distance:
-                samples_out[index].distance = distance
+        cosine = wp.dot(lamp.direction, sample.direction)
+        if cosine > nearest:
+            nearest = cosine
+            samples_out[index].distance = wp.clamp(lamp.distance, MIN_LAMP_DISTANCE, FAR_AWAY)
 
 
-def place_lamps(
-    lamps: wp.array[wp.vec4], height: int, samples_out: wp.array[RoomSample], *, rows: Rows | None = None
-) -> None:
+def place_lamps(lamps: wp.array[RoomLamp], samples_out: wp.array[RoomSample], *, rows: Rows | None = None) -> None:
     """Turn the samples of near lamps from directions into places.
 
+    A sample shows a lamp if it is as bright as clipping and within ``LAMP_COSINE`` of its direction.
+
     Args:
-        lamps: (k,) position in the world and radius in metres; radius 0: none.
-        height: Rows of the environment that the samples were drawn from.
-        samples_out: (n,) samples; only their distance changes.
+        lamps: (k,) lamps; those without direction are none, those without end of distance stay directions.
+        samples_out: (n,) samples, drawn from an environment captured where the lamps' distances are from.
         rows: Range of samples; None means all.
     """
-    launch_rows(
-        place_lamps_kernel,
-        samples_out.shape,
-        [lamps, math.pi / height],
-        [samples_out],
-        rows=rows,
-        device=samples_out.device,
-    )
+    launch_rows(place_lamps_kernel, samples_out.shape, [lamps], [samples_out], rows=rows, device=samples_out.device)
 
 
 def sum_environment(

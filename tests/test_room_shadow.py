@@ -11,7 +11,18 @@ from warp_ar.graph import make_plan
 from warp_ar.kernels import room_samples, room_shadow
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.room_samples import RoomSample
-from warp_ar.kernels.structs import BOX, LAMBERT, PLANE, SPHERE, FrameParams, Material, Probe, RayScene, Shape
+from warp_ar.kernels.structs import (
+    BOX,
+    LAMBERT,
+    PLANE,
+    SPHERE,
+    FrameParams,
+    Material,
+    Probe,
+    RayScene,
+    RoomLamp,
+    Shape,
+)
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.quality import PRESETS
 from warp_ar.scene import load_scene
@@ -204,18 +215,40 @@ def test_texels_list_the_map(device):
     np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
 
 
-def test_lamps_give_their_samples_a_place(device):
-    at = np.array([0.3, -0.1, 0.4])
-    _, _, samples = list_texels(sky(size=(64, 128)))
-    room_samples.place_lamps(wp.array([[*at, 0.03], [0, 0, 1, 0]], dtype=wp.vec4), 64, samples)
-    found = samples.numpy()
+def lamps_at(at, half_angle):
+    """A lamp at a place, a distant one, and an unused record."""
     to_lamp = at - ORIGIN
-    angle = np.arccos(found["direction"] @ (to_lamp / np.linalg.norm(to_lamp)))
-    width = np.arctan((0.03 + np.pi / 64 * np.linalg.norm(to_lamp)) / np.linalg.norm(to_lamp))
+    records = np.zeros(3, np.dtype(RoomLamp.numpy_dtype()))
+    records["direction"] = to_lamp / np.linalg.norm(to_lamp), (0, 0, -1), (0, 0, 0)
+    records["distance"] = np.linalg.norm(to_lamp), np.inf, 0.0
+    records["half_angle"] = half_angle, 0.2, 0.0
+    return wp.array(records, dtype=RoomLamp)
+
+
+def lamp_at(*positions):
+    """Records of lamps at positions in the world; None stands for a distant one straight up."""
+    values = []
+    for at in positions:
+        offset = np.array([0, 0, 1.0]) if at is None else np.asarray(at) - ORIGIN
+        distance = np.linalg.norm(offset)
+        values.append({"direction": offset / distance, "distance": np.inf if at is None else distance})
+    return records(RoomLamp, *values, {})
+
+
+def test_lamps_give_their_samples_a_place(device):
+    at = np.array([0.3, -0.1, 0.2])
+    direction = (at - ORIGIN) / np.linalg.norm(at - ORIGIN)
+    environment = sky(0.5, (64, 128))
+    wi = reference.texel_directions(64, 128)[0]
+    environment[wi @ direction > np.cos(0.1)] = 40.0
+    environment[wi[..., 2] > np.cos(0.1)] = 40.0
+    _, _, samples = list_texels(environment)
+    room_samples.place_lamps(lamp_at(at, None), samples)
+    found = samples.numpy()
     near = found["distance"] < 1e29
-    assert near[angle < 0.95 * width].all()
-    assert not near[angle > 1.05 * width].any()
-    np.testing.assert_allclose(found["distance"][near], np.linalg.norm(to_lamp), rtol=1e-5)
+    np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
+    np.testing.assert_allclose(found["distance"][near], np.linalg.norm(at - ORIGIN), rtol=1e-5)
+    assert np.isfinite(found["distance"]).all()
 
 
 # --- Ratio ------------------------------------------------------------------------------------------------------------
@@ -340,7 +373,7 @@ def test_near_lamps_cast_their_own_shadow(device):
     directions, flux, samples = draw(environment)
     item = [sphere((0.1, 0, 0.1), 0.03)]
     distant = run((directions, flux, samples), item)[..., 0]
-    room_samples.place_lamps(wp.array([[*lamp, 0.02]], dtype=wp.vec4), 64, samples)
+    room_samples.place_lamps(lamps_at(lamp, 0.05), 64, samples)
     near = run((directions, flux, samples), item, near=True)[..., 0]
     # Centre of the shadow: where the line through lamp and object meets the desk.
     expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)

@@ -27,7 +27,7 @@ def sample_count(request: Request) -> int:
 
 
 def knows_lamps(request: Request) -> bool:
-    """Whether a stage finds lamps at a distance: a resource ``lamps`` of (position, radius), ``wp.vec4`` each."""
+    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``RoomLamp``."""
     wiring = Recover.wire(request)
     return isinstance(wiring, Wiring) and "lamps" in wiring.writes
 
@@ -73,13 +73,11 @@ class RoomSamples(Stage):
         origin = wp.vec3(*self.request.scene.probes[0].center)
         small = arrays.get("room_samples_map")
         if small is not None:
-            rows = small.shape[0]
             passes = [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
                 Pass(lambda rows: room_samples.list_texels(small, origin, directions, flux, samples)),
             ]
         else:
-            rows = environment.shape[0]
             cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
             out = directions, flux, samples
             passes = [
@@ -87,5 +85,5 @@ class RoomSamples(Stage):
                 Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, *out)),
             ]
         if knows_lamps(self.request):
-            passes.append(Pass(lambda _: room_samples.place_lamps(arrays["lamps"], rows, samples)))
+            passes.append(Pass(lambda _: room_samples.place_lamps(arrays["lamps"], samples)))
         return passes
