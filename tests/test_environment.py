@@ -345,7 +345,7 @@ def request(height=16):
     import dataclasses
     import types
 
-    quality = dataclasses.replace(PRESETS["medium"], environment_height=height)
+    quality = dataclasses.replace(PRESETS["medium"].with_rungs(recover="clipped"), environment_height=height)
     return Request(types.SimpleNamespace(probes=(1,), proxies=()), quality, (64, 48))
 
 
