@@ -32,7 +32,6 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pyramid import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
 from warp_ar.kernels.structs import RoomLamp
-from warp_ar.kernels.structs import RoomLamp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,8 +40,6 @@ SIDE_WEIGHT = wp.constant(wp.float32(0.3))
 """Weight of directions that the desk does not see, beside the cosine of those that it does."""
 FAR_AWAY = wp.constant(wp.float32(1.0e30))
 """Distance of light that is part of the environment."""
-
-
 LAMP_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
 """Cosine of the largest angle between a lamp's direction and light that belongs to it."""
 MIN_LAMP_DISTANCE = wp.constant(wp.float32(0.05))

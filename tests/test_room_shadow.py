@@ -215,16 +215,6 @@ def test_texels_list_the_map(device):
     np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
 
 
-def lamps_at(at, half_angle):
-    """A lamp at a place, a distant one, and an unused record."""
-    to_lamp = at - ORIGIN
-    records = np.zeros(3, np.dtype(RoomLamp.numpy_dtype()))
-    records["direction"] = to_lamp / np.linalg.norm(to_lamp), (0, 0, -1), (0, 0, 0)
-    records["distance"] = np.linalg.norm(to_lamp), np.inf, 0.0
-    records["half_angle"] = half_angle, 0.2, 0.0
-    return wp.array(records, dtype=RoomLamp)
-
-
 def lamp_at(*positions):
     """Records of lamps at positions in the world; None stands for a distant one straight up."""
     values = []
@@ -373,7 +363,7 @@ def test_near_lamps_cast_their_own_shadow(device):
     directions, flux, samples = draw(environment)
     item = [sphere((0.1, 0, 0.1), 0.03)]
     distant = run((directions, flux, samples), item)[..., 0]
-    room_samples.place_lamps(lamps_at(lamp, 0.05), 64, samples)
+    room_samples.place_lamps(lamp_at(lamp), samples)
     near = run((directions, flux, samples), item, near=True)[..., 0]
     # Centre of the shadow: where the line through lamp and object meets the desk.
     expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)
