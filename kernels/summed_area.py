@@ -10,14 +10,15 @@ Two forms. *By rows, then columns* (``sum_area``), for CPU: a row belongs to one
 neighbours that share cache lines. On CUDA that would be a few thousand threads, each waiting for load after load.
 
 *By tiles* (``sum_area_tiled``), for CUDA: a tile is a strip of rows, and as many columns as a warp has lanes, times
-four. (1) Every tile's row sums and column sums; (2) along each row the sums of the tiles to the left, and along each
-strip the running sums of its columns; (3) every tile runs down its rows,
+four. (1) Every tile's row sums and column sums, and its total; (2) along each row the sums of the tiles to the left,
+and along each strip the running sums of its columns; (3) every tile runs down its rows,
 
     table[i, j] = table[i - 1, j] + left[i, tile] + sum of intensity[i, first column of the tile .. j],
 
 where the row above the tile is the sum over the strips above. The frame is read twice, the second time out of the
-cache, and the table written once; sums along a row go from lane to lane. A tile of one lane, as on CPU, is the same
-sum: it is how the form is tested there.
+cache, and the table written once; sums along a row go from lane to lane. Rows are loaded some at a time, before the
+first of them is needed: a warp that waits for every row takes five times as long. A tile of one lane, as on CPU, is the
+same sum: it is how the form is tested there.
 
 References:
     [Cro84] Crow, "Summed-area tables for texture mapping", SIGGRAPH 1984.
@@ -81,40 +82,12 @@ def box_mean(table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: w
     return wp.float32(box_sum(table, r0, r1, c0, c1)) / wp.float32(wp.max((r1 - r0) * (c1 - c0), 1))
 
 
-@wp.kernel(enable_backward=False)
-def sum_along_rows_kernel(
-    # In:
-    row_start: wp.int32,
-    frame: wp.array2d[wp.vec3ub],
-    # Out:
-    table_out: wp.array2d[wp.uint32],
-):
-    """One thread per row."""
-    i = row_start + wp.tid()
-    total = wp.uint32(0)
-    for j in range(frame.shape[1]):
-        total += intensity(frame[i, j])
-        table_out[i, j] = total
-
-
-@wp.kernel(enable_backward=False)
-def sum_along_columns_kernel(
-    # In:
-    column_start: wp.int32,
-    column_stop: wp.int32,
-    block: wp.int32,
-    # Out:
-    table_out: wp.array2d[wp.uint32],
-):
-    """One thread per block of columns; it adds whole rows, so the previous one is in the cache."""
-    start = column_start + wp.tid() * block
-    stop = wp.min(start + block, column_stop)
-    for i in range(1, table_out.shape[0]):
-        for j in range(start, stop):
-            table_out[i, j] = table_out[i - 1, j] + table_out[i, j]
-
+ROWS_AHEAD = wp.constant(8)
+"""Rows that a tile loads at a time."""
 
 vec4u = wp.types.vector(length=4, dtype=wp.uint32)
+row_of_sums = wp.types.vector(length=8, dtype=wp.uint32)
+rows_of_four = wp.types.matrix(shape=(8, 4), dtype=wp.uint32)
 
 
 @wp.func_native("""
@@ -145,6 +118,22 @@ def last_lane(value: wp.uint32) -> wp.uint32:
 """)
 def load_word(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int32, word: wp.int32) -> wp.uint32:
     """One of the three words of four pixels; columns and the frame's width are multiples of four."""
+
+
+@wp.func_native("""
+    const unsigned int* at = table.data + size_t(row) * table.shape[1] + column;
+#if defined(__CUDA_ARCH__)
+    if (table.shape[1] % 4 == 0) {
+        const uint4 four = *reinterpret_cast<const uint4*>(at);
+        return wp::vec_t<4, wp::uint32>(four.x, four.y, four.z, four.w);
+    }
+#endif
+    wp::vec_t<4, wp::uint32> value;
+    for (int k = 0; k < 4 && column + k < table.shape[1]; ++k) value[k] = at[k];
+    return value;
+""")
+def load_four(table: wp.array2d[wp.uint32], row: wp.int32, column: wp.int32) -> vec4u:
+    """Four neighbours, in one piece where rows are aligned; 0 beyond the row's end."""
 
 
 @wp.func_native("""
@@ -193,6 +182,44 @@ def four_intensities(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int
 
 
 @wp.kernel(enable_backward=False)
+def sum_along_rows_kernel(
+    # In:
+    row_start: wp.int32,
+    frame: wp.array2d[wp.vec3ub],
+    # Out:
+    table_out: wp.array2d[wp.uint32],
+):
+    """One thread per row, four columns at a time."""
+    i = row_start + wp.tid()
+    total = wp.uint32(0)
+    for j in range(0, frame.shape[1], 4):
+        value = four_intensities(frame, i, j)
+        value[0] = value[0] + total
+        value[1] = value[1] + value[0]
+        value[2] = value[2] + value[1]
+        value[3] = value[3] + value[2]
+        store_four(table_out, i, j, value)
+        total = value[3]
+
+
+@wp.kernel(enable_backward=False)
+def sum_along_columns_kernel(
+    # In:
+    column_start: wp.int32,
+    column_stop: wp.int32,
+    block: wp.int32,
+    # Out:
+    table_out: wp.array2d[wp.uint32],
+):
+    """One thread per block of columns; it adds whole rows, so the previous one is in the cache."""
+    start = column_start + wp.tid() * block
+    stop = wp.min(start + block, column_stop)
+    for i in range(1, table_out.shape[0]):
+        for j in range(start, stop):
+            table_out[i, j] = table_out[i - 1, j] + table_out[i, j]
+
+
+@wp.kernel(enable_backward=False)
 def sum_tiles_kernel(
     # In:
     lanes: wp.int32,
@@ -201,17 +228,26 @@ def sum_tiles_kernel(
     # Out:
     row_sums_out: wp.array2d[wp.uint32],
     column_sums_out: wp.array2d[wp.uint32],
+    totals_out: wp.array2d[wp.uint32],
 ):
-    """Row sums and column sums of every tile; a warp per tile, four columns per lane."""
+    """Row sums, column sums and total of every tile; a warp per tile, four columns per lane."""
     strip_index, t = wp.tid()
     column = 4 * t
     columns = vec4u()
-    for i in range(strip_index * strip, wp.min((strip_index + 1) * strip, frame.shape[0])):
-        value = four_intensities(frame, i, column)
-        columns += value
-        row = scan_lanes(value[0] + value[1] + value[2] + value[3])
-        if t % lanes == lanes - 1:
-            row_sums_out[i, t // lanes] = row
+    total = wp.uint32(0)
+    for first in range(strip_index * strip, (strip_index + 1) * strip, ROWS_AHEAD):
+        rows = rows_of_four()
+        for k in range(ROWS_AHEAD):
+            if first + k < frame.shape[0]:
+                rows[k] = four_intensities(frame, first + k, column)
+        for k in range(ROWS_AHEAD):
+            columns += rows[k]
+            row = scan_lanes(rows[k, 0] + rows[k, 1] + rows[k, 2] + rows[k, 3])
+            total += row
+            if first + k < frame.shape[0] and t % lanes == lanes - 1:
+                row_sums_out[first + k, t // lanes] = row
+    if t % lanes == lanes - 1:
+        totals_out[strip_index, t // lanes] = total
     if column < frame.shape[1]:
         store_four(column_sums_out, strip_index, column, columns)
 
@@ -220,17 +256,19 @@ def sum_tiles_kernel(
 def scan_sums_kernel(
     # In:
     lanes: wp.int32,
+    totals: wp.array2d[wp.uint32],
     # Out (and in: sums of every tile):
     row_sums_out: wp.array2d[wp.uint32],
     column_sums_out: wp.array2d[wp.uint32],
 ):
-    """A warp per row: what lies left of each tile. A warp per strip: running sums along its columns."""
+    """A warp per row: what lies left of each tile. A warp per tile: running sums along its strip's columns."""
     t = wp.tid()
     line = t // lanes
     lane = t % lanes
-    carry = wp.uint32(0)
+    width = column_sums_out.shape[1]
+    tiles = (width + 4 * lanes - 1) // (4 * lanes)
     if line < row_sums_out.shape[0]:
-        tiles = (column_sums_out.shape[1] + 4 * lanes - 1) // (4 * lanes)
+        carry = wp.uint32(0)
         for first in range(0, tiles, lanes):
             own = wp.uint32(0)
             if first + lane < tiles:
@@ -241,21 +279,22 @@ def scan_sums_kernel(
             carry += last_lane(running)
     else:
         line -= row_sums_out.shape[0]
-        width = column_sums_out.shape[1]
-        for first in range(0, width, 4 * lanes):
-            column = first + 4 * lane
-            sums = vec4u()
-            for k in range(4):
-                if column + k < width:
-                    sums[k] = column_sums_out[line, column + k]
-            sums[1] = sums[1] + sums[0]
-            sums[2] = sums[2] + sums[1]
-            sums[3] = sums[3] + sums[2]
-            running = scan_lanes(sums[3])
-            before = carry + running - sums[3]
-            if column < width:
-                store_four(column_sums_out, line, column, sums + vec4u(before, before, before, before))
-            carry += last_lane(running)
+        row = line // tiles
+        tile = line % tiles
+        column = 4 * (tile * lanes + lane)
+        sums = vec4u()
+        for k in range(4):
+            if column + k < width:
+                sums[k] = column_sums_out[row, column + k]
+        own = wp.uint32(0)
+        for k in range(lane, tile, lanes):
+            own += totals[row, k]
+        sums[1] = sums[1] + sums[0]
+        sums[2] = sums[2] + sums[1]
+        sums[3] = sums[3] + sums[2]
+        before = last_lane(scan_lanes(own)) + scan_lanes(sums[3]) - sums[3]
+        if column < width:
+            store_four(column_sums_out, row, column, sums + vec4u(before, before, before, before))
 
 
 @wp.kernel(enable_backward=False)
@@ -274,19 +313,25 @@ def write_tiles_kernel(
     column = 4 * t
     width = frame.shape[1]
     total = vec4u()
-    for above in range(strip_index):
-        for k in range(4):
-            if column + k < width:
-                total[k] = total[k] + column_sums[above, column + k]
-    for i in range(strip_index * strip, wp.min((strip_index + 1) * strip, frame.shape[0])):
-        value = four_intensities(frame, i, column)
-        value[1] = value[1] + value[0]
-        value[2] = value[2] + value[1]
-        value[3] = value[3] + value[2]
-        before = row_sums[i, t // lanes] + scan_lanes(value[3]) - value[3]
-        total += value + vec4u(before, before, before, before)
-        if column < width:
-            store_four(table_out, i, column, total)
+    if column < width:
+        for above in range(strip_index):
+            total += load_four(column_sums, above, column)
+    for first in range(strip_index * strip, (strip_index + 1) * strip, ROWS_AHEAD):
+        rows = rows_of_four()
+        left = row_of_sums()
+        for k in range(ROWS_AHEAD):
+            if first + k < frame.shape[0]:
+                rows[k] = four_intensities(frame, first + k, column)
+                left[k] = row_sums[first + k, t // lanes]
+        for k in range(ROWS_AHEAD):
+            value = rows[k]
+            value[1] = value[1] + value[0]
+            value[2] = value[2] + value[1]
+            value[3] = value[3] + value[2]
+            before = left[k] + scan_lanes(value[3]) - value[3]
+            total += value + vec4u(before, before, before, before)
+            if first + k < frame.shape[0] and column < width:
+                store_four(table_out, first + k, column, total)
 
 
 def sum_along_rows(frame: wp.array, table_out: wp.array, *, rows: Rows | None = None) -> None:
@@ -334,23 +379,27 @@ def _lanes(device: wp.DeviceLike) -> int:
     return 1 if wp.get_device(device).is_cpu else 32
 
 
-def tiled_shapes(height: int, width: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Shapes of the scratch arrays of ``sum_area_tiled`` for a frame of this size: row sums, column sums."""
-    return (height, -(-width // 4)), (-(-height // strip_rows(height)), width)
+def tiled_shapes(height: int, width: int) -> tuple[tuple[int, int], ...]:
+    """Shapes of the scratch arrays of ``sum_area_tiled`` for a frame of this size: row sums, column sums, totals."""
+    strips, tiles = -(-height // strip_rows(height)), -(-width // 4)
+    return (height, tiles), (strips, width), (strips, tiles)
 
 
 def strip_rows(height: int) -> int:
     """Rows of a strip: enough strips to fill a device, few enough that summing those above a tile stays cheap."""
-    return 32 if height <= 1536 else 64
+    return 16 if height <= 1200 else 32
 
 
-def sum_area_tiled(frame: wp.array, row_sums_out: wp.array, column_sums_out: wp.array, table_out: wp.array) -> None:
+def sum_area_tiled(
+    frame: wp.array, row_sums_out: wp.array, column_sums_out: wp.array, totals_out: wp.array, table_out: wp.array
+) -> None:
     """Write the whole summed-area table of a frame's intensity, by tiles.
 
     Args:
         frame: (H, W) vec3ub, RGB, contiguous.
         row_sums_out: Scratch, uint32, of ``tiled_shapes(H, W)[0]``.
         column_sums_out: Scratch, uint32, of ``tiled_shapes(H, W)[1]``.
+        totals_out: Scratch, uint32, of ``tiled_shapes(H, W)[2]``.
         table_out: (H, W) uint32, contiguous; entry (i, j) is the sum over rows 0..i and columns 0..j modulo 2^32.
 
     Raises:
@@ -358,10 +407,12 @@ def sum_area_tiled(frame: wp.array, row_sums_out: wp.array, column_sums_out: wp.
     """
     if not (frame.is_contiguous and table_out.is_contiguous):
         raise ValueError("sum_area_tiled: frame and table_out must be contiguous; copy what is a view")
-    height = frame.shape[0]
-    device, lanes, strip = frame.device, _lanes(frame.device), strip_rows(height)
-    tiles = (column_sums_out.shape[0], -(-frame.shape[1] // (4 * lanes)) * lanes)
+    height, width = frame.shape
+    device, strip = frame.device, strip_rows(height)
+    lanes = 1 if device.is_cpu else 32
+    strips, tiles = column_sums_out.shape[0], -(-width // (4 * lanes))
+    grid = (strips, tiles * lanes)
     sums = [row_sums_out, column_sums_out]
-    wp.launch(sum_tiles_kernel, tiles, [lanes, strip, frame], sums, device=device)
-    wp.launch(scan_sums_kernel, (height + tiles[0]) * lanes, [lanes], sums, device=device)
-    wp.launch(write_tiles_kernel, tiles, [lanes, strip, frame, *sums], [table_out], device=device)
+    wp.launch(sum_tiles_kernel, grid, [lanes, strip, frame], [*sums, totals_out], device=device)
+    wp.launch(scan_sums_kernel, (height + strips * tiles) * lanes, [lanes, totals_out], sums, device=device)
+    wp.launch(write_tiles_kernel, grid, [lanes, strip, frame, *sums], [table_out], device=device)

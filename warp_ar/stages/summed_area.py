@@ -33,19 +33,17 @@ class SummedArea(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The table, and the sums on the way to it by tiles."""
         width, height = self.request.size
-        rows, columns = summed_area.tiled_shapes(height, width)
-        return {
-            "summed_area": ArraySpec((height, width), wp.uint32),
-            "summed_area_row_sums": ArraySpec(rows, wp.uint32),
-            "summed_area_column_sums": ArraySpec(columns, wp.uint32),
-        }
+        names = ("summed_area_row_sums", "summed_area_column_sums", "summed_area_totals")
+        shapes = zip(names, summed_area.tiled_shapes(height, width), strict=True)
+        sums = {name: ArraySpec(shape, wp.uint32) for name, shape in shapes}
+        return {"summed_area": ArraySpec((height, width), wp.uint32), **sums}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """On CPU rows in bands of rows, then columns in bands of columns; on CUDA by tiles."""
         width, height = self.request.size
         frame, table = arrays["frame"], arrays["summed_area"]
         if not device.is_cpu:
-            sums = arrays["summed_area_row_sums"], arrays["summed_area_column_sums"]
+            sums = [arrays[f"summed_area_{name}"] for name in ("row_sums", "column_sums", "totals")]
             return [Pass(lambda rows: summed_area.sum_area_tiled(frame, *sums, table))]
         return [
             Pass(lambda rows: summed_area.sum_along_rows(frame, table, rows=rows), rows=height),
