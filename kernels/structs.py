@@ -138,5 +138,4 @@ class RoomLamp:
 
     direction: wp.vec3  # unit, from the first ball; zero where there is no lamp
     distance: wp.float32  # metres from the ball, infinite for a distant one
-    half_angle: wp.float32  # radians around the direction within which the environment holds its light
     power: wp.vec3  # radiance times solid angle at the ball, beyond what the camera captured; times distance^2: radiant intensity

@@ -143,7 +143,6 @@ class Recover(Stage):
             records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
             for record, lamp in zip(records, self.estimate.lamps, strict=False):
                 record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
-                record["half_angle"] = recovery.PEAK_ANGLE
             arrays["lamps"].assign(records)
 
         def add(rows: Rows | None) -> None:
