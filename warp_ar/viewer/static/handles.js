@@ -171,13 +171,13 @@ export class Handles extends EventTarget {
     put(item.hit, held, 24 * unit);
     item.group.classList.toggle("beyond", !!lamp && (held[0] !== lamp[0] || held[1] !== lamp[1]));
     item.lamp.setAttribute("fill", css(light.color));
-    line(item.stem, lamp, floor);
+    line(item.stem, held, floor);
     item.floor.setAttribute("d", light.kind === "directional" ? "" : this.#circle(at, 0.014, 0));
     if (item.target) {
       const target = project(this.#camera, this.#pose, light.target);
       put(item.target, target, 4.5 * unit);
       put(item.targetHit, target, 18 * unit);
-      line(item.beam, lamp, target);
+      line(item.beam, held, target);
     }
   }
 
