@@ -9,13 +9,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from rich.console import Console
+from rich.table import Table
+
 from warp_ar.errors import WarpArError
 from warp_ar.graph import make_plan
 from warp_ar.live import EXIT_DONE, EXIT_USAGE, Parser
+from warp_ar.numerics import NUMERICS
 from warp_ar.pipeline import resolve_quality
 from warp_ar.quality import DEFAULT_PRESET, PRESETS
 from warp_ar.run_log import print_plan
 from warp_ar.scene import load_scene
+from warp_ar.stages import STAGES
 from warp_ar.stages.base import Request
 
 
@@ -30,8 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
     )
+    parser.add_argument("--numerics", action="store_true", help="print every stage's precision and worst error instead")
     try:
         options: argparse.Namespace = parser.parse_args(arguments)
+        if options.numerics:
+            print_numerics()
+            return EXIT_DONE
         scene = load_scene(options.scene)
         size = (scene.camera.width, scene.camera.height)
         print_plan(make_plan(Request(scene, resolve_quality(options.quality), size)))
@@ -39,6 +48,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"warp_ar: {error}", file=sys.stderr)
         return EXIT_USAGE
     return EXIT_DONE
+
+
+def print_numerics() -> None:
+    """Print the error model: per stage its precision, expected and measured worst error, and rows of hard cases."""
+    table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
+    for stage in STAGES:
+        numbers = NUMERICS.get(stage.name)
+        if numbers is not None:
+            measured = "" if numbers.measured is None else f"{numbers.measured:.1e}"
+            rows = " ".join(map(str, numbers.rows))
+            table.add_row(stage.name, numbers.precision, numbers.expected, measured, rows)
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
 if __name__ == "__main__":

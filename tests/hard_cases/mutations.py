@@ -2,8 +2,8 @@
 
     python -m tests.hard_cases.mutations [ROW ...]
 
-copies the checkout to a temporary folder, and there, one after another: runs the row's test, which must pass; breaks the
-code by replacing one piece of text; runs the test again, which must fail; mends it. Never touches the checkout itself.
+copies the checkout to a temporary folder, and there, one after another: runs the row's test, which must pass; breaks
+the code by replacing one piece of text; runs the test again, which must fail; mends it. Never touches the checkout itself.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ MUTATIONS = (
         1,
         "straight back divides 0 by 0: no plane through the axis is picked",
         "kernels/probe.py",
-        "        if sin_psi <= 1.0e-6:  # straight back: any plane through the axis will do\n            side = any_perpendicular(axis)\n",
-        "",
-        "tests/test_probe.py::test_straight_back_and_blind",
+        "            side = any_perpendicular(axis)\n        side = wp.normalize(side)\n",
+        "            pass\n        side = side / wp.length(side)\n",
+        f"{HARD}test_rows01_03_probe.py::test_light_straight_back_along_an_axis",
     ),
     Mutation(
         2,
@@ -59,7 +59,9 @@ MUTATIONS = (
         "samples outside the frame count",
         "kernels/probe.py",
         "                        if inside >= 0.0 and ramp > 0.0:\n",
-        "                        if at[2] > rim_start:\n                            ramp = 1.0\n                            at[0] = wp.clamp(at[0], 0.0, last_column)\n                            at[1] = wp.clamp(at[1], 0.0, last_row)\n",
+        "                        if at[2] > rim_start:\n                            ramp = 1.0\n"
+        "                            at[0] = wp.clamp(at[0], 0.0, last_column)\n"
+        "                            at[1] = wp.clamp(at[1], 0.0, last_row)\n",
         "tests/test_probe.py::test_partly_outside_the_frame",
     ),
     Mutation(

@@ -35,10 +35,10 @@ def write(mesh: Mesh, path: pathlib.Path) -> pathlib.Path:
 
 
 def count_leaks(mesh: Mesh, rays: int, device: str, *, shell: Mesh | None = None, scale: float = 1.0) -> int:
-    """Rays that meet nothing, of those from just inside a closed mesh through a random edge or vertex of it.
+    """Rays that meet nothing, of those from the middle and from just inside, through a random edge or vertex.
 
     Args:
-        mesh: What the rays meet.
+        mesh: What the rays meet: closed, its middle inside.
         rays: How many.
         device: Where they are traced.
         shell: The same closed surface with its faces in order, if those of ``mesh`` are not.
@@ -56,7 +56,9 @@ def count_leaks(mesh: Mesh, rays: int, device: str, *, shell: Mesh | None = None
     for start in range(0, rays, BATCH):
         targets, normals, centers = generators.rays_at_edges(shell, min(BATCH, rays - start), rng)
         # From a little inside a face to its own edges and beyond: the other faces of the closed mesh are in the way.
-        origins = place(centers - 1e-3 * np.ptp(shell.vertices) * normals)
+        starts = centers - 1e-3 * np.ptp(shell.vertices) * normals
+        starts[::2] = 0.5 * (shell.vertices.min(0) + shell.vertices.max(0))
+        origins = place(starts)
         hits, _, occluded = shoot(scene, origins, place(targets) - origins, device)
         leaks += int(((hits["shape"] != 0) | (occluded[:, 0] != 1)).sum())
     return leaks
