@@ -1,0 +1,47 @@
+"""Room shadows and near light of bundled scenes, 640 x 480, by rung; one band, so CPU times are those of one core."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from bench.common import measure, report
+from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS
+from warp_ar.scene import load_scene
+from warp_ar.sources import open_source
+from warp_ar.stages.room_shadow import RUNGS
+
+CASES = tuple((scene, rung) for scene in ("torus", "mirror") for rung in RUNGS if rung != "brute_force")
+
+
+def main(device: str) -> None:
+    for name, rung in CASES:
+        scene = load_scene(name)
+        quality = dataclasses.replace(PRESETS["high"], edge_samples=4).with_rungs(room_shadow=rung)
+        assert scene.source is not None
+        assert scene.source.path is not None
+        with open_source(scene.source.path) as source, Pipeline(scene, device=device, quality=quality, bands=1) as pipe:
+            frame = next(iter(source)).image
+            pipe(frame)
+            ratio = pipe.arrays["physical_ratio"].numpy()
+            # Checked before it is timed: there is a shadow, most of the picture is far from it, nothing is broken.
+            assert np.isfinite(ratio).all()
+            assert ratio.min() < 0.8
+            assert np.median(ratio) > 0.95
+            passes = {
+                stage.name: [step.launch for step in steps]
+                for stage, steps in pipe._scheduler._stages
+                if stage.name in ("room_samples", "room_shadow", "object_light")
+            }
+
+            def run_all(launches):
+                for launch in launches:
+                    launch(None)
+
+            with wp.ScopedDevice(device):
+                times = measure({key: lambda steps=steps: run_all(steps) for key, steps in passes.items()}, device)
+        for key, values in times.items():
+            report(f"{key}/{name}/{rung}", values, device, changed=round(float((ratio != 1).any(-1).mean()), 3))
