@@ -41,6 +41,9 @@ EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
 # Smallest cosine between shading normal and viewer.
 MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
+EDGE_THREADS = 1 << 16
+"""Threads that share the samples of all edges."""
+
 RoomDiffuse = Literal["none", "sh", "map"]
 
 
@@ -151,36 +154,103 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
     return shade_hit
 
 
+@wp.func
+def differs(
+    i: wp.int32,
+    j: wp.int32,
+    found: wp.int32,
+    reach: wp.float32,
+    rect: wp.vec4i,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    hit: Hit,
+) -> wp.bool:
+    """Whether a neighbour sees another surface than this pixel."""
+    other = wp.int32(-1)
+    if inside_rect(i, j, rect):
+        other = hit_object[i, j]
+    if other != found:
+        return True
+    if found < 0:
+        return False
+    if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
+        return True
+    return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
+
+
 @functools.cache
-def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
-    """Kernel of ``shade``, specialised to ``config``."""
+def make_shade_sample(config: ShadeConfig) -> wp.Function:
+    """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.trace)
     side = math.isqrt(config.edge_samples)
-    if side * side != config.edge_samples or side < 1:
-        raise ValueError(f"edge_samples is {config.edge_samples}; expected a square number such as 1, 4 or 16")
 
     @wp.func(module="unique")
-    def differs(
+    def shade_sample(
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        levels: wp.array[wp.vec3],
+        level_height: wp.int32,
+        dfg: wp.array2d[wp.vec2],
+        hit_object: wp.array2d[wp.int32],
+        near_irradiance: wp.array2d[wp.vec3],
+        near_mirrored: wp.array2d[wp.vec4],
         i: wp.int32,
         j: wp.int32,
-        found: wp.int32,
-        reach: wp.float32,
-        rect: wp.vec4i,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
-        hit: Hit,
-    ) -> wp.bool:
-        other = wp.int32(-1)
-        if inside_rect(i, j, rect):
-            other = hit_object[i, j]
-        if other != found:
-            return True
-        if found < 0:
-            return False
-        if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
-            return True
-        return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
+        sample: wp.int32,
+        alone: wp.bool,
+        centre: Hit,
+    ) -> wp.vec4:
+        ray = rays[i, j]
+        inner = wp.vec3(ray[0], ray[1], 1.0)
+        if wp.static(side > 1):
+            if not alone:
+                n = wp.static(float(side))
+                a = wp.float32(sample % wp.static(side))
+                b = wp.float32(sample / wp.static(side))
+                inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
+                inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
+        direction = params[0].world_from_camera * inner
+        hit = centre
+        if wp.static(side > 1):
+            if not alone:
+                hit = closest_visible(scene, params[0].camera_position, direction)
+        if hit.shape < 0:
+            return wp.vec4(0.0)
+        pixel = wp.vec2i(-1, -1)
+        if wp.static(config.near):
+            pixel = nearest_of_object(hit_object, i, j, hit.shape)
+        radiance = shade_hit(
+            scene,
+            lights,
+            irradiance_sh,
+            irradiance_map,
+            levels,
+            level_height,
+            dfg,
+            hit,
+            direction,
+            near_irradiance,
+            near_mirrored,
+            pixel,
+            tile_turn(i, j),
+        )
+        return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+
+    return shade_sample
+
+
+@functools.cache
+def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
+    """Kernel of ``shade``, specialised to ``config``; one that is ``deferred`` lists edges instead of sampling them."""
+    shade_sample = make_shade_sample(config)
+    side = math.isqrt(config.edge_samples)
+    if side * side != config.edge_samples or side < 1:
+        raise ValueError(f"edge_samples is {config.edge_samples}; expected a square number such as 1, 4 or 16")
 
     @wp.kernel(module="unique", enable_backward=False)
     def shade_kernel(
@@ -201,6 +271,8 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
         near_mirrored: wp.array2d[wp.vec4],
         # Out:
         virtual_out: wp.array2d[wp.vec4],
+        edge_count_out: wp.array[wp.int32],
+        edges_out: wp.array[wp.vec2i],
     ):
         i, j = wp.tid()
         i += row_start
@@ -219,46 +291,125 @@ def make_shade_kernel(config: ShadeConfig) -> wp.Kernel:
                     column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
                     if differs(row, column, found, reach, rect, hit_object, hits, hit):
                         samples = wp.static(side * side)
-            ray = rays[i, j]
-            origin = params[0].camera_position
+            if wp.static(deferred):
+                if samples > 1:
+                    place = wp.atomic_add(edge_count_out, 0, 1)
+                    if place < edges_out.shape[0]:
+                        edges_out[place] = wp.vec2i(i, j)
+                        return
             for sample in range(samples):
-                inner = wp.vec3(ray[0], ray[1], 1.0)
-                if wp.static(side > 1):
-                    if samples > 1:
-                        n = wp.static(float(side))
-                        a = wp.float32(sample % wp.static(side))
-                        b = wp.float32(sample / wp.static(side))
-                        inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
-                        inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
-                direction = params[0].world_from_camera * inner
-                if wp.static(side > 1):
-                    if samples > 1:
-                        hit = closest_visible(scene, origin, direction)
-                if hit.shape >= 0:
-                    pixel = wp.vec2i(-1, -1)
-                    if wp.static(config.near):
-                        pixel = nearest_of_object(hit_object, i, j, hit.shape)
-                    radiance = shade_hit(
-                        scene,
-                        lights,
-                        irradiance_sh,
-                        irradiance_map,
-                        levels,
-                        level_height,
-                        dfg,
-                        hit,
-                        direction,
-                        near_irradiance,
-                        near_mirrored,
-                        pixel,
-                        tile_turn(i, j),
-                    )
-                    result += wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+                result += shade_sample(
+                    params,
+                    rays,
+                    scene,
+                    lights,
+                    irradiance_sh,
+                    irradiance_map,
+                    levels,
+                    level_height,
+                    dfg,
+                    hit_object,
+                    near_irradiance,
+                    near_mirrored,
+                    i,
+                    j,
+                    sample,
+                    samples == 1,
+                    hit,
+                )
             if samples > 1:
                 result = result / wp.float32(samples)
         virtual_out[i, j] = result
 
     return shade_kernel
+
+
+@functools.cache
+def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
+    """Kernel that shades every sample of the edges that were listed."""
+    shade_sample = make_shade_sample(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sample_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        levels: wp.array[wp.vec3],
+        level_height: wp.int32,
+        dfg: wp.array2d[wp.vec2],
+        hit_object: wp.array2d[wp.int32],
+        near_irradiance: wp.array2d[wp.vec3],
+        near_mirrored: wp.array2d[wp.vec4],
+        edge_count: wp.array[wp.int32],
+        edges: wp.array[wp.vec2i],
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = wp.min(edge_count[0], edges.shape[0]) * wp.static(config.edge_samples)
+        while item < stop:
+            edge = edges[item / wp.static(config.edge_samples)]
+            samples_out[item] = shade_sample(
+                params,
+                rays,
+                scene,
+                lights,
+                irradiance_sh,
+                irradiance_map,
+                levels,
+                level_height,
+                dfg,
+                hit_object,
+                near_irradiance,
+                near_mirrored,
+                edge[0],
+                edge[1],
+                item % wp.static(config.edge_samples),
+                False,
+                Hit(),
+            )
+            item += threads
+
+    return sample_edges_kernel
+
+
+@wp.kernel(enable_backward=False)
+def average_edges_kernel(
+    # In:
+    threads: wp.int32,
+    count: wp.int32,
+    edge_count: wp.array[wp.int32],
+    edges: wp.array[wp.vec2i],
+    samples: wp.array[wp.vec4],
+    # Out:
+    virtual_out: wp.array2d[wp.vec4],
+):
+    """Mean of every listed edge's samples, in their order."""
+    item = wp.tid()
+    stop = wp.min(edge_count[0], edges.shape[0])
+    while item < stop:
+        result = wp.vec4(0.0)
+        for sample in range(count):
+            result += samples[item * count + sample]
+        virtual_out[edges[item][0], edges[item][1]] = result / wp.float32(count)
+        item += threads
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EdgeLists:
+    """Scratch arrays for edges that are sampled on their own; edges beyond what they hold are sampled in place."""
+
+    count: wp.array[wp.int32]
+    """(1,): edges found."""
+    edges: wp.array[wp.vec2i]
+    """(n,): row and column of each."""
+    samples: wp.array[wp.vec4]
+    """(n * edge_samples,): radiance and coverage."""
 
 
 def shade(
@@ -278,9 +429,13 @@ def shade(
     *,
     near_irradiance: wp.array2d[wp.vec3] | None = None,
     near_mirrored: wp.array2d[wp.vec4] | None = None,
+    edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Shade what ``trace_pixels`` found.
+
+    Samples of edges take many times as long as the pixels around them. On CUDA that holds up whole warps; given
+    ``edge_lists``, edges are listed first and their samples shaded side by side, with the same result.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.
@@ -298,27 +453,22 @@ def shade(
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
         near_irradiance: (H, W) as ``filter_object_light`` writes; needed if ``config.near``.
         near_mirrored: (H, W) likewise.
+        edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    launch_rows(
-        make_shade_kernel(config),
-        rays.shape,
-        [
-            params,
-            rays,
-            scene,
-            lights,
-            irradiance_sh,
-            irradiance_map,
-            levels,
-            level_height,
-            dfg,
-            hit_object,
-            hits,
-            near_irradiance,
-            near_mirrored,
-        ],
-        [virtual_out],
-        rows=rows,
-        device=rays.device,
-    )
+    inputs = [params, rays, scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit_object]
+    near = [near_irradiance, near_mirrored]
+    device = rays.device
+    if edge_lists is None or config.edge_samples == 1:
+        kernel, outputs = make_shade_kernel(config), [virtual_out, None, None]
+        launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
+        return
+    count, edges, samples = edge_lists.count, edge_lists.edges, edge_lists.samples
+    count.zero_()
+    kernel, outputs = make_shade_kernel(config, deferred=True), [virtual_out, count, edges]
+    launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
+    listed = [count, edges]
+    sampling = [EDGE_THREADS, *inputs, *near, *listed]
+    wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)
+    averaging = [EDGE_THREADS, config.edge_samples, *listed, samples]
+    wp.launch(average_edges_kernel, EDGE_THREADS, averaging, [virtual_out], device=device)

@@ -43,9 +43,12 @@ def spot_falloff(light: Light, wi: wp.vec3) -> wp.float32:
     """1 inside the inner half angle, falling linearly in angle to 0 at the outer one; a step where both are equal.
 
     The angle comes from atan2, exact at both ends where acos is not. The axis itself is always inside: a cone of 0
-    degrees is a line.
+    degrees is a line. Where 1 - x^2 / 2 <= cos x already says that a point is outside, no angle is needed.
     """
     axis = -light.direction
+    # Both vectors are of unit length to a few roundings, so the margin is ample.
+    if wp.dot(axis, wi) < 1.0 - 0.5 * light.outer_angle * light.outer_angle - 1.0e-5:
+        return 0.0
     angle = wp.atan2(wp.length(wp.cross(axis, wi)), wp.dot(axis, wi))
     if angle <= light.inner_angle:
         return 1.0

@@ -13,7 +13,7 @@ from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
-from warp_ar.kernels.shade import ShadeConfig, shade
+from warp_ar.kernels.shade import EdgeLists, ShadeConfig, shade
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
 
@@ -73,7 +73,16 @@ def scene_of(world, *fields, device):
 
 
 def render(
-    scene, config, device, *, light_array=None, light_room=1.0, rect=(0, 48, 0, 64), bands=(None,), eye=(0.0, 0.0, 0.0)
+    scene,
+    config,
+    device,
+    *,
+    light_array=None,
+    light_room=1.0,
+    rect=(0, 48, 0, 64),
+    bands=(None,),
+    eye=(0.0, 0.0, 0.0),
+    listed=0,
 ):
     """Trace and shade a frame of a camera at ``eye`` that looks along +z; (48, 64, 4)."""
     params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
@@ -91,9 +100,14 @@ def render(
         integrate_dfg(dfg)
     light_array = lights(device=device) if light_array is None else light_array
     trace_pixels(config.trace, params, rays, scene, found, depth, hits)
+    lists = None
+    if listed:
+        samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
+        count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
+        lists = EdgeLists(count, edges, samples)
     for rows in bands:
         inputs = (params, rays, scene, light_array, sh, None, levels, LEVEL_HEIGHT, dfg, found, hits)
-        shade(config, *inputs, virtual, rows=rows)
+        shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 
 
@@ -160,6 +174,17 @@ def test_near_vertical_edge_has_every_shade(device):
     scene = scene_of(world, WHITE["lambert"], device=device)
     alpha = render(scene, dataclasses.replace(EVERYTHING, edge_samples=16), device)[..., 3]
     assert len(np.unique(np.round(alpha * 16))) >= 16
+
+
+@pytest.mark.parametrize("edge_samples", [4, 16])
+@pytest.mark.parametrize("listed", [5, 3000])
+def test_listed_edges_are_the_same(device, edge_samples, listed):
+    """Edges sampled on their own, or in place where the list is full, give the bits of edges sampled in place."""
+    scene = scene_of(ball(device), WHITE["plastic"], device=device)
+    config = dataclasses.replace(EVERYTHING, edge_samples=edge_samples)
+    expected = render(scene, config, device)
+    assert ((expected[..., 3] > 0.0) & (expected[..., 3] < 1.0)).sum() > 20
+    np.testing.assert_array_equal(render(scene, config, device, listed=listed), expected)
 
 
 # --- The float64 twin -------------------------------------------------------------------------------------------------

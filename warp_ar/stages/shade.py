@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.shade import RoomDiffuse, ShadeConfig, make_shade_kernel, shade
+from warp_ar.kernels.shade import EdgeLists, RoomDiffuse, ShadeConfig, shade
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.ray_scene import (
     has_sized_lights,
@@ -24,6 +24,9 @@ from warp_ar.stages.visibility import GrowingRows
 
 # Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
 DFG_SIZE = 32
+
+LISTED_SHARE = 16
+"""Edges that can be listed: one pixel in so many."""
 
 
 def shade_config(request: Request) -> ShadeConfig:
@@ -86,9 +89,15 @@ class Shade(Stage):
         return Wiring(tuple(reads), ("virtual",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The shaded objects and, for metallic-roughness, the table of its reflectance."""
+        """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
         width, height = self.request.size
-        specs = {"virtual": ArraySpec((height, width), wp.vec4)}
+        edges = width * height // LISTED_SHARE
+        specs = {
+            "virtual": ArraySpec((height, width), wp.vec4),
+            "shade_edge_count": ArraySpec((1,), wp.int32),
+            "shade_edges": ArraySpec((edges,), wp.vec2i),
+            "shade_edge_samples": ArraySpec((edges * self.request.quality.edge_samples,), wp.vec4),
+        }
         if METALLIC_ROUGHNESS in shade_config(self.request).models:
             specs["shade_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
         return specs
@@ -96,7 +105,9 @@ class Shade(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were; the table is computed here, once."""
         config = shade_config(self.request)
-        make_shade_kernel(config)
+        lists = None
+        if not device.is_cpu:
+            lists = EdgeLists(*(arrays[f"shade_{name}"] for name in ("edge_count", "edges", "edge_samples")))
         dfg = arrays.get("shade_dfg")
         if dfg is not None:
             integrate_dfg(dfg)
@@ -122,6 +133,7 @@ class Shade(Stage):
                 arrays["virtual"],
                 near_irradiance=arrays.get("object_irradiance"),
                 near_mirrored=arrays.get("object_mirrored"),
+                edge_lists=lists,
                 rows=rows,
             )
 
