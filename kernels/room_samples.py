@@ -40,6 +40,8 @@ SIDE_WEIGHT = wp.constant(wp.float32(0.3))
 """Weight of directions that the desk does not see, beside the cosine of those that it does."""
 FAR_AWAY = wp.constant(wp.float32(1.0e30))
 """Distance of light that is part of the environment."""
+LAMP_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
+"""Cosine of the largest angle between a lamp's direction and light that belongs to it."""
 MIN_LAMP_DISTANCE = wp.constant(wp.float32(0.05))
 """Metres from the ball within which no lamp is taken to be."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
@@ -278,11 +280,13 @@ def place_lamps_kernel(
     """Give the samples that show a lamp the distance of the lamp that they are nearest to."""
     index = wp.tid() + row_start
     sample = samples_out[index]
-    nearest = float(-1.0)
+    if wp.max(sample.radiance) < 1.0:
+        return
+    nearest = LAMP_COSINE
     for k in range(lamps.shape[0]):
         lamp = lamps[k]
         cosine = wp.dot(lamp.direction, sample.direction)
-        if cosine > nearest and cosine >= wp.cos(lamp.half_angle) and lamp.half_angle > 0.0:
+        if cosine > nearest:
             nearest = cosine
             samples_out[index].distance = wp.clamp(lamp.distance, MIN_LAMP_DISTANCE, FAR_AWAY)
 
@@ -290,8 +294,10 @@ def place_lamps_kernel(
 def place_lamps(lamps: wp.array[RoomLamp], samples_out: wp.array[RoomSample], *, rows: Rows | None = None) -> None:
     """Turn the samples of near lamps from directions into places.
 
+    A sample shows a lamp if it is as bright as clipping and within ``LAMP_COSINE`` of its direction.
+
     Args:
-        lamps: (k,) lamps; those of no angle are none, those at infinity stay directions.
+        lamps: (k,) lamps; those without direction are none, those at infinity stay directions.
         samples_out: (n,) samples, drawn from an environment captured where the lamps' distances are from.
         rows: Range of samples; None means all.
     """

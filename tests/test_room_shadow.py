@@ -215,14 +215,14 @@ def test_texels_list_the_map(device):
     np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
 
 
-def lamp_at(*positions, half_angle=0.1):
+def lamp_at(*positions):
     """Records of lamps at positions in the world, and an unused one; None stands for a distant lamp straight up."""
     values = []
     for at in positions:
         offset = np.array([0, 0, 1.0]) if at is None else np.asarray(at) - ORIGIN
         distance = np.linalg.norm(offset)
         far = np.inf if at is None else distance
-        values.append({"direction": offset / distance, "distance": far, "half_angle": half_angle})
+        values.append({"direction": offset / distance, "distance": far})
     return records(RoomLamp, *values, {})
 
 
