@@ -27,6 +27,9 @@ before virtual light is added to it: that is known and needs no guess.
 
 A longer exposure, s > 1, is scaled and clipped: what a camera does.
 
+``declipped``: each clipped pixel has the radiance that ``declip`` estimates for it, at least what the camera
+shows; s = 1 is the identity.
+
 Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
 
 ``auto`` keeps highlights of virtual light on the desk below clipping. Over a grid of pixels that virtual light falls
@@ -53,12 +56,13 @@ import warp as wp
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.composite import CompositeConfig, in_rect, make_compose, make_is_changed
 from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.probe import is_clipped
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.summed_area import box_mean
 
 wp.set_module_options({"enable_backward": False})
 
-RUNGS = ("plain", "box")
+RUNGS = ("plain", "box", "declipped")
 """Cheapest first."""
 
 MAX_BOX = 1.0 / 8.0
@@ -91,7 +95,7 @@ NO_LAYERS = CompositeConfig()
 class ExposureConfig:
     """What is compiled into the kernel."""
 
-    rung: Literal["plain", "box"] = "plain"
+    rung: Literal["plain", "box", "declipped"] = "plain"
     """How clipped pixels darken."""
     layers: CompositeConfig = NO_LAYERS
     """What is composed before it is exposed."""
@@ -248,6 +252,7 @@ def make_expose_kernel(config: ExposureConfig) -> wp.Kernel:
         physical_ratio: wp.array2d[wp.vec3],
         table: wp.array2d[wp.uint32],
         max_box: wp.int32,
+        declipped: wp.array2d[wp.vec3],
         scale: wp.array[wp.float32],
         codes: wp.array[wp.vec3ub],
         # Out:
@@ -263,12 +268,18 @@ def make_expose_kernel(config: ExposureConfig) -> wp.Kernel:
             if least > KNEE and s < 1.0:
                 clipped = (least - KNEE) / (255.0 - KNEE)
                 gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
-        if gain == 1.0 and not is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
+        guessed = bool(gain != 1.0)
+        if wp.static(config.rung == "declipped"):
+            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
+        if not guessed and not is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
             image_out[i, j] = wp.vec3ub(
                 codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2]
             )
         else:
             radiance = gain * decode(decode_table, code)
+            if wp.static(config.rung == "declipped"):
+                if guessed:
+                    radiance = declipped[i, j]
             radiance = compose(radiance, params, virtual_layer, physical_added, physical_ratio, i, j)
             image_out[i, j] = encode(encode_table, s * radiance)
 
@@ -344,6 +355,7 @@ def expose(
     codes: wp.array,
     image_out: wp.array,
     *,
+    declipped: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the picture at another exposure, layers composed.
@@ -361,6 +373,7 @@ def expose(
         scale: (1,) float32, not negative.
         codes: (256,) vec3ub of ``expose_codes`` for this ``scale``.
         image_out: (H, W) vec3ub.
+        declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
         rows: Band of rows; None means all.
     """
     launch_rows(
@@ -376,6 +389,7 @@ def expose(
             physical_ratio,
             table,
             largest_box(frame.shape[0]),
+            declipped,
             scale,
             codes,
         ],

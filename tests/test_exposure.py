@@ -26,8 +26,25 @@ def run(frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, r
     exposure.expose_codes(decode, encode, scale_array, codes)
     over = array(virtual, wp.vec4), array(added, wp.vec3), array(ratio, wp.vec3)
     config = exposure.ExposureConfig(rung, layers)
-    exposure.expose(config, params, frame_array, decode, encode, *over, table, scale_array, codes, image)
+    exposure.expose(
+        config,
+        params,
+        frame_array,
+        decode,
+        encode,
+        *over,
+        table,
+        scale_array,
+        codes,
+        image,
+        declipped=wp.array(declipped(frame, transfer), dtype=wp.vec3),
+    )
     return image.numpy()
+
+
+def declipped(frame, transfer="srgb"):
+    """An estimate to expose: three times clipping wherever a channel clips, in that channel."""
+    return np.where(frame >= 254, 3.0, linear(frame, transfer))
 
 
 def linear(frame, transfer="srgb"):
@@ -88,6 +105,16 @@ def test_centre_stays_bright_and_edge_fades(device):
     assert profile[-1] < 220
     unclipped = frame[..., 0] < 255
     np.testing.assert_array_equal(box[unclipped], plain[unclipped])
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_declipped_pixels_show_their_estimate(device, scale):
+    frame = make_layers(4)[0]
+    frame[::3, ::2, 0] = 255
+    frame[::5, ::5] = 255
+    radiance = declipped(frame) if scale < 1.0 else linear(frame)  # only a shorter exposure shows it
+    exact = reference_color.encoded_srgb(np.clip(radiance * np.float64(scale), 0.0, 1.0))
+    assert (np.abs(run(frame, scale, "declipped") - exact) <= 0.5 + NEAR_HALF).all()
 
 
 def test_pixel_with_a_hue_is_not_lifted(device):

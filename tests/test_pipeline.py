@@ -178,7 +178,7 @@ def test_only_what_the_scene_calls_for_is_planned() -> None:
     room = {"unwrap", "accumulate", "fill"}
     off = Exposure(1.0)
     assert stages(objects=(), lights=(), exposure=off) == set()
-    assert stages(objects=(), lights=()) == {"summed_area", "expose"}
+    assert stages(objects=(), lights=()) == {"expose"}, "plain scaling asks for nothing else"
     assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
     assert {"shade", "visibility", "diffuse", "specular"}.isdisjoint(stages(objects=(), exposure=off))
     assert room.isdisjoint(stages(probes=())), "without a ball there is no room light to capture"

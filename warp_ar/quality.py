@@ -47,6 +47,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="relief",
                 recover="clipped",
                 room_shadow="none",
+                expose="box",
                 shade="environment",
             ),
             _preset(
@@ -58,6 +59,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="relief",
                 recover="white_card",
                 room_shadow="none",
+                expose="plain",
                 shade="environment",
             ),
             _preset(
@@ -70,6 +72,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="reflectance",
                 recover="white_card",
                 room_shadow="coarse",
+                expose="glow",
                 shade="environment",
             ),
             _preset(
@@ -82,6 +85,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="reflectance",
                 recover="shading",
                 room_shadow="bounce",
+                expose="ball",
                 shade="one_bounce",
             ),
             _preset(
@@ -94,6 +98,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 relight="reflectance",
                 recover="shading",
                 room_shadow="brute_force",
+                expose="ball",
                 shade="one_bounce",
             ),
         )

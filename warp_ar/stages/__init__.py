@@ -5,6 +5,7 @@ from __future__ import annotations
 from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Stage
 from warp_ar.stages.composite import Composite
+from warp_ar.stages.declip import Declip
 from warp_ar.stages.diffuse import Diffuse
 from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
@@ -36,5 +37,6 @@ STAGES: tuple[type[Stage], ...] = (
     ObjectLight,
     Shade,
     Composite,
+    Declip,
     Expose,
 )

@@ -10,18 +10,19 @@ import warp as wp
 from warp_ar.kernels import exposure
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import composite_config, exposes, layer_names
+from warp_ar.stages.declip import declips
 
 
 class Expose(Stage):
-    """Composes the picture and scales its light, over-exposed regions by their surroundings."""
+    """Composes the picture and scales its light, over-exposed regions by what they are guessed to have been."""
 
     name = "expose"
-    rungs = exposure.RUNGS
-    summary = "another exposure: saturated centres darken last"
+    rungs = ("plain", "box", "glow", "ball")
+    summary = "another exposure: over-exposed regions keep what they can be guessed to have had"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Reads the layers, and the table where it darkens by the box."""
+        """Reads the layers, and what its rung knows of clipped pixels."""
         if not exposes(request):
             return LeftOut(
                 "exposure is 1"
@@ -33,6 +34,8 @@ class Expose(Stage):
             reads.append("clock")
         if uses_table(request):
             reads.append("summed_area")
+        if declips(request):
+            reads.append("declipped")
         return Wiring(tuple(reads), ("image",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -51,7 +54,9 @@ class Expose(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
         layers = composite_config(layer_names(self.request))
-        config = exposure.ExposureConfig("box" if uses_table(self.request) else "plain", layers)
+        config = exposure.ExposureConfig(
+            "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", layers
+        )
         exposure.make_expose_kernel(config)
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
@@ -83,6 +88,7 @@ class Expose(Stage):
                 scale,
                 codes,
                 arrays["image"],
+                declipped=arrays.get("declipped"),
                 rows=rows,
             )
 
@@ -93,4 +99,4 @@ class Expose(Stage):
 def uses_table(request: Request) -> bool:
     """Whether darkening looks at a pixel's surroundings: only the box does, and only where light is taken away."""
     scale = request.scene.exposure.scale
-    return exposes(request) and request.quality.rung("expose") != "plain" and (isinstance(scale, str) or scale < 1.0)
+    return exposes(request) and request.quality.rung("expose") == "box" and (isinstance(scale, str) or scale < 1.0)

@@ -1,0 +1,81 @@
+"""How bright the camera's clipped pixels really were."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import declip
+from warp_ar.ray_scene import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.composite import exposes
+from warp_ar.stages.recover import recovers
+
+
+class Declip(Stage):
+    """Estimates radiance above clipping, which another exposure brings into view; its rungs are those of ``expose``."""
+
+    name: ClassVar[str] = "declip"
+    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "estimates how bright clipped pixels were, by hue, depth and the ball"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Wired where a shorter exposure is asked for at a rung that looks above clipping."""
+        if not declips(request):
+            return LeftOut("no shorter exposure asks how bright clipped pixels were")
+        return Wiring(("frame", "pose", "environment") if asks_ball(request) else ("frame",), ("declipped",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The frame's radiance, and a pyramid of hues."""
+        width, height = self.request.size
+        return {
+            "declipped": ArraySpec((height, width), wp.vec3),
+            "declip_levels": ArraySpec((declip.level_texels(height, width),), wp.vec4),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Twice up and down the pyramid: for pixels that clip in some channels, then for those that clip in all."""
+        ball = asks_ball(self.request)
+        config = declip.DeclipConfig(ball, trace_config(self.request.scene).proxies if ball else ())
+        declip.make_complete_core_kernel(config)
+        frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
+        shape = frame.shape
+        half = declip.level_shapes(*shape)[0][0]
+
+        def core(rows: Rows | None) -> None:
+            declip.complete_core(
+                config,
+                frame,
+                levels,
+                arrays["params"],
+                arrays["rays"],
+                arrays["ray_scene"],
+                arrays["probes"],
+                arrays["environment"] if ball else None,
+                out,
+                rows=rows,
+            )
+
+        return [
+            Pass(lambda rows: declip.pull_frame(frame, decode, levels, rows=rows), rows=half),
+            Pass(lambda rows: declip.fill_levels(shape, levels)),
+            Pass(lambda rows: declip.complete(frame, decode, levels, out, rows=rows), rows=shape[0]),
+            Pass(lambda rows: declip.pull_completed(frame, out, levels, rows=rows), rows=half),
+            Pass(lambda rows: declip.fill_levels(shape, levels)),
+            Pass(core, rows=shape[0]),
+        ]
+
+
+def declips(request: Request) -> bool:
+    """Whether clipped pixels are to be estimated: only a shorter exposure shows them."""
+    scale = request.scene.exposure.scale
+    shorter = isinstance(scale, str) or scale < 1.0
+    return exposes(request) and shorter and request.quality.rung("expose") in ("glow", "ball")
+
+
+def asks_ball(request: Request) -> bool:
+    """Whether the ball's light says more: only with the energy put back that clipping took there too."""
+    return request.quality.rung("expose") == "ball" and bool(request.scene.probes) and recovers(request)
