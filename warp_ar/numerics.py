@@ -2,7 +2,8 @@
 
 Errors are relative to the largest value of a stage's output, and those of float32 arithmetic alone: what a method
 leaves out (the distance of a lamp, the lobes of an order-2 series) is the price list's matter. The measured ones are
-the largest differences from float64 twins on CPU; ``python -m tests.hard_cases.measure_errors`` in a checkout measures them anew.
+the largest differences from float64 twins on CPU; in a checkout, ``python -m tests.hard_cases.measure_errors`` measures
+them anew.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
     python -m tests.hard_cases.mutations [ROW ...]
 
 copies the checkout to a temporary folder, and there, one after another: runs the row's test, which must pass; breaks
-the code by replacing one piece of text; runs the test again, which must fail; mends it. Never touches the checkout itself.
+the code by replacing one piece of text; runs the test again, which must fail; mends it. The checkout stays as it is.
 """
 
 from __future__ import annotations
@@ -138,10 +138,10 @@ MUTATIONS = (
     ),
     Mutation(
         12,
-        "1 / scale without a bound",
+        "any scale is an exposure: NaN and negative ones too",
         "kernels/exposure.py",
-        "    return wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)\n",
-        "    return params[0].exposure_scale\n",
+        "    scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)\n",
+        "    scale_out[0] = params[0].exposure_scale\n",
         f"{HARD}test_rows11_12_exposure.py::test_exposures_at_their_ends",
     ),
     Mutation(

@@ -1,0 +1,89 @@
+"""Writes the table of hard cases into docs/hard-cases.md from reports of pytest.
+
+    python -m pytest -q --junitxml=cpu.xml                  # where there is a CUDA device, its tests are in the report too
+    python -m tests.hard_cases.table REPORT.xml [...] [--note "when and on what"]
+
+A report counts for CPU and for CUDA by what its tests' names say (``[cuda:0-...]``); a column that no report fills keeps
+what stands there. A cell says how many of a stage's rungs passed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import pathlib
+import re
+import xml.etree.ElementTree as ElementTree
+
+from tests.hard_cases import atlas
+
+FILE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "hard-cases.md"
+BEGIN, END = "<!-- table -->", "<!-- /table -->"
+
+Results = dict[tuple[int, str, str], list[bool]]
+
+
+def read_reports(paths: list[pathlib.Path]) -> dict[str, Results]:
+    """Outcome of every test, by device and cell; skipped tests say nothing."""
+    found: dict[str, Results] = {"CPU": collections.defaultdict(list), "CUDA": collections.defaultdict(list)}
+    for path in paths:
+        for case in ElementTree.parse(path).iter("testcase"):
+            if case.find("skipped") is not None:
+                continue
+            name = case.get("name", "")
+            device = "CUDA" if "cuda" in name else "CPU"
+            good = case.find("failure") is None and case.find("error") is None
+            for entry in case.iter("property"):
+                if entry.get("name") == "atlas":
+                    row, stage, rung = entry.get("value", "").split("/")
+                    found[device][int(row), stage, rung].append(good)
+    return found
+
+
+def cell_text(results: Results, row: int, stage: str) -> str:
+    """What one stage's cell says: rungs passed of all, or who failed."""
+    rungs = atlas.rungs_of(stage)
+    tried = {rung: results.get((row, stage, rung), []) for rung in rungs}
+    if not any(tried.values()):
+        return ""
+    failed = [rung for rung, outcomes in tried.items() if not all(outcomes)]
+    if failed:
+        return "FAILED: " + ", ".join(failed)
+    count = sum(bool(outcomes) for outcomes in tried.values())
+    return f"{count}/{len(rungs)} ({sum(map(len, tried.values()))} tests)"
+
+
+def make_table(results: dict[str, Results], before: str) -> str:
+    """The table, one line per row and stage, columns of devices that no report fills taken over from ``before``."""
+    old = {tuple(line.split("|")[1:3]): line.split("|")[4:6] for line in before.splitlines() if line.startswith("| ")}
+    lines = ["| row | stage | rungs | CPU | CUDA |", "| --- | --- | --- | --- | --- |"]
+    known = {stage for _, stage, _ in atlas.cells()}
+    for row, stages in atlas.CONCERNS.items():
+        for stage in (stage for stage in stages if stage in known):
+            kept = old.get((f" {row} ", f" {stage} "), ["", ""])
+            columns = [
+                (cell_text(results[device], row, stage) or kept[index].strip())
+                for index, device in enumerate(("CPU", "CUDA"))
+            ]
+            lines.append(f"| {row} | {stage} | {' '.join(atlas.rungs_of(stage))} | {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Write the table of hard cases from pytest's JUnit reports.")
+    parser.add_argument("reports", nargs="+", type=pathlib.Path, metavar="REPORT.xml")
+    parser.add_argument("--note", help="when the reports were made, and on what")
+    options = parser.parse_args()
+    text = FILE.read_text()
+    match = re.search(f"{re.escape(BEGIN)}(.*?){re.escape(END)}", text, re.DOTALL)
+    assert match is not None, f"{FILE} has no {BEGIN} ... {END}"
+    table = make_table(read_reports(options.reports), match.group(1))
+    notes = [line for line in match.group(1).splitlines() if line.startswith("- ")]
+    if options.note:
+        notes.append(f"- {options.note}")
+    body = "\n".join([*notes, "", table] if notes else ["", table])
+    FILE.write_text(text.replace(match.group(0), f"{BEGIN}\n{body}\n{END}"))
+
+
+if __name__ == "__main__":
+    main()
