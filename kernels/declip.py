@@ -29,7 +29,8 @@ there a is approached as 1 - 2^-q. (At once would be too soon: a region's recove
 
 **Filling.** Pull and push over a pyramid: a level's sums of weighted values are its children's; downward, what a
 texel does not know to a full weight it takes from the coarser level, bilinearly [GGSC96]. The number of levels
-climbed on the way, a smooth log2 of the distance, comes along.
+climbed on the way, a smooth log2 of the distance, comes along. Only tiles in which something clips, and their
+neighbours, take part.
 
 References:
     [GGSC96] Gortler, Grzeszczuk, Szeliski, Cohen, "The Lumigraph", SIGGRAPH 1996, section 3.4 (pull-push).
@@ -46,12 +47,18 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.probe import is_clipped
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
 
 wp.set_module_options({"enable_backward": False})
 
+KNEE = wp.constant(wp.float32(250.0))
+"""Code above which a channel begins to count as clipped: noise and video codecs scatter around clipping."""
+CLIPPED = wp.constant(wp.float32(254.0))
+"""Code from which it is."""
+TILE_LEVEL = 4
+"""A tile is 2^4 = 16 pixels wide."""
+_TILE_LEVEL = wp.constant(TILE_LEVEL)
 DARKEST = wp.constant(wp.float32(0.25))
 """Largest channel below which a pixel's hue says nothing of clipped neighbours: two stops below clipping."""
 LEAST_HUE = wp.constant(wp.float32(1.0 / 64.0))
@@ -75,6 +82,16 @@ class DeclipConfig:
 
 
 @wp.func
+def clipping(code: wp.vec3ub) -> wp.vec3:
+    """How far each channel counts as clipped, 0..1: 1 from ``CLIPPED`` up."""
+    return wp.vec3(
+        wp.clamp((wp.float32(code[0]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+        wp.clamp((wp.float32(code[1]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+        wp.clamp((wp.float32(code[2]) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0),
+    )
+
+
+@wp.func
 def hue_weight(radiance: wp.vec3) -> wp.float32:
     """How much an unclipped pixel says about its clipped neighbours."""
     w = wp.clamp((wp.max(radiance) - DARKEST) / (1.0 - DARKEST), 0.0, 1.0)
@@ -92,9 +109,46 @@ def weighted_hue(radiance: wp.vec3) -> wp.vec4:
 
 
 @wp.kernel(enable_backward=False)
+def mark_tiles_kernel(
+    # In:
+    row_start: wp.int32,
+    frame: wp.array2d[wp.vec3ub],
+    # Out:
+    marked_out: wp.array2d[wp.int32],
+):
+    """1 where a tile has a clipped channel."""
+    i, j = wp.tid()
+    i += row_start
+    found = wp.int32(0)
+    for r in range(i << _TILE_LEVEL, wp.min((i + 1) << _TILE_LEVEL, frame.shape[0])):
+        for c in range(j << _TILE_LEVEL, wp.min((j + 1) << _TILE_LEVEL, frame.shape[1])):
+            code = frame[r, c]
+            if wp.float32(wp.max(wp.max(code[0], code[1]), code[2])) > KNEE:
+                found = wp.int32(1)
+    marked_out[i, j] = found
+
+
+@wp.kernel(enable_backward=False)
+def widen_tiles_kernel(
+    # In:
+    marked: wp.array2d[wp.int32],
+    # Out:
+    active_out: wp.array2d[wp.int32],
+):
+    """1 where a tile or one of its eight neighbours is marked."""
+    i, j = wp.tid()
+    found = wp.int32(0)
+    for r in range(wp.max(i - 1, 0), wp.min(i + 2, marked.shape[0])):
+        for c in range(wp.max(j - 1, 0), wp.min(j + 2, marked.shape[1])):
+            found = wp.max(found, marked[r, c])
+    active_out[i, j] = found
+
+
+@wp.kernel(enable_backward=False)
 def pull_frame_kernel(
     # In:
     row_start: wp.int32,
+    active: wp.array2d[wp.int32],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     columns: wp.int32,
@@ -104,11 +158,14 @@ def pull_frame_kernel(
     """First level: hues of pixels that clip in no channel."""
     i, j = wp.tid()
     i += row_start
+    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
+        levels_out[i * columns + j] = wp.vec4()
+        return
     total = wp.vec4()
     for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
         for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
             code = frame[r, c]
-            if wp.max(is_clipped(code)) == 0.0:
+            if wp.max(clipping(code)) == 0.0:
                 total += weighted_hue(decode(decode_table, code))
     levels_out[i * columns + j] = total
 
@@ -117,6 +174,7 @@ def pull_frame_kernel(
 def pull_completed_kernel(
     # In:
     row_start: wp.int32,
+    active: wp.array2d[wp.int32],
     frame: wp.array2d[wp.vec3ub],
     completed: wp.array2d[wp.vec3],
     columns: wp.int32,
@@ -126,10 +184,13 @@ def pull_completed_kernel(
     """First level again: hues of pixels that do not clip in all channels."""
     i, j = wp.tid()
     i += row_start
+    if active[i >> (_TILE_LEVEL - 1), j >> (_TILE_LEVEL - 1)] == 0:
+        levels_out[i * columns + j] = wp.vec4()
+        return
     total = wp.vec4()
     for r in range(2 * i, wp.min(2 * i + 2, frame.shape[0])):
         for c in range(2 * j, wp.min(2 * j + 2, frame.shape[1])):
-            if wp.min(is_clipped(frame[r, c])) == 0.0:
+            if wp.min(clipping(frame[r, c])) == 0.0:
                 total += weighted_hue(completed[r, c])
     levels_out[i * columns + j] = total
 
@@ -137,6 +198,8 @@ def pull_completed_kernel(
 @wp.kernel(enable_backward=False)
 def pull_level_kernel(
     # In:
+    active: wp.array2d[wp.int32],
+    to_tile: wp.int32,
     fine_offset: wp.int32,
     fine_rows: wp.int32,
     fine_columns: wp.int32,
@@ -147,6 +210,9 @@ def pull_level_kernel(
 ):
     """Sums of the finer level's texels."""
     i, j = wp.tid()
+    if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
+        levels_out[offset + i * columns + j] = wp.vec4()
+        return
     total = wp.vec4()
     for r in range(2 * i, wp.min(2 * i + 2, fine_rows)):
         for c in range(2 * j, wp.min(2 * j + 2, fine_columns)):
@@ -176,6 +242,8 @@ def sample_coarser(
 def push_level_kernel(
     # In:
     row_start: wp.int32,
+    active: wp.array2d[wp.int32],
+    to_tile: wp.int32,
     coarse_offset: wp.int32,
     coarse_rows: wp.int32,
     coarse_columns: wp.int32,
@@ -187,6 +255,8 @@ def push_level_kernel(
     """From sums to values: hue, and levels climbed; the last level (no coarser rows) is completed by grey."""
     i, j = wp.tid()
     i += row_start
+    if to_tile >= 0 and active[i >> to_tile, j >> to_tile] == 0:
+        return
     at = offset + i * columns + j
     sums = levels_out[at]
     above = wp.vec4(1.0, 1.0, 1.0, 0.0)
@@ -214,6 +284,7 @@ def hue_of(filled: wp.vec4) -> wp.vec3:
 def complete_kernel(
     # In:
     row_start: wp.int32,
+    active: wp.array2d[wp.int32],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     levels: wp.array[wp.vec4],
@@ -222,19 +293,25 @@ def complete_kernel(
     # Out:
     declipped_out: wp.array2d[wp.vec3],
 ):
-    """Linear radiance; missing channels by the neighbours' hue."""
+    """Linear radiance where tiles are active; missing channels by the neighbours' hue."""
     i, j = wp.tid()
     i += row_start
+    if active[i >> _TILE_LEVEL, j >> _TILE_LEVEL] == 0:
+        return
     code = frame[i, j]
     radiance = decode(decode_table, code)
-    clipped = is_clipped(code)
+    clipped = clipping(code)
     if wp.max(clipped) > 0.0 and wp.min(clipped) == 0.0:
         hue = hue_of(sample_coarser(levels, 0, rows, columns, i, j))
-        kept = wp.vec3(1.0, 1.0, 1.0) - clipped
+        kept = wp.vec3(
+            wp.where(clipped[0] > 0.0, 0.0, 1.0),
+            wp.where(clipped[1] > 0.0, 0.0, 1.0),
+            wp.where(clipped[2] > 0.0, 0.0, 1.0),
+        )
         k = wp.dot(kept, radiance) / wp.dot(kept, hue)
         for channel in range(3):
-            if clipped[channel] > 0.0:
-                radiance[channel] = wp.clamp(k * hue[channel], 1.0, BRIGHTEST)
+            guess = wp.clamp(k * hue[channel], radiance[channel], BRIGHTEST)
+            radiance[channel] += clipped[channel] * (guess - radiance[channel])
     declipped_out[i, j] = radiance
 
 
@@ -296,7 +373,8 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
-        if wp.min(is_clipped(frame[i, j])) == 0.0:
+        clipped = clipping(frame[i, j])
+        if wp.min(clipped) == 0.0:
             return
         filled = sample_coarser(levels, 0, rows, columns, i, j)
         hue = hue_of(filled)
@@ -311,7 +389,9 @@ def make_complete_core_kernel(config: DeclipConfig) -> wp.Kernel:
         growth = 1.0 - wp.pow(2.0, -rate * (filled[3] + 1.0))
         for channel in range(3):
             stops = wp.log2(wp.clamp(inside[channel], 1.0, BRIGHTEST) / edge[channel])
-            declipped_out[i, j][channel] = wp.max(edge[channel] * wp.pow(2.0, growth * stops), 1.0)
+            guess = wp.max(edge[channel] * wp.pow(2.0, growth * stops), 1.0)
+            radiance = declipped_out[i, j][channel]
+            declipped_out[i, j][channel] = radiance + clipped[channel] * (guess - radiance)
 
     return complete_core_kernel
 
@@ -331,31 +411,55 @@ def level_texels(height: int, width: int) -> int:
     return sum(map(math.prod, level_shapes(height, width)))
 
 
-def pull_frame(frame: wp.array, decode_table: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
+def tile_shape(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of tiles."""
+    side = 1 << TILE_LEVEL
+    return -(-height // side), -(-width // side)
+
+
+def mark_tiles(frame: wp.array, marked_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Mark the tiles, ``tile_shape(H, W)`` int32, of a frame, (H, W) vec3ub, in which some channel clips."""
+    launch_rows(mark_tiles_kernel, marked_out.shape, [frame], [marked_out], rows=rows, device=frame.device)
+
+
+def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
+    """Mark the neighbours of marked tiles too; both ``tile_shape(H, W)`` int32."""
+    wp.launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
+
+
+def pull_frame(
+    active: wp.array, frame: wp.array, decode_table: wp.array, levels_out: wp.array, *, rows: Rows | None = None
+) -> None:
     """Write the first level: weighted hues of the pixels that do not clip.
 
     Args:
+        active: Tiles of ``widen_tiles``; the others give and get nothing.
         frame: (H, W) vec3ub, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.
         levels_out: (``level_texels(H, W)``,) vec4: sums of weighted hue, and of weights.
         rows: Band of rows of the first level; None means all.
     """
     shape = level_shapes(*frame.shape)[0]
-    launch_rows(pull_frame_kernel, shape, [frame, decode_table, shape[1]], [levels_out], rows=rows, device=frame.device)
-
-
-def pull_completed(frame: wp.array, completed: wp.array, levels_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write the first level from ``complete``: weighted hues of the pixels that do not clip in all channels."""
-    shape = level_shapes(*frame.shape)[0]
     launch_rows(
-        pull_completed_kernel, shape, [frame, completed, shape[1]], [levels_out], rows=rows, device=frame.device
+        pull_frame_kernel, shape, [active, frame, decode_table, shape[1]], [levels_out], rows=rows, device=frame.device
     )
 
 
-def fill_levels(shape: tuple[int, int], levels_out: wp.array) -> None:
+def pull_completed(
+    active: wp.array, frame: wp.array, completed: wp.array, levels_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Write the first level from ``complete``: weighted hues of the pixels that do not clip in all channels."""
+    shape = level_shapes(*frame.shape)[0]
+    launch_rows(
+        pull_completed_kernel, shape, [active, frame, completed, shape[1]], [levels_out], rows=rows, device=frame.device
+    )
+
+
+def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) -> None:
     """Pull sums up from the first level, and push values down to it.
 
     Args:
+        active: Tiles of ``widen_tiles``.
         shape: Height and width of the frame.
         levels_out: First level: sums of weighted hue, and of weights. Becomes values: hue, and levels climbed.
     """
@@ -363,14 +467,21 @@ def fill_levels(shape: tuple[int, int], levels_out: wp.array) -> None:
     offsets = [sum(map(math.prod, shapes[:level])) for level in range(len(shapes))]
     device = levels_out.device
     for level in range(1, len(shapes)):
-        inputs = [offsets[level - 1], *shapes[level - 1], offsets[level], shapes[level][1]]
+        inputs = [
+            active,
+            TILE_LEVEL - 1 - level,
+            offsets[level - 1],
+            *shapes[level - 1],
+            offsets[level],
+            shapes[level][1],
+        ]
         wp.launch(pull_level_kernel, shapes[level], inputs, [levels_out], device=device)
     coarser = (0, 0, 0)
     for level in reversed(range(len(shapes))):
         wp.launch(
             push_level_kernel,
             shapes[level],
-            [0, *coarser, offsets[level], shapes[level][1]],
+            [0, active, TILE_LEVEL - 1 - level, *coarser, offsets[level], shapes[level][1]],
             [levels_out],
             device=device,
         )
@@ -378,11 +489,18 @@ def fill_levels(shape: tuple[int, int], levels_out: wp.array) -> None:
 
 
 def complete(
-    frame: wp.array, decode_table: wp.array, levels: wp.array, declipped_out: wp.array, *, rows: Rows | None = None
+    active: wp.array,
+    frame: wp.array,
+    decode_table: wp.array,
+    levels: wp.array,
+    declipped_out: wp.array,
+    *,
+    rows: Rows | None = None,
 ) -> None:
     """Write the frame's linear radiance, channels that clip beside others that do not completed by the filled hue.
 
     Args:
+        active: Tiles of ``widen_tiles``; pixels of others stay as they are.
         frame: (H, W) vec3ub, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.
         levels: Filled levels of ``pull_frame`` and ``fill_levels``.
@@ -393,7 +511,7 @@ def complete(
     launch_rows(
         complete_kernel,
         frame.shape,
-        [frame, decode_table, levels, *shape],
+        [active, frame, decode_table, levels, *shape],
         [declipped_out],
         rows=rows,
         device=frame.device,

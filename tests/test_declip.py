@@ -26,11 +26,15 @@ def run(frame, config=None, environment=None, params=None, proxies=()):
     scene.proxies = wp.array(list(proxies), dtype=Shape) if proxies else wp.zeros(0, Shape)
     ball = Probe()
     ball.center, ball.radius, ball.reflectance = wp.vec3(0.0, 0.0, 0.0), RADIUS, wp.vec3(0.8, 0.8, 0.8)
-    declip.pull_frame(array, decode, levels)
-    declip.fill_levels(array.shape, levels)
-    declip.complete(array, decode, levels, out)
-    declip.pull_completed(array, out, levels)
-    declip.fill_levels(array.shape, levels)
+    tiles = [wp.zeros(declip.tile_shape(height, width), wp.int32) for _ in range(2)]
+    declip.mark_tiles(array, tiles[0])
+    declip.widen_tiles(*tiles)
+    active = tiles[1]
+    declip.pull_frame(active, array, decode, levels)
+    declip.fill_levels(active, array.shape, levels)
+    declip.complete(active, array, decode, levels, out)
+    declip.pull_completed(active, array, out, levels)
+    declip.fill_levels(active, array.shape, levels)
     declip.complete_core(
         config or declip.DeclipConfig(),
         array,
@@ -74,8 +78,30 @@ def blob(hue, peak, size=64, width=9.0):
 
 
 def test_unclipped_pixels_keep_their_radiance(device):
-    frame = np.random.default_rng(0).integers(0, 254, (33, 47, 3))
-    np.testing.assert_allclose(run(frame), linear(frame), rtol=1e-6)
+    frame = np.random.default_rng(0).integers(0, 256, (33, 47, 3))
+    keep = frame <= reference.KNEE
+    np.testing.assert_allclose(run(frame)[keep], linear(frame)[keep], rtol=1e-6)
+
+
+def test_nothing_is_done_far_from_clipping(device):
+    frame = np.full((100, 200, 3), 200, np.uint8)
+    frame[5, 5] = 255
+    out = run(frame)
+    assert (out[:32, :32] > 0.0).all()
+    assert (out[32:] == 0.0).all()
+    assert (out[:, 32:] == 0.0).all()
+
+
+def test_no_step_at_the_knee(device):
+    """From one code to the next, neither hue nor core may jump by more than a quarter of the way up to a stop."""
+    frame = np.full((32, 32, 3), 248, np.uint8)
+    frame[0, 0] = 255
+    steps = []
+    for code in range(248, 256):
+        frame[8:, 8:] = code
+        steps.append(run(frame)[20, 20, 0])
+    assert (np.diff(steps) >= -FLOAT).all()
+    assert np.diff(steps).max() < 0.27
 
 
 def test_missing_channel_of_one_hue_is_exact(device):
@@ -94,7 +120,7 @@ def test_edge_of_core_is_as_bright_as_its_hue_demands(device):
     out = run(encode(truth))
     assert (out[core][:, 0] >= 1.0 / 0.5 * 0.98).all()
     plain = np.abs(np.log2(truth[core])).mean()
-    assert np.abs(np.log2(out[core] / truth[core])).mean() < 0.35 * plain
+    assert np.abs(np.log2(out[core] / truth[core])).mean() < 0.4 * plain
 
 
 def test_grows_inward_by_at_most_a_stop(device):
@@ -104,11 +130,13 @@ def test_grows_inward_by_at_most_a_stop(device):
     assert out.max() <= 2.0 * (1.0 + FLOAT)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (31, 64), (64, 48), (97, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (31, 64), (64, 48), (97, 3), (120, 90)])
 def test_matches_twin(device, shape):
     rng = np.random.default_rng(3)
     frame = np.clip(rng.normal(210.0, 60.0, (*shape, 3)), 0, 255).astype(np.uint8)
-    np.testing.assert_allclose(run(frame), reference.declip(frame, linear(frame)), rtol=FLOAT)
+    frame[40:] //= 2  # tiles that take no part
+    expected, active = reference.declip(frame, linear(frame))
+    np.testing.assert_allclose(run(frame), np.where(active[..., None], expected, 0.0), rtol=FLOAT)
 
 
 @pytest.mark.parametrize("value", [0, 255])
@@ -123,7 +151,7 @@ def test_never_below_clipping(device):
     frame = np.random.default_rng(5).choice(np.array([0, 3, 120, 255], np.uint8), (60, 60, 3))
     out = run(frame)
     assert np.isfinite(out).all()
-    assert (out[frame >= reference.CLIPPING] >= 0.98).all()
+    assert (out[frame >= reference.CLIPPED] >= 1.0 - FLOAT).all()
 
 
 def environment(height=64, base=0.3, spots=()):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-DARKEST, LEAST_HUE, BRIGHTEST, CLIPPING = 0.25, 1.0 / 64.0, 1.0e4, 254
+DARKEST, LEAST_HUE, BRIGHTEST, KNEE, CLIPPED, TILE = 0.25, 1.0 / 64.0, 1.0e4, 250, 254, 16
 
 
 def weighted_hue(radiance, known):
@@ -42,17 +42,27 @@ def fill(sums, levels=0):
     return np.concatenate([own + (1.0 - known) * above[..., :3], (1.0 - known) * (above[..., 3:] + 1.0)], -1)
 
 
+def active_pixels(frame):
+    """Pixels of tiles in which something clips, and of their neighbours."""
+    height, width = frame.shape[:2]
+    tiles = np.zeros((-(-height // TILE) + 2, -(-width // TILE) + 2), bool)
+    for i, j in np.argwhere((frame > KNEE).any(-1)):
+        tiles[i // TILE : i // TILE + 3, j // TILE : j // TILE + 3] = True
+    return np.kron(tiles[1:-1, 1:-1], np.ones((TILE, TILE), bool))[:height, :width]
+
+
 def declip(frame, linear):
-    """Radiance by hue and depth, without the ball."""
-    clipped = frame >= CLIPPING
+    """Radiance by hue and depth, without the ball, and where it holds."""
+    ramp = np.clip((frame.astype(float) - KNEE) / (CLIPPED - KNEE), 0.0, 1.0)
+    clipped, active = ramp > 0.0, active_pixels(frame)
     some, core = clipped.any(-1), clipped.all(-1)
-    out = linear.copy()
-    hue = np.maximum(fill(weighted_hue(linear, ~some))[..., :3], LEAST_HUE)
+    hue = np.maximum(fill(weighted_hue(linear, ~some & active))[..., :3], LEAST_HUE)
     k = (linear * ~clipped).sum(-1) / np.where(core, 1.0, (hue * ~clipped).sum(-1))
-    guess = np.clip(k[..., None] * hue, 1.0, BRIGHTEST)
-    out = np.where(clipped & ~core[..., None], guess, out)
-    filled = fill(weighted_hue(out, ~core))
+    guess = np.minimum(np.maximum(k[..., None] * hue, linear), BRIGHTEST)
+    out = np.where(core[..., None], linear, linear + ramp * (guess - linear))
+    filled = fill(weighted_hue(out, ~core & active))
     hue = np.maximum(filled[..., :3], LEAST_HUE)
     edge = hue / hue.min(-1, keepdims=True)
     growth = 1.0 - 2.0 ** (-0.5 * filled[..., 3:])
-    return np.where(core[..., None], np.maximum(edge * 2.0**growth, 1.0), out)
+    guess = np.maximum(edge * 2.0**growth, 1.0)
+    return np.where(core[..., None], linear + ramp * (guess - linear), out), active

@@ -29,10 +29,12 @@ class Declip(Stage):
         return Wiring(("frame", "pose", "environment") if asks_ball(request) else ("frame",), ("declipped",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The frame's radiance, and a pyramid of hues."""
+        """The frame's radiance near what clips, tiles that say where that is, and a pyramid of hues."""
         width, height = self.request.size
         return {
             "declipped": ArraySpec((height, width), wp.vec3),
+            "declip_marked": ArraySpec(declip.tile_shape(height, width), wp.int32),
+            "declip_active": ArraySpec(declip.tile_shape(height, width), wp.int32),
             "declip_levels": ArraySpec((declip.level_texels(height, width),), wp.vec4),
         }
 
@@ -42,6 +44,7 @@ class Declip(Stage):
         config = declip.DeclipConfig(ball, trace_config(self.request.scene).proxies if ball else ())
         declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
+        marked, active = arrays["declip_marked"], arrays["declip_active"]
         shape = frame.shape
         half = declip.level_shapes(*shape)[0][0]
 
@@ -60,11 +63,13 @@ class Declip(Stage):
             )
 
         return [
-            Pass(lambda rows: declip.pull_frame(frame, decode, levels, rows=rows), rows=half),
-            Pass(lambda rows: declip.fill_levels(shape, levels)),
-            Pass(lambda rows: declip.complete(frame, decode, levels, out, rows=rows), rows=shape[0]),
-            Pass(lambda rows: declip.pull_completed(frame, out, levels, rows=rows), rows=half),
-            Pass(lambda rows: declip.fill_levels(shape, levels)),
+            Pass(lambda rows: declip.mark_tiles(frame, marked, rows=rows), rows=marked.shape[0]),
+            Pass(lambda rows: declip.widen_tiles(marked, active)),
+            Pass(lambda rows: declip.pull_frame(active, frame, decode, levels, rows=rows), rows=half),
+            Pass(lambda rows: declip.fill_levels(active, shape, levels)),
+            Pass(lambda rows: declip.complete(active, frame, decode, levels, out, rows=rows), rows=shape[0]),
+            Pass(lambda rows: declip.pull_completed(active, frame, out, levels, rows=rows), rows=half),
+            Pass(lambda rows: declip.fill_levels(active, shape, levels)),
             Pass(core, rows=shape[0]),
         ]
 
