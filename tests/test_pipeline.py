@@ -278,3 +278,14 @@ def test_a_new_pipeline_continues_with_the_light(frames: Frames) -> None:
         np.testing.assert_array_equal(new.arrays["environment_radiance"].numpy(), light)
         result = new(np.full_like(frames[0], 90), time_seconds=9.0)  # no marker in sight: the kept light is still there
         assert result.environment_array is not None
+
+
+def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: str) -> None:
+    scene = make_scene(lights=(), exposure=Exposure(1.0))
+    sphere, torus = scene.objects
+    painted = dataclasses.replace(sphere, material=LambertMaterial((0.1, 0.9, 0.2)))
+    with Pipeline(scene, device=device, quality="low") as pipeline:
+        for index in range(60):  # the light settles, the tracker too
+            before = pipeline(frames[0], time_seconds=index / 30).image
+        assert pipeline.update(dataclasses.replace(scene, objects=(painted, torus)))
+        assert (pipeline(frames[0], time_seconds=2.0).image != before).any()
