@@ -52,6 +52,7 @@ class Setup:
             self.seen = wp.array(seen, dtype=kernels.Observation)
             self.transfer = wp.zeros((count, self.cells.size), dtype=wp.float32)
             self.mirrored = wp.zeros_like(self.transfer)
+            self.traced = wp.zeros(count, dtype=wp.int32)
         self.solver = recovery.Recovery(surfaces, scene.marker.white, probe.center)
 
     def condense(self) -> None:
@@ -61,8 +62,9 @@ class Setup:
 
     def trace(self) -> None:
         """Trace all surface points."""
-        arrays = (self.points, self.seen, self.cells, self.probes, self.scene, self.transfer, self.mirrored)
-        kernels.trace_transfer(*arrays, proxies=self.proxies)
+        self.traced.zero_()
+        arrays = (self.points, self.seen, self.cells, self.probes, self.scene)
+        kernels.trace_transfer(*arrays, self.traced, self.transfer, self.mirrored, proxies=self.proxies)
 
     def add(self) -> None:
         """Apply an excess."""

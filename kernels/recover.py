@@ -80,6 +80,7 @@ class Cell:
     clipped: wp.vec3  # mean share that may lack light: at clipping, or not seen at all
     hidden: wp.float32  # mean share that is not seen
     modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the room beyond
+    middle: wp.vec3  # unit
     direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
     solid_angle: wp.float32
 
@@ -143,7 +144,8 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.hidden /= cell.solid_angle
-        cell.direction = wp.normalize(toward)
+        cell.middle = wp.normalize(toward)
+        cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
             cell.direction = wp.normalize(lost_toward)
         if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, 1.0e8):
@@ -384,34 +386,37 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         probes: wp.array[Probe],
         scene: RayScene,
         # Out:
+        traced_out: wp.array[wp.int32],
         transfer_out: wp.array2d[wp.float32],
         mirrored_out: wp.array2d[wp.float32],
     ):
         index = row_start + wp.tid()
+        if traced_out[index] != 0 or observations[index].visible <= 0.0:
+            return
+        traced_out[index] = 1
         rows = cells.shape[0]
         columns = cells.shape[1]
         for m in range(rows * columns):
             transfer_out[index, m] = 0.0
             mirrored_out[index, m] = 0.0
-        if observations[index].visible > 0.0:
-            point = points[index]
-            for m in range(rows * columns):
-                cell = cells[m // columns, m % columns]
+        point = points[index]
+        for m in range(rows * columns):
+            middle = cells[m // columns, m % columns].middle
+            solid_angle = cells[m // columns, m % columns].solid_angle
+            for k in range(probes.shape[0]):
+                more = solid_angle * mirrored_irradiance(probes[k], point, middle)
+                mirrored_out[index, m] = mirrored_out[index, m] + more
+            cosine = wp.dot(middle, point.normal)
+            if cosine > 0.0:
+                share = cosine * solid_angle
+                angle = wp.sqrt(solid_angle / PI)
                 for k in range(probes.shape[0]):
-                    more = cell.solid_angle * mirrored_irradiance(probes[k], point, cell.direction)
-                    mirrored_out[index, m] = mirrored_out[index, m] + more
-                cosine = wp.dot(cell.direction, point.normal)
-                if cosine > 0.0:
-                    share = cosine * cell.solid_angle
-                    angle = wp.sqrt(cell.solid_angle / PI)
-                    for k in range(probes.shape[0]):
-                        center = probes[k].center
-                        share *= 1.0 - hidden_share(center, probes[k].radius, point.position, cell.direction, angle)
-                    target = m
-                    hit = trace.closest_proxy(scene, point.position + 1.0e-5 * point.normal, cell.direction, 1.0e8)
-                    if hit.shape >= 0:
-                        target = cell_of(hit.point - probes[0].center, rows, columns)
-                    transfer_out[index, target] = transfer_out[index, target] + share
+                    share *= 1.0 - hidden_share(probes[k].center, probes[k].radius, point.position, middle, angle)
+                target = m
+                hit = trace.closest_proxy(scene, point.position + 1.0e-5 * point.normal, middle, 1.0e8)
+                if hit.shape >= 0:
+                    target = cell_of(hit.point - probes[0].center, rows, columns)
+                transfer_out[index, target] = transfer_out[index, target] + share
 
     @wp.kernel(module="unique", enable_backward=False)
     def trace_lamps_kernel(
@@ -495,6 +500,7 @@ def trace_transfer(
     cells: wp.array,
     probes: wp.array,
     scene: RayScene,
+    traced_out: wp.array,
     transfer_out: wp.array,
     mirrored_out: wp.array,
     *,
@@ -503,12 +509,15 @@ def trace_transfer(
 ) -> None:
     """Irradiance that a surface point receives from each cell of the room, per unit of the cell's radiance.
 
+    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
+
     Args:
         points: ``SurfacePoint`` (n).
         observations: ``Observation`` (n): points that the camera does not see are left out.
-        cells: ``Cell`` (rows, columns): directions and solid angles.
+        cells: ``Cell`` (rows, columns): middles and solid angles.
         probes: ``Probe`` (P), at least one; the room is the one that the first sees.
         scene: Its proxies hide the room.
+        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
         transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
         mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
         proxies: Kinds of proxy in the scene.
@@ -518,7 +527,7 @@ def trace_transfer(
         make_kernels(proxies)[1],
         points.shape,
         [points, observations, cells, probes, scene],
-        [transfer_out, mirrored_out],
+        [traced_out, transfer_out, mirrored_out],
         rows=rows,
         device=transfer_out.device,
     )

@@ -20,6 +20,7 @@ from warp_ar.quality import PRESETS
 from warp_ar.ray_scene import HostScene, trace_config
 from warp_ar.scene import load_scene, loads_scene
 from warp_ar.session import Session
+from warp_ar.tracking import Pose
 
 ROWS, COLUMNS = kernels.CELL_ROWS, kernels.CELL_COLUMNS
 QUADRATURE = 0.003
@@ -98,14 +99,16 @@ def seen(device, count):
 def cells_of(device, radiance=1.0, clipped=0.0):
     d, solid_angle = reference.cell_directions(ROWS, COLUMNS)
     values = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
-    values["direction"], values["solid_angle"] = d.reshape(ROWS, COLUMNS, 3), solid_angle.reshape(ROWS, COLUMNS)
+    values["middle"] = values["direction"] = d.reshape(ROWS, COLUMNS, 3)
+    values["solid_angle"] = solid_angle.reshape(ROWS, COLUMNS)
     values["radiance"], values["clipped"] = radiance, clipped
     return values, wp.array(values, dtype=kernels.Cell, device=device)
 
 
 def transfer_of(device, points, cells, probes, scene, proxies=()):
     out = [wp.zeros((len(points), ROWS * COLUMNS), dtype=wp.float32, device=device) for _ in range(2)]
-    kernels.trace_transfer(points, seen(device, len(points)), cells, probes, scene, *out, proxies=proxies)
+    traced = wp.zeros(len(points), dtype=wp.int32, device=device)
+    kernels.trace_transfer(points, seen(device, len(points)), cells, probes, scene, traced, *out, proxies=proxies)
     return [array.numpy().astype(float) for array in out]
 
 
@@ -456,6 +459,42 @@ def test_stage_is_left_out_where_the_quality_says_so(scene):
     with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
         assert "recover" in dict(pipeline.plan.left_out)
         assert "filled_radiance" not in pipeline.arrays
+
+
+def test_points_are_traced_once_when_they_come_into_view(device):
+    """What a row holds stays as it is: the room does not move."""
+    points = points_of(device, [(5.0, 5.0, 0.0), (4.0, 5.0, 0.0)], [(0, 0, 1)] * 2)
+    views, rows = np.zeros(2, np.dtype(kernels.Observation.numpy_dtype())), []
+    traced = wp.zeros(2, dtype=wp.int32, device=device)
+    out = [wp.full((2, ROWS * COLUMNS), -1.0, dtype=wp.float32, device=device) for _ in range(2)]
+    room = cells_of(device)[1], probes_of(device), empty_scene().ray_scene
+    for visible in ((1, 0), (1, 1)):
+        views["visible"] = visible
+        seen_now = wp.array(views, dtype=kernels.Observation, device=device)
+        kernels.trace_transfer(points, seen_now, *room, traced, *out, proxies=())
+        rows.append(out[0].numpy().sum(axis=1))
+        out[0][:1].fill_(-1.0)
+    assert rows[0] == pytest.approx([np.pi, -ROWS * COLUMNS], rel=QUADRATURE)
+    assert rows[1] == pytest.approx([-ROWS * COLUMNS, np.pi], rel=QUADRATURE)
+
+
+@pytest.mark.parametrize(("fps", "expected"), [(12, [0, 1, 2, 5, 8, 11]), (30, [0, 1, 2, 8, 14]), (3, [0, 1, 2, 5, 8])])
+def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
+    frames, update = [], recovery.Recovery.update
+
+    def counted(self, *args, **kwargs):
+        frames.append(index)
+        return update(self, *args, **kwargs)
+
+    monkeypatch.setattr(recovery.Recovery, "update", counted)
+    rng = np.random.default_rng(5)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    quality = PRESETS["low"].with_rungs(recover="white_card")
+    with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
+        for index in range(expected[-1] + 1):
+            image = rng.integers(0, 255, (240, 320, 3), np.uint8)
+            pipeline(image, time_seconds=index / fps, pose=pose)
+    assert frames == expected
 
 
 CLIPPED_ERROR = 0.4

@@ -174,6 +174,7 @@ class Pipeline:
         self._shadow_rows = (0, height)
         add("shadow_rows", lambda: self._shadow_rows)
         params = self._block.host("params")
+        add("seconds", lambda: float(params["time"][0]))
         params["focal"] = (self.camera.fx, self.camera.fy)
         params["principal"] = (self.camera.cx, self.camera.cy)
         params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)

@@ -430,7 +430,14 @@ class _Problem:
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
         through_balls = mirrored[seen]
-        self.transfer = transfer[seen] + through_balls
+        self.transfer = transfer[seen]
+        # What clips in a cell lies off its middle, for which transfer was traced.
+        lamps = np.flatnonzero((clipped > LOST) & ~modelled)
+        normals = surfaces.points["normal"][seen]
+        cosine = normals @ cells["middle"].reshape(-1, 3)[lamps].T
+        turned = np.clip(normals @ cells["direction"].reshape(-1, 3)[lamps].T, 0.0, 2.0 * np.maximum(cosine, 0.0))
+        self.transfer[:, lamps] *= np.where(cosine > 0.0, turned / np.maximum(cosine, 1e-6), 1.0)
+        self.transfer += through_balls
         self.light = np.pi * shown["radiance"].astype(float)
         # Patches on a clutter's edge, or half in a sharp shadow, say nothing.
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01

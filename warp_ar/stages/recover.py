@@ -16,6 +16,10 @@ from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.unwrap import NO_PROBE
 
+EVERY_FRAME = 3
+"""Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
+EVERY_SECONDS = 0.2
+"""Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched lamp."""
 MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
 
 
@@ -56,6 +60,7 @@ class Recover(Stage):
             "recover_cells": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
             "recover_observations": ArraySpec((points,), kernels.Observation),
+            "recover_traced": ArraySpec((points,), wp.int32),
             "recover_transfer": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_mirrored": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_lamps": ArraySpec((MOST_LAMPS,), wp.vec4),
@@ -75,6 +80,7 @@ class Recover(Stage):
         cells = arrays["recover_cells"]
         points = len(self._surfaces.points)
         self.estimate: recovery.Estimate | None = None
+        self._frames, self._waited, self._last = 0, 0, 0.0
         arrays.add("recover_status", self.status)
 
         def condense(rows: Rows | None) -> None:
@@ -109,6 +115,7 @@ class Recover(Stage):
                 cells,
                 arrays["probes"],
                 arrays["ray_scene"],
+                arrays["recover_traced"],
                 arrays["recover_transfer"],
                 arrays["recover_mirrored"],
                 proxies=proxies,
@@ -131,6 +138,12 @@ class Recover(Stage):
             return np.array(target.numpy(), np.float64)
 
         def solve(rows: Rows | None) -> None:
+            due = self._due()
+            self._frames += 1
+            self._waited += 1
+            if not due:
+                return
+            self._waited, self._last = 0, arrays["seconds"]()
             self.estimate = solver.update(
                 cells.numpy(),
                 arrays["recover_transfer"].numpy(),
@@ -161,13 +174,18 @@ class Recover(Stage):
             )
 
         passes = [
-            Pass(condense, rows=cells.shape[0]),
-            Pass(observe, rows=points),
-            Pass(transfer, rows=points),
+            Pass(condense, rows=cells.shape[0], extent=lambda: (0, cells.shape[0] * self._due())),
+            Pass(observe, rows=points, extent=lambda: (0, points * self._due())),
+            Pass(transfer, rows=points, extent=lambda: (0, points * self._due())),
             Pass(solve, on_host=True),
             Pass(add, rows=height),
         ]
         return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
+
+    def _due(self) -> bool:
+        """Whether this frame is one to estimate from."""
+        waited = abs(self._arrays["seconds"]() - self._last) > EVERY_SECONDS - 1e-3
+        return self._frames < EVERY_FRAME or (waited and self._waited + 1 >= EVERY_FRAME)
 
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``."""
