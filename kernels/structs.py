@@ -138,4 +138,4 @@ class RoomLamp:
 
     direction: wp.vec3  # unit, from the first ball; zero where there is no lamp
     distance: wp.float32  # metres from the ball, infinite for a distant one
-    power: wp.vec3  # radiance times solid angle at the ball, beyond what the camera captured; times distance^2: radiant intensity
+    power: wp.vec3  # radiance times solid angle at the ball, beyond what was captured; * distance^2: radiant intensity

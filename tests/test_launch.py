@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -23,7 +24,7 @@ def count_rows_kernel(row_start: wp.int32, amount: wp.int32, counts_out: wp.arra
 @pytest.mark.parametrize("edges", [(0, ROWS), (0, 5, ROWS), (0, 0, 1, 12, ROWS)])
 def test_bands_touch_each_row_once(device: str, edges: tuple[int, ...]) -> None:
     counts = wp.zeros((ROWS, 3), dtype=wp.int32, device=device)
-    for band in zip(edges[:-1], edges[1:], strict=True):
+    for band in itertools.pairwise(edges):
         launch_rows(count_rows_kernel, counts.shape, [2], [counts], rows=band, device=device)
     np.testing.assert_array_equal(counts.numpy(), 2)
     launch_rows(count_rows_kernel, counts.shape, [1], [counts], rows=None, device=device)
@@ -31,7 +32,7 @@ def test_bands_touch_each_row_once(device: str, edges: tuple[int, ...]) -> None:
 
 
 def test_tiles_from_several_threads() -> None:
-    """Warp's CPU tiles share one unguarded arena: without the lock this crashes the process within a few dozen rounds."""
+    """Warp's CPU tiles share one unguarded arena: without the lock this crashes within a few dozen rounds."""
     environment = wp.array(np.random.default_rng(1).random((16, 32, 3), np.float32), dtype=wp.vec3, device="cpu")
     clusters = wp.zeros(8 * 16, dtype=irradiance.Cluster, device="cpu")
     irradiance.gather_clusters(environment, (8, 16), clusters)
@@ -41,6 +42,8 @@ def test_tiles_from_several_threads() -> None:
         for _ in range(100):
             actual.zero_()
             list(
-                pool.map(lambda band: irradiance.sum_clusters(clusters, actual, rows=(band, band + 16)), range(0, 64, 16))
+                pool.map(
+                    lambda band: irradiance.sum_clusters(clusters, actual, rows=(band, band + 16)), range(0, 64, 16)
+                )
             )
             np.testing.assert_array_equal(actual.numpy(), expected.numpy())

@@ -153,13 +153,14 @@ def _prepare_folder(path: Path) -> None:
 
 
 def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
-    """Complain where no frame so far showed the marker: an error for a clip, a note for a camera that may yet see it."""
+    """Complain where no frame so far showed the marker: an error for a clip, a note for a camera."""
     if not log.never_posed or log.count == 0:
         return
     marker = scene.marker
     wanted = f"board {marker.board!r}" if marker.board else f"id {marker.id}"
     message = (
-        f"no marker in the first {log.count} frames: expected {marker.dictionary} {wanted}; check the scene's [marker], "
+        f"no marker in the first {log.count} frames: expected {marker.dictionary} {wanted}; "
+        "check the scene's [marker], "
         "that the whole marker with its white border is in view, sharp and not mirrored"
     )
     if not live:

@@ -7,7 +7,7 @@ import functools
 import time
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -212,7 +212,7 @@ class Pipeline:
         return True
 
     def continue_from(self, other: Pipeline) -> None:
-        """Go on where another pipeline stopped: its clock and, where they fit, its track of the marker and its light."""
+        """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
         self._start_time, self._last_time = other._start_time, other._last_time
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
@@ -269,7 +269,7 @@ class Pipeline:
         state: TrackState | None = None
         if self._tracker is not None and pose is None:
             start = time.perf_counter()
-            track = self._tracker.track(host_image if host_image is not None else image.numpy(), now)
+            track = self._tracker.track(cast(Any, image).numpy() if host_image is None else host_image, now)
             timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
             pose, state = track.pose, track.state
         lost = self._tracker is not None and pose is None
@@ -290,7 +290,8 @@ class Pipeline:
         if isinstance(image, wp.array):
             if image.shape != (height, width) or image.dtype != wp.vec3ub or image.device != self.device:
                 raise UsageError(
-                    f"frame is a Warp array {image.shape} of {image.dtype.__name__} on {image.device}; expected ({height}, {width}) of vec3ub on {self.device}"
+                    f"frame is a Warp array {image.shape} of {image.dtype.__name__} on {image.device}; "
+                    f"expected ({height}, {width}) of vec3ub on {self.device}"
                 )
             return None
         if not isinstance(image, np.ndarray) or image.shape != (height, width, 3) or image.dtype != np.uint8:

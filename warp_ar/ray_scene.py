@@ -71,12 +71,12 @@ _CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) 
 
 def shape_kind(thing: scenes.Object | scenes.Proxy) -> int:
     """Kind of ``structs.Shape`` that an object or proxy becomes; a torus becomes a fine mesh."""
-    return structs.MESH if thing.shape == "torus" else _SHAPES[thing.shape]
+    return int(structs.MESH if thing.shape == "torus" else _SHAPES[thing.shape])
 
 
 def light_kind(light: scenes.Light) -> int:
     """Kind of ``structs.Light`` that a light becomes."""
-    return _LIGHTS[light.kind]
+    return int(_LIGHTS[light.kind])
 
 
 def has_sized_lights(scene: scenes.Scene) -> bool:
@@ -384,7 +384,7 @@ class HostScene:
         return screen_rect(self._outlines, pose, camera)
 
     def _follow_objects(self) -> None:
-        """Forget what was found out about objects that have moved since; clipping polygons takes longer than a kernel."""
+        """Forget what was found out about moved objects; clipping polygons takes longer than a kernel."""
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed

@@ -317,7 +317,8 @@ def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Arra
         marker: Marker or board.
 
     Returns:
-        Centres of all cells (c, 3), which of them are white (c,), the side of a cell in metres, and the whole's corners (4, 3).
+        Centres of all cells (c, 3), which of them are white (c,), the side of a cell in metres, and the whole's
+        corners (4, 3).
     """
     pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
     size = marker.size if marker.board is None else marker.board.marker_length

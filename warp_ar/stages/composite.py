@@ -75,7 +75,7 @@ def layer_names(request: Request) -> tuple[str, ...]:
 
 
 def shades_room(request: Request) -> bool:
-    """Whether virtual objects change the room's light on the desk: needs objects, proxies, a ball, and a rung for it."""
+    """Whether virtual objects change the room's light on the desk."""
     scene = request.scene
     wanted = request.quality.rung("room_shadow") not in ("default", "none")
     return bool(wanted and scene.objects and scene.proxies and scene.probes)
