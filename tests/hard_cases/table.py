@@ -1,10 +1,10 @@
 """Writes the table of hard cases into docs/hard-cases.md from reports of pytest.
 
-    python -m pytest -q --junitxml=cpu.xml                  # where there is a CUDA device, its tests are in the report too
+    python -m pytest -q --junitxml=report.xml
     python -m tests.hard_cases.table REPORT.xml [...] [--note "when and on what"]
 
-A report counts for CPU and for CUDA by what its tests' names say (``[cuda:0-...]``); a column that no report fills keeps
-what stands there. A cell says how many of a stage's rungs passed.
+A report of a machine with a CUDA device holds the tests of both devices: their names say which (``[cuda:0-...]``). A
+column that no report fills keeps what stands there. A cell says how many of a stage's rungs passed.
 """
 
 from __future__ import annotations

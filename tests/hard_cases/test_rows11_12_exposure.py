@@ -161,3 +161,18 @@ def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, rung, name):
         np.testing.assert_array_equal(picture[untouched], FRAMES[name][untouched])
     else:
         assert (picture[untouched] <= FRAMES[name][untouched]).all()
+
+
+@pytest.mark.atlas(row=11, stage="expose")
+@pytest.mark.parametrize("rung", RUNGS["expose"])
+def test_no_box_beyond_the_frame_darkens_its_border(rig_for, rung):
+    """On a white frame every pixel, in corners too, is at least as bright as scaling alone makes it."""
+    rig = rig_for("expose", rung)
+    picture = rig.frame(FRAMES["white"])
+    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
+    if "physical_ratio" in rig.arrays:
+        untouched &= (rig.get("physical_ratio") == 1).all(-1)
+    scale = rig.get("expose_scale")[0]
+    least = round(255 * float(1.055 * scale ** (1 / 2.4) - 0.055))
+    assert untouched.any()
+    assert (picture[untouched] >= least).all()
