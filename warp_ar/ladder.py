@@ -1,0 +1,188 @@
+"""What a quality can turn, what each turn costs and how far off it is, and what to choose for a budget.
+
+A **knob** is a stage with several rungs, or a number or way of ``Quality`` that several stages share. A **price** is
+what one rung of one knob costs in milliseconds and errs in FLIP. Both are taken to add up over knobs: costs because
+stages run one after another, errors because each is the excess over the knob's best rung, mean over the same pixels.
+
+Choosing is then a small knapsack problem with one item per knob, solved exactly: knobs are joined one by one, and of
+the joined choices those are dropped that cost no less and err no less than another.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from warp_ar.errors import UsageError
+from warp_ar.graph import make_plan
+from warp_ar.quality import PRESETS, Quality
+from warp_ar.scene import Scene
+from warp_ar.stages import STAGES
+from warp_ar.stages.base import Request
+
+PRICE_LIST = "price_list.json"
+"""The committed errors, beside this file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Knob:
+    """Something that a quality can turn."""
+
+    name: str
+    """A stage's, or a field's of ``Quality``."""
+    rungs: tuple[str, ...]
+    """Cheapest first; the last is the reference."""
+    stages: tuple[str, ...]
+    """Stages whose work it changes."""
+
+
+_LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples")
+KNOBS: tuple[Knob, ...] = (
+    Knob("environment_height", ("32", "64", "128", "256"), _LIGHT),
+    Knob("edge_samples", ("1", "4", "16"), ("shade",)),
+    Knob("light_shadow", ("hard", "soft"), ("relight", "shade")),
+    *(Knob(stage.name, tuple(stage.rungs), (stage.name,)) for stage in STAGES if len(stage.rungs) > 1),
+)
+"""All there are."""
+NUMBERS = ("environment_height", "edge_samples")
+"""Knobs that are numbers of ``Quality``, not rungs."""
+
+
+def setting(quality: Quality, knob: Knob) -> str:
+    """Rung that ``quality`` has the knob on; one that it does not name is on the stage's own default, the last."""
+    if knob.name in NUMBERS:
+        return str(getattr(quality, knob.name))
+    rung = quality.rung(knob.name)
+    return rung if rung in knob.rungs else knob.rungs[-1]
+
+
+def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
+    """``quality`` with some knobs on other rungs.
+
+    Raises:
+        UsageError: There is no such knob or rung.
+    """
+    known = {knob.name: knob for knob in KNOBS}
+    numbers: dict[str, int] = {}
+    rungs: dict[str, str] = {}
+    for name, rung in settings.items():
+        if name not in known:
+            raise UsageError(f"there is nothing called {name!r} to turn; expected {', '.join(known)}")
+        if rung not in known[name].rungs:
+            raise UsageError(f"{name} has no rung {rung!r}; expected {', '.join(known[name].rungs)}")
+        if name in NUMBERS:
+            numbers[name] = int(rung)
+        else:
+            rungs[name] = rung
+    return dataclasses.replace(quality.with_rungs(**rungs), **numbers)  # type: ignore[arg-type]
+
+
+def relevant_knobs(scene: Scene, size: tuple[int, int]) -> tuple[Knob, ...]:
+    """Knobs that change what the scene shows or costs."""
+    plan = make_plan(Request(scene, PRESETS["reference"], size))
+    running = {stage.name for stage, _ in plan.stages}
+    soft = any(light.radius > 0.0 for light in scene.lights)
+    return tuple(
+        knob for knob in KNOBS if not running.isdisjoint(knob.stages) and (knob.name != "light_shadow" or soft)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Price:
+    """One rung of one knob."""
+
+    knob: str
+    rung: str
+    milliseconds: float
+    error: float
+    """Mean FLIP above that of the knob's best rung."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """A rung for every knob, and what they cost and err together."""
+
+    settings: tuple[tuple[str, str], ...]
+    milliseconds: float
+    error: float
+
+
+def undominated(prices: Sequence[Price]) -> list[Price]:
+    """Of one knob's prices those than which no other costs less and errs less; cheapest first."""
+    kept: list[Price] = []
+    for price in sorted(prices, key=lambda price: (price.milliseconds, price.error)):
+        if not kept or price.error < kept[-1].error:
+            kept.append(price)
+    return kept
+
+
+def frontier(prices: Sequence[Price]) -> list[Choice]:
+    """Every choice than which no other costs less and errs less; cheapest first.
+
+    Args:
+        prices: All rungs of all knobs; every knob must get one.
+    """
+    knobs: dict[str, list[Price]] = {}
+    for price in prices:
+        knobs.setdefault(price.knob, []).append(price)
+    front = [Choice((), 0.0, 0.0)]
+    for own in knobs.values():
+        joined = [
+            Choice(
+                (*choice.settings, (price.knob, price.rung)),
+                choice.milliseconds + price.milliseconds,
+                choice.error + price.error,
+            )
+            for choice in front
+            for price in undominated(own)
+        ]
+        joined.sort(key=lambda choice: (choice.milliseconds, choice.error))
+        front = []
+        for choice in joined:
+            if not front or choice.error < front[-1].error:
+                front.append(choice)
+    return front
+
+
+def choose(front: Sequence[Choice], budget_ms: float) -> Choice:
+    """Least error of a ``frontier`` within a budget; the cheapest if none fits."""
+    fitting = [choice for choice in front if choice.milliseconds <= budget_ms]
+    return fitting[-1] if fitting else front[0]
+
+
+def choose_for_error(front: Sequence[Choice], error: float) -> Choice:
+    """Cheapest of a ``frontier`` that errs no more; the most exact if none does."""
+    return next((choice for choice in front if choice.error <= error), front[-1])
+
+
+def load_errors() -> dict[str, dict[str, float]]:
+    """Mean excess error of every rung of every knob, from the price list that comes with the package."""
+    text = importlib.resources.files("warp_ar").joinpath(PRICE_LIST).read_text(encoding="utf-8")
+    return read_errors(json.loads(text))
+
+
+def read_errors(price_list: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Errors of a price list; a rung that it does not know is taken to err as its next cheaper one.
+
+    Raises:
+        UsageError: The list has no errors, or one that is no number.
+    """
+    listed = price_list.get("errors")
+    if not isinstance(listed, Mapping):
+        raise UsageError(f"{PRICE_LIST}: expected a table 'errors'; make it anew with python -m warp_ar.tradeoff")
+    errors: dict[str, dict[str, float]] = {}
+    for knob in KNOBS:
+        own = listed.get(knob.name, {})
+        found: dict[str, float] = {}
+        last = 0.0
+        for rung in knob.rungs:
+            last = own.get(rung, last)
+            if not isinstance(last, (int, float)) or not math.isfinite(last) or last < 0.0:
+                raise UsageError(f"{PRICE_LIST}: errors.{knob.name}.{rung} is {last!r}; expected a number, 0 or more")
+            found[rung] = float(last)
+        errors[knob.name] = found
+    return errors
