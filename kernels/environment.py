@@ -97,7 +97,7 @@ LOBE_OUTER = wp.constant(wp.float32(math.cos(math.radians(40.0))))
 CORE = wp.constant(wp.float32(0.9))
 """Share of a lobe's peak above which texels say where exactly the light is."""
 LOBE_ANGLE = wp.constant(wp.float32(math.radians(40.0)))
-KEY_BLOCK = 256  # as other launches: another size would compile the whole module a second time
+KEY_BLOCK = 512
 MAX_KEY_LIGHTS = 4
 
 mat43 = wp.types.matrix(shape=(MAX_KEY_LIGHTS, 3), dtype=wp.float32)
@@ -725,7 +725,8 @@ def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, thread: wp.int32
     return total[0]
 
 
-@wp.kernel(enable_backward=False)
+# A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
+@wp.kernel(module="unique", enable_backward=False)
 def find_key_lights_kernel(
     # In:
     environment: wp.array2d[wp.vec3],
@@ -751,7 +752,7 @@ def find_key_lights_kernel(
     blues = wp.vec4(0.0, 0.0, 0.0, 0.0)
     count = key_lights_out.shape[0]
     # Runs of texels that share one start of the rotation: long ones where a single thread walks them all.
-    segments = wp.where(threads == 1, 1, 16)
+    segments = wp.where(threads == 1, 1, 64)
 
     for k in range(count):
         # The cell's direction in which a surface receives most; the first of equals, whatever the number of threads.

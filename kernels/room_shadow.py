@@ -334,7 +334,8 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | proxy_mask | ball_mask
             bit = wp.uint64(1)
-            for k in range(wp.static(chunk)):
+            stop = wp.int32(wp.static(chunk))  # a loop: unrolled, the kernel would hold its rays many times over
+            for k in range(stop):
                 direction = directions[at + k]
                 reach = float(FAR)
                 grown = float(1.0)

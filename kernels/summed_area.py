@@ -160,25 +160,54 @@ def packed_intensity(red: wp.uint32, green: wp.uint32, blue: wp.uint32) -> wp.ui
 
 
 @wp.func
+def aligned_intensities(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int32) -> vec4u:
+    """Intensity of four pixels; columns and the frame's width are multiples of four."""
+    # R0 G0 B0 R1, G1 B1 R2 G2, B2 R3 G3 B3 from the lowest byte up.
+    a = load_word(frame, row, column, 0)
+    b = load_word(frame, row, column, 1)
+    c = load_word(frame, row, column, 2)
+    return vec4u(
+        packed_intensity(a, a >> wp.uint32(8), a >> wp.uint32(16)),
+        packed_intensity(a >> wp.uint32(24), b, b >> wp.uint32(8)),
+        packed_intensity(b >> wp.uint32(16), b >> wp.uint32(24), c),
+        packed_intensity(c >> wp.uint32(8), c >> wp.uint32(16), c >> wp.uint32(24)),
+    )
+
+
+@wp.func
 def four_intensities(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int32) -> vec4u:
     """Intensity of a pixel and the three to its right; 0 beyond the row's end."""
     width = frame.shape[1]
     value = vec4u()
     if width % 4 == 0:
         if column < width:
-            # R0 G0 B0 R1, G1 B1 R2 G2, B2 R3 G3 B3 from the lowest byte up.
-            a = load_word(frame, row, column, 0)
-            b = load_word(frame, row, column, 1)
-            c = load_word(frame, row, column, 2)
-            value[0] = packed_intensity(a, a >> wp.uint32(8), a >> wp.uint32(16))
-            value[1] = packed_intensity(a >> wp.uint32(24), b, b >> wp.uint32(8))
-            value[2] = packed_intensity(b >> wp.uint32(16), b >> wp.uint32(24), c)
-            value[3] = packed_intensity(c >> wp.uint32(8), c >> wp.uint32(16), c >> wp.uint32(24))
+            value = aligned_intensities(frame, row, column)
     else:
         for k in range(4):
             if column + k < width:
                 value[k] = intensity(frame[row, column + k])
     return value
+
+
+@wp.func
+def intensities_ahead(frame: wp.array2d[wp.vec3ub], first: wp.int32, column: wp.int32) -> rows_of_four:
+    """``four_intensities`` of ``ROWS_AHEAD`` rows; 0 beyond the last row."""
+    rows = rows_of_four()
+    height = frame.shape[0]
+    width = frame.shape[1]
+    if width % 4 == 0:
+        # Loads without conditions go out together; what lies outside is put to 0 afterwards.
+        inside = wp.min(column, width - 4)
+        for k in range(ROWS_AHEAD):
+            rows[k] = aligned_intensities(frame, wp.min(first + k, height - 1), inside)
+        for k in range(ROWS_AHEAD):
+            if first + k >= height or column >= width:
+                rows[k] = vec4u()
+    else:
+        for k in range(ROWS_AHEAD):
+            if first + k < height:
+                rows[k] = four_intensities(frame, first + k, column)
+    return rows
 
 
 @wp.kernel(enable_backward=False)
@@ -236,10 +265,7 @@ def sum_tiles_kernel(
     columns = vec4u()
     total = wp.uint32(0)
     for first in range(strip_index * strip, (strip_index + 1) * strip, ROWS_AHEAD):
-        rows = rows_of_four()
-        for k in range(ROWS_AHEAD):
-            if first + k < frame.shape[0]:
-                rows[k] = four_intensities(frame, first + k, column)
+        rows = intensities_ahead(frame, first, column)
         for k in range(ROWS_AHEAD):
             columns += rows[k]
             row = scan_lanes(rows[k, 0] + rows[k, 1] + rows[k, 2] + rows[k, 3])
@@ -313,16 +339,19 @@ def write_tiles_kernel(
     column = 4 * t
     width = frame.shape[1]
     total = vec4u()
-    if column < width:
-        for above in range(strip_index):
-            total += load_four(column_sums, above, column)
+    inside = wp.where(width % 4 == 0, wp.min(column, width - 4), wp.min(column, width - 1))
+    for first in range(0, strip_index, ROWS_AHEAD):
+        strips = rows_of_four()
+        for k in range(ROWS_AHEAD):
+            strips[k] = load_four(column_sums, wp.min(first + k, strip_index - 1), inside)
+        for k in range(ROWS_AHEAD):
+            if first + k < strip_index:
+                total += strips[k]
     for first in range(strip_index * strip, (strip_index + 1) * strip, ROWS_AHEAD):
-        rows = rows_of_four()
+        rows = intensities_ahead(frame, first, column)
         left = row_of_sums()
         for k in range(ROWS_AHEAD):
-            if first + k < frame.shape[0]:
-                rows[k] = four_intensities(frame, first + k, column)
-                left[k] = row_sums[first + k, t // lanes]
+            left[k] = row_sums[wp.min(first + k, frame.shape[0] - 1), t // lanes]
         for k in range(ROWS_AHEAD):
             value = rows[k]
             value[1] = value[1] + value[0]
