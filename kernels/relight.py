@@ -59,10 +59,11 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.lamps import add_nearness
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
-from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
 from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
 
@@ -99,6 +100,8 @@ class RelightConfig:
     """Whether there are mirror balls, which hide the desk and throw shadows of virtual light."""
     soft: bool = False
     """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
+    lamps: bool = False
+    """Whether ``reflectance`` knows lamps of the room by their places."""
 
     def __post_init__(self) -> None:
         if self.rung not in RUNGS:
@@ -188,6 +191,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         key_lights: wp.array[KeyLight],
         irradiance_sh: wp.array[wp.vec3],
         irradiance_map: wp.array2d[wp.vec3],
+        lamps: wp.array[RoomLamp],
         box: wp.int32,
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
@@ -255,6 +259,8 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
                                 room = sh_irradiance(irradiance_sh, hit.normal)
                             else:
                                 room = sample_latlong(irradiance_map, hit.normal)
+                            if wp.static(config.lamps):
+                                room = add_nearness(room, lamps, probes[0].center, hit.point, hit.normal)
                             kd = wp.vec3(
                                 reflectance_of(radiance[0], room[0]),
                                 reflectance_of(radiance[1], room[1]),
@@ -292,6 +298,7 @@ def relight(
     irradiance: wp.array | None,
     physical_added_out: wp.array,
     *,
+    lamps: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the desk; zero outside ``params[0].light_rect``.
@@ -310,6 +317,7 @@ def relight(
         irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
             ``reflectance``.
         physical_added_out: (H, W) vec3, linear radiance in camera values.
+        lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
         rows: Band of rows; None means all.
     """
     is_map = config.irradiance == "map"
@@ -328,6 +336,7 @@ def relight(
             key_lights,
             None if is_map else irradiance,
             irradiance if is_map else None,
+            lamps,
             surroundings_size(frame.shape[0]),
         ],
         [physical_added_out],

@@ -73,10 +73,12 @@ EVIDENCE: Final = 7.0
 """Fall of the cost (twice a log likelihood) that a peak must be worth."""
 PEAKS: Final = 4
 """Most peaks at a time."""
-SEARCH_EVERY: Final = 3
-"""Frames between searches for one more peak; the first frame searches for all."""
+SEARCH_EVERY: Final = 2
+"""Estimates between searches for one more peak; the first searches for all."""
 MOST_CANDIDATES: Final = 160
-"""Directions that are tried for a peak."""
+"""Directions that are tried for a peak in the first frame."""
+LATER_CANDIDATES: Final = 40
+"""Directions that are tried in a later search, others each time."""
 DISTANCES: Final = np.array([2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.26, 0.2])
 """Metres from the ball that are tried for a lamp, beside infinity."""
 PEAK_ANGLE: Final = 0.12
@@ -330,6 +332,14 @@ def small_product(a: Array, b: Array) -> Array:
     return total
 
 
+def sums_over_cells(transfer: NDArray[np.float32], values: Array) -> Array:
+    """Product of (n, m) and (m, k), in blocks that a BLAS library keeps on one thread, as ``small_product``."""
+    step = max(1, _ONE_THREAD // max(values.size, 1))
+    small = values.astype(np.float32)
+    blocks = [transfer[start : start + step] @ small for start in range(0, len(transfer), step)]
+    return np.concatenate([np.zeros((0, values.shape[1])), *blocks])
+
+
 # ---- the least-squares problem ---------------------------------------------------------------------------------------
 
 
@@ -443,7 +453,12 @@ class _Problem:
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > DARK) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
-        self.captured = self.transfer @ self.radiance
+        # With what clips taken to be some ten times as bright: only the order of magnitude matters.
+        bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
+        sums = sums_over_cells(self.transfer, np.column_stack([self.radiance, bright]))
+        self.captured = sums[:, :3]
+        mirrored_sums = sums_over_cells(through_balls, bright[:, None])
+        self.mirrored_share = mirrored_sums[:, 0] / np.maximum(sums[:, 3], 1e-9)
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3
@@ -451,10 +466,6 @@ class _Problem:
             sent = self.transfer[:, order]
             columns = [np.add.reduceat(sent * self.lacking[order, c], starts, axis=1) for c in range(3)]
         self.columns = np.stack(columns)
-        # With what clips taken to be some ten times as bright: only the order of magnitude matters.
-        bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
-        total = np.maximum(self.transfer @ bright, 1e-9)
-        self.mirrored_share = (through_balls @ bright) / total
         self.peaks: list[_Peak] = []
         self.peak_columns = np.zeros((3, len(self.index), 0))
         self.ties = [
@@ -665,7 +676,11 @@ class _Problem:
                 best = (peak, cost)
         if best is None or best[1] > fit.cost - EVIDENCE:
             return None
-        peak, cost = best
+        self.push(self.settled(*best, fit, c))
+        return self.fit(c, self.with_peak(fit.z), ITERATIONS)
+
+    def settled(self, peak: _Peak, cost: float, fit: _Fit, c: int) -> _Peak:
+        """Where a peak that is not among the unknowns of ``fit``, and would lead to ``cost``, does best."""
         for _ in range(2):
             around = self.neighbours(peak)
             moved = False
@@ -675,8 +690,14 @@ class _Problem:
                     peak, cost, moved = around[place], other, True
             if not moved:
                 break
-        self.push(peak)
-        return self.fit(c, self.with_peak(fit.z), ITERATIONS)
+        return peak
+
+    def move_peak(self, c: int, mean: float) -> None:
+        """Move the first peak to where it does better, if that is nearby; it becomes the last."""
+        peak = self.peaks.pop(0)
+        self.peak_columns = self.peak_columns[:, :, 1:]
+        fit = self.fit(c, self.start(mean), ITERATIONS)
+        self.push(self.settled(peak, self.tried(peak, fit.z, c, 4).cost, fit, c))
 
     def neighbours(self, peak: _Peak) -> list[_Peak]:
         """Peaks in cells nearby, and at distances nearby."""
@@ -686,18 +707,19 @@ class _Problem:
             found += [_Peak(peak.cell, peak.distance * factor) for factor in (0.83, 0.91, 1.1, 1.2)]
         return found
 
-    def find_peaks(self, c: int, z: Array, most: int) -> Array:
-        """Add up to ``most`` peaks; returns the unknowns."""
+    def find_peaks(self, c: int, z: Array, most: int, *, candidates: int = MOST_CANDIDATES, turn: int = 0) -> Array:
+        """Add up to ``most`` peaks; returns the unknowns. Each ``turn`` tries other directions, if few at a time."""
         fit = self.fit(c, z, ITERATIONS)
         cells = np.flatnonzero(self.may_hold_peak)
         if len(cells) == 0 or most < 1:
             return fit.z
-        cells = cells[:: -(-len(cells) // MOST_CANDIDATES)]
+        step = -(-len(cells) // candidates)
+        cells = cells[turn % step :: step]
         distances = [np.inf, *DISTANCES] if self._trace is not None else [np.inf]
-        candidates = [_Peak(int(cell), float(distance)) for distance in distances for cell in cells]
-        columns = self.power_columns(candidates)
+        peaks = [_Peak(int(cell), float(distance)) for distance in distances for cell in cells]
+        columns = self.power_columns(peaks)
         for _ in range(most):
-            better = self.add_peak(fit, c, candidates, columns)
+            better = self.add_peak(fit, c, peaks, columns)
             if better is None:
                 break
             fit = better
@@ -754,9 +776,14 @@ class Recovery:
         for peak in self._peaks:
             if problem.may_hold_peak[peak.cell]:
                 problem.push(peak)
-        if self._frames % SEARCH_EVERY == 0:
-            most = PEAKS if self._frames == 0 else 1
-            problem.find_peaks(best, problem.start(means[best]), min(most, PEAKS - len(problem.peaks)))
+        if self._frames and problem.peaks:
+            problem.move_peak(best, means[best])
+        start, room = problem.start(means[best]), PEAKS - len(problem.peaks)
+        if self._frames == 0:
+            problem.find_peaks(best, start, room)
+        elif self._frames % SEARCH_EVERY == 1:
+            turn = self._frames // SEARCH_EVERY
+            problem.find_peaks(best, start, min(room, 1), candidates=LATER_CANDIDATES, turn=turn)
         self._frames += 1
 
         bright = problem.first_mean

@@ -43,7 +43,7 @@ class Recover(Stage):
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
-            ("environment", "lamps"),
+            ("environment", "lamps") if request.quality.rung(cls.name) == "shading" else ("environment",),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -55,7 +55,7 @@ class Recover(Stage):
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
-            "lamps": ArraySpec((recovery.PEAKS,), RoomLamp),
+            **{name: ArraySpec((recovery.PEAKS,), RoomLamp) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
@@ -156,7 +156,8 @@ class Recover(Stage):
             records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
             for record, lamp in zip(records, self.estimate.lamps, strict=False):
                 record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
-            arrays["lamps"].assign(records)
+            if "lamps" in arrays:
+                arrays["lamps"].assign(records)
 
         def add(rows: Rows | None) -> None:
             kernels.add_excess(

@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import relight
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.room_samples import knows_lamps
 from warp_ar.stages.shade import casts_soft
 from warp_ar.stages.visibility import GrowingRows
 
@@ -36,6 +37,7 @@ class Relight(Stage):
             reads.append("summed_area")
         if rung == "reflectance":
             reads.append(irradiance_name(request))
+            reads += ["lamps"] * knows_lamps(request)
         return Wiring(tuple(reads), ("physical_added",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -48,7 +50,12 @@ class Relight(Stage):
         form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
         scene = self.request.scene
         config = relight.RelightConfig(
-            relight_rung(self.request), trace_config(scene), form, bool(scene.probes), casts_soft(self.request)
+            relight_rung(self.request),
+            trace_config(scene),
+            form,
+            bool(scene.probes),
+            casts_soft(self.request),
+            "lamps" in self.wiring.reads,
         )
         relight.make_relight_kernel(config)
 
@@ -66,6 +73,7 @@ class Relight(Stage):
                 arrays.get("key_lights"),
                 arrays.get(irradiance_name(self.request)),
                 arrays["physical_added"],
+                lamps=arrays.get("lamps"),
                 rows=rows,
             )
 
