@@ -34,7 +34,7 @@ from warp_ar.scene import (
     Scene,
 )
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Arrays, Pass, Request, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, Pass, Request, Stage, Wiring
 from warp_ar.tracking import Pose, Track, TrackState
 
 SIZE = (48, 36)
@@ -286,6 +286,15 @@ def solid_angles(height: int, width: int) -> np.ndarray:
     return ((edges[:-1] - edges[1:]) * 2.0 * math.pi / width)[:, None]
 
 
+def _spec_of(name: str, request: Request) -> ArraySpec:
+    """What the stage that writes a resource declares of it."""
+    for kind in STAGES:
+        wiring = kind.wire(request)
+        if isinstance(wiring, Wiring) and name in wiring.writes:
+            return kind(request, wiring).arrays()[name]
+    raise ValueError(f"no stage writes {name}")
+
+
 class LoneStage:
     """A stage of the room's light by itself, with an environment of any height."""
 
@@ -300,8 +309,8 @@ class LoneStage:
         self.arrays = Arrays()
         with wp.ScopedDevice(device):
             for read in wiring.reads:
-                dtype = wp.float32 if read.endswith("confidence") else wp.vec3
-                self.arrays.add(read, wp.zeros((height, 2 * height), dtype=dtype))
+                spec = _spec_of(read, request)
+                self.arrays.add(read, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             for own, spec in self.stage.arrays().items():
                 self.arrays.add(own, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             self.passes = self.stage.build(self.arrays, wp.get_device(device))
