@@ -11,8 +11,26 @@ from tests.hard_cases.rig import SIZE, STAGE_RUNGS, Rig, assert_same_bits
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 
 
+REMEMBERS = ("recover",)
+"""Stages that keep something on the host from frame to frame, which a rig cannot put back."""
+
+
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+@pytest.mark.parametrize(("stage", "rung"), [case for case in STAGE_RUNGS if case[0] in REMEMBERS])
+def test_from_the_first_frame_on(device, stage, rung):
+    """A whole sequence again, from the start and in other bands."""
+    found = []
+    for bands in (1, 1, 3, 16):
+        with Rig(device, stage, rung, bands=bands) as rig:
+            for name in ("noise", "white", "ramp", "torn", "noise"):
+                rig.frame(FRAMES[name])
+            found.append(rig.written(stage))
+    for other in found[1:]:
+        assert_same_bits(found[0], other)
+
+
+@pytest.mark.atlas(row=17)
+@pytest.mark.parametrize(("stage", "rung"), [case for case in STAGE_RUNGS if case[0] not in REMEMBERS])
 def test_run_to_run_and_in_any_bands(rig_for, stage, rung):
     """What a stage writes is a function of what it reads and of its own state before."""
     rig = rig_for(stage, rung)
