@@ -15,7 +15,8 @@ counts the same and the window is centred [KH01]. Neighbours on another surface 
 the frame alone: nothing flickers and nothing lags.
 
 Culling. A sample matters only if its direction meets the bounding sphere of an object; a dot product tells. Only those
-rays are traced, and pixels that have none are done.
+rays are traced, and pixels that have none are done. Tiles of cells in which a ray met an object note the frame's
+number: elsewhere the ratio is 1, and need not be averaged.
 
 Bounce. What a ray meets is not black: an object reflects one of its two lobes, picked by their reflectance. Its rough
 lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an object, that object's own colour; the desk,
@@ -49,6 +50,8 @@ from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset
 
 wp.set_module_options({"enable_backward": False})
 
+SHADED_TILE = wp.constant(8)
+"""Cells along a tile that notes whether something in it is shaded."""
 CHUNK = 64
 """Samples that are culled together: the bits of a mask."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
@@ -273,6 +276,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         # Out:
         ratio_out: wp.array2d[wp.vec4],
         surface_out: wp.array2d[wp.int32],
+        shaded_out: wp.array2d[wp.int32],
     ):
         i, j = wp.tid()
         i += row_start
@@ -387,6 +391,9 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                                 if occluded_by_objects(scene, origin, direction, reach):
                                     change -= weight * radiance
                 bit = bit << wp.uint64(1)
+        unchanged = change == wp.vec3(0.0, 0.0, 0.0)
+        if shaded_out.shape[0] > 0 and not unchanged:
+            shaded_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
         for channel in range(3):
             if without[channel] > MIN_IRRADIANCE:
@@ -396,10 +403,24 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     return room_shadow_kernel
 
 
+@wp.func
+def is_near_shaded(
+    shaded: wp.array2d[wp.int32], frame_index: wp.int32, i: wp.int32, j: wp.int32, reach: wp.int32
+) -> wp.bool:
+    """Whether something is shaded in this frame in a tile within ``reach`` cells."""
+    for a in range(wp.max(i - reach, 0) / SHADED_TILE, wp.min((i + reach) / SHADED_TILE + 1, shaded.shape[0])):
+        for b in range(wp.max(j - reach, 0) / SHADED_TILE, wp.min((j + reach) / SHADED_TILE + 1, shaded.shape[1])):
+            if shaded[a, b] == frame_index:
+                return True
+    return False
+
+
 @wp.kernel(enable_backward=False)
 def filter_ratio_kernel(
     # In:
     row_start: wp.int32,
+    params: wp.array[FrameParams],
+    shaded: wp.array2d[wp.int32],
     ratio: wp.array2d[wp.vec4],
     surface: wp.array2d[wp.int32],
     side: wp.int32,
@@ -414,6 +435,10 @@ def filter_ratio_kernel(
         return
     depth = ratio[i, j][3]
     reach = side / 2
+    if shaded.shape[0] > 0:
+        if not is_near_shaded(shaded, params[0].frame_index, i, j, reach):
+            filtered_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
+            return
     total = wp.vec3(0.0)
     weights = float(0.0)
     for ni in range(wp.max(i - reach, 0), wp.min(i + reach + 1, ratio.shape[0])):
@@ -485,6 +510,7 @@ def shade_room(
     ratio_out: wp.array2d[wp.vec4],
     surface_out: wp.array2d[wp.int32],
     *,
+    shaded_out: wp.array2d[wp.int32] | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
@@ -503,16 +529,22 @@ def shade_room(
         stride: Pixels from one estimate to the next.
         ratio_out: (ceil(H / stride), ceil(W / stride)) RGB ratio and depth.
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
+        shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         rows: Band of rows of the outputs; None means all.
     """
     launch_rows(
         make_room_shadow_kernel(config),
         ratio_out.shape,
         [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride],
-        [ratio_out, surface_out],
+        [ratio_out, surface_out, shaded_out],
         rows=rows,
         device=rays.device,
     )
+
+
+def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
+    """Shape of the array that notes shaded tiles, for so many cells."""
+    return -(-rows // int(SHADED_TILE)), -(-columns // int(SHADED_TILE))
 
 
 def filter_ratio(
@@ -521,6 +553,8 @@ def filter_ratio(
     side: int,
     filtered_out: wp.array2d[wp.vec3],
     *,
+    params: wp.array[FrameParams] | None = None,
+    shaded: wp.array2d[wp.int32] | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded.
@@ -530,12 +564,14 @@ def filter_ratio(
         surface: From ``shade_room``.
         side: Cells along a tile.
         filtered_out: As ``ratio``, without the depth; written only where a surface is seen.
+        params: (1,) FrameParams: frame_index; needed with ``shaded``.
+        shaded: From ``shade_room``; where it is left out every cell is averaged.
         rows: Band of rows; None means all.
     """
     launch_rows(
         filter_ratio_kernel,
         surface.shape,
-        [ratio, surface, side],
+        [params, shaded, ratio, surface, side],
         [filtered_out],
         rows=rows,
         device=surface.device,

@@ -123,14 +123,30 @@ def run(
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     cells = -(-H // stride), -(-W // stride)
     ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
+    shaded = wp.full(room_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
     rays = wp.array(RAYS, dtype=wp.vec2)
     room_shadow.shade_room(
-        config, params, rays, frame, tables()[0], scene, room, *drawn, stride, ratio, surface, rows=rows
+        config,
+        params,
+        rays,
+        frame,
+        tables()[0],
+        scene,
+        room,
+        *drawn,
+        stride,
+        ratio,
+        surface,
+        shaded_out=shaded,
+        rows=rows,
     )
     if not filtered:
         return ratio.numpy()[..., :3], surface.numpy()
-    averaged = wp.zeros(cells, wp.vec3)
+    averaged, skipped = wp.zeros(cells, wp.vec3), wp.zeros(cells, wp.vec3)
     room_shadow.filter_ratio(ratio, surface, side, averaged, rows=rows)
+    # Around cells that are not shaded nothing is averaged, with the same result.
+    room_shadow.filter_ratio(ratio, surface, side, skipped, params=params, shaded=shaded, rows=rows)
+    np.testing.assert_array_equal(skipped.numpy(), averaged.numpy())
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     room_shadow.spread_ratio(params, averaged, surface, stride, out)
     return out.numpy()

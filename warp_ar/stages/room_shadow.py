@@ -122,6 +122,7 @@ class RoomShadow(Stage):
             "room_shadow_ratio": ArraySpec(cells, wp.vec4),
             "room_shadow_filtered": ArraySpec(cells, wp.vec3),
             "room_shadow_surface": ArraySpec(cells, wp.int32, -1),
+            "room_shadow_shaded": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
         }
         if METALLIC_ROUGHNESS in room_config(self.request).models:
             specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
@@ -150,6 +151,8 @@ class RoomShadow(Stage):
             reach = rung.side  # the filter looks beyond the rows that it writes
             return max(start // rung.stride - reach, 0), min(-(-stop // rung.stride) + reach, ratio.shape[0])
 
+        params, shaded = arrays["params"], arrays["room_shadow_shaded"]
+
         def estimate(rows: Rows | None) -> None:
             room_shadow.shade_room(
                 config,
@@ -161,14 +164,15 @@ class RoomShadow(Stage):
                 rung.stride,
                 ratio,
                 surface,
+                shaded_out=shaded,
                 rows=rows,
             )
 
         def average(rows: Rows | None) -> None:
-            room_shadow.filter_ratio(ratio, surface, rung.side, filtered, rows=rows)
+            room_shadow.filter_ratio(ratio, surface, rung.side, filtered, params=params, shaded=shaded, rows=rows)
 
         def spread(rows: Rows | None) -> None:
-            room_shadow.spread_ratio(arrays["params"], filtered, surface, rung.stride, out, rows=rows)
+            room_shadow.spread_ratio(params, filtered, surface, rung.stride, out, rows=rows)
 
         return [
             Pass(estimate, rows=ratio.shape[0], extent=cells),
