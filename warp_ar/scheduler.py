@@ -61,6 +61,7 @@ class Scheduler:
         self._pool = ThreadPoolExecutor(self.bands, "warp_ar") if device.is_cpu and self.bands > 1 else None
         self._stages: list[Step] = []
         self._seen: dict[str, tuple[int, ...]] = {}
+        self._translated: set[Pass] = set()
         self._graphs: dict[tuple[str, ...], Any] = {}
         self._streams: list[Any] = []
         self._marks: dict[str, tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
@@ -119,6 +120,11 @@ class Scheduler:
             return
         start, stop = step.extent() if step.extent is not None else (0, step.rows)
         bands = min(self.bands, max(1, (stop - start) // MIN_BAND_ROWS))
+        # The first launch translates its kernel. Python 3.11's parser is not safe in two threads at once (seen: "AST
+        # constructor recursion depth mismatch"), and one thread would only wait for the other.
+        if stop > start and step not in self._translated:
+            self._translated.add(step)
+            bands = 1
         edges = [start + (stop - start) * band // bands for band in range(bands + 1)]
         # This thread takes the last band itself: one hand-over less per pass.
         futures: list[Future[None]] = [
