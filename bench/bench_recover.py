@@ -68,7 +68,7 @@ class Setup:
 
     def add(self) -> None:
         """Apply an excess."""
-        kernels.add_excess(self.radiance, self.confidence, self.clipped, self.excess, self.recovered)
+        kernels.add_excess(self.radiance, self.confidence, self.clipped, self.cells, self.excess, self.recovered)
 
     def solve(self) -> recovery.Estimate:
         """Solve on the host, warm after the first call."""

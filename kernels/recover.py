@@ -44,6 +44,8 @@ BALL_MARGIN = wp.constant(wp.float32(1.08))
 """How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel counts as seen; as for filling."""
+LIT = wp.constant(wp.float32(0.02))
+"""Clipped share from which a cell's light is where it clips, and not where nothing is seen."""
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
@@ -77,8 +79,8 @@ class Cell:
     """A part of the room."""
 
     radiance: wp.vec3  # mean, as captured
-    clipped: wp.vec3  # mean share that may lack light: at clipping, or not seen at all
-    hidden: wp.float32  # mean share that is not seen
+    clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
+    hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
     modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the room beyond
     middle: wp.vec3  # unit
     direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
@@ -95,12 +97,6 @@ def trust(confidence: wp.float32) -> wp.float32:
     """How far a texel counts as seen, 0..1; 0 for NaN."""
     t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
-
-
-@wp.func
-def lacking(clipped: wp.vec3, seen: wp.float32) -> wp.vec3:
-    """Share of a texel that may lack light, per channel."""
-    return seen * clipped + (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
 
 
 @functools.cache
@@ -137,13 +133,17 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 lost = seen * clipped[i, j]
                 cell.solid_angle += area
                 cell.radiance += area * radiance[i, j]
-                cell.clipped += area * lacking(clipped[i, j], seen)
+                cell.clipped += area * lost
                 cell.hidden += area * (1.0 - seen)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.hidden /= cell.solid_angle
+        if wp.max(cell.clipped) > LIT:
+            cell.hidden = 0.0
+        else:
+            cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
         cell.middle = wp.normalize(toward)
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
@@ -195,6 +195,7 @@ def add_excess_kernel(
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
     clipped: wp.array2d[wp.vec3],
+    cells: wp.array2d[Cell],
     excess: wp.array2d[wp.vec3],
     # Out:
     recovered_out: wp.array2d[wp.vec3],
@@ -206,7 +207,10 @@ def add_excess_kernel(
     row = ((i + 1) * excess.shape[0] - 1) // radiance.shape[0]
     column = ((j + 1) * excess.shape[1] - 1) // radiance.shape[1]
     more = excess[row, column]
-    share = lacking(clipped[i, j], trust(confidence[i, j]))
+    seen = trust(confidence[i, j])
+    share = seen * clipped[i, j]
+    if cells[row, column].hidden > 0.0:
+        share += (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
     recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
 
@@ -214,6 +218,7 @@ def add_excess(
     radiance: wp.array,
     confidence: wp.array,
     clipped: wp.array,
+    cells: wp.array,
     excess: wp.array,
     recovered_out: wp.array,
     *,
@@ -225,6 +230,7 @@ def add_excess(
         radiance: As captured and completed, ``wp.vec3`` (h, w).
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        cells: ``Cell``, ``cell_shape(h, w)``: whether what is not seen takes part.
         excess: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
         recovered_out: ``wp.vec3`` (h, w).
         rows: Band of rows, None for all.
@@ -232,7 +238,7 @@ def add_excess(
     launch_rows(
         add_excess_kernel,
         radiance.shape,
-        [radiance, confidence, clipped, excess],
+        [radiance, confidence, clipped, cells, excess],
         [recovered_out],
         rows=rows,
         device=recovered_out.device,

@@ -223,7 +223,7 @@ def test_cells_keep_energy_and_excess_returns_it(device, height, scene):
     assert not got["modelled"][0].any()
     excess = rng.uniform(0, 5, (*got.shape, 3)).astype(np.float32)
     recovered = wp.zeros(shape, **to)
-    kernels.add_excess(*arrays, wp.array(excess, **to), recovered)
+    kernels.add_excess(*arrays, cells, wp.array(excess, **to), recovered)
     added = (area * (recovered.numpy() - radiance)).sum((0, 1))
     assert added == pytest.approx((weight * got["clipped"] * excess).sum((0, 1)), rel=1e-4)
 

@@ -75,8 +75,10 @@ PEAKS: Final = 4
 """Most peaks at a time."""
 SEARCH_EVERY: Final = 2
 """Estimates between searches for one more peak; the first searches for all."""
+FIRST: Final = 5
+"""Estimates in which searches try as many directions as they ever do."""
 MOST_CANDIDATES: Final = 160
-"""Directions that are tried for a peak in the first frame."""
+"""Directions that are tried for a peak at first."""
 LATER_CANDIDATES: Final = 40
 """Directions that are tried in a later search, others each time."""
 DISTANCES: Final = np.array([2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.26, 0.2])
@@ -783,7 +785,8 @@ class Recovery:
             problem.find_peaks(best, start, room)
         elif self._frames % SEARCH_EVERY == 1:
             turn = self._frames // SEARCH_EVERY
-            problem.find_peaks(best, start, min(room, 1), candidates=LATER_CANDIDATES, turn=turn)
+            candidates = MOST_CANDIDATES if self._frames < FIRST else LATER_CANDIDATES
+            problem.find_peaks(best, start, min(room, 1), candidates=candidates, turn=turn)
         self._frames += 1
 
         bright = problem.first_mean

@@ -164,6 +164,7 @@ class Recover(Stage):
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
                 arrays["environment_clipped"],
+                cells,
                 arrays["recover_excess"],
                 arrays["environment"],
                 rows=rows,
