@@ -52,6 +52,8 @@ wp.set_module_options({"enable_backward": False})
 
 SHADED_TILE = wp.constant(8)
 """Cells along a tile that notes whether something in it is shaded."""
+WARP_LANES = 32
+"""Threads of a CUDA device that go the same way or wait for each other."""
 CHUNK = 64
 """Samples that are culled together: the bits of a mask."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
@@ -273,6 +275,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         flux: wp.array[wp.vec3],
         samples: wp.array[RoomSample],
         stride: wp.int32,
+        lanes: wp.int32,
         # Out:
         ratio_out: wp.array2d[wp.vec4],
         surface_out: wp.array2d[wp.int32],
@@ -280,6 +283,11 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
+        # Neighbouring threads take the cells of one set, so that their rays go the same way.
+        group = lanes * side
+        place = j % group
+        if j - place + group <= ratio_out.shape[1]:
+            j += (place % lanes) * side + place / lanes - place
         row = wp.min(i * stride + stride / 2, rays.shape[0] - 1)
         column = wp.min(j * stride + stride / 2, rays.shape[1] - 1)
         surface_out[i, j] = -1
@@ -532,10 +540,11 @@ def shade_room(
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         rows: Band of rows of the outputs; None means all.
     """
+    lanes = 1 if rays.device.is_cpu else WARP_LANES
     launch_rows(
         make_room_shadow_kernel(config),
         ratio_out.shape,
-        [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride],
+        [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride, lanes],
         [ratio_out, surface_out, shaded_out],
         rows=rows,
         device=rays.device,

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, cast
 
@@ -26,7 +27,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
 from warp_ar.stages.base import Arrays, Request
 from warp_ar.tracking import Pose, Tracker, TrackState
-from warp_ar.transfer import Download, Transfers
+from warp_ar.transfer import Transfers
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the room's light from frame to frame."""
@@ -52,14 +53,14 @@ class Result:
     """Tracked, held or lost; None when nothing needed the pose."""
     stages: Mapping[str, StageTiming]
     """Milliseconds of every stage of the plan, and whether it was skipped."""
-    download: Download | None = None
+    download: Future[npt.NDArray[np.uint8]] | None = None
     """The lit frame on its way to the host, where it was sent ahead."""
 
     @functools.cached_property
     def image(self) -> npt.NDArray[np.uint8]:
         """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
         if self.download is not None:
-            return self.download.take()
+            return self.download.result()
         return np.array(self.image_array.numpy() if isinstance(self.image_array, wp.array) else self.image_array)
 
     @functools.cached_property
@@ -244,6 +245,7 @@ class Pipeline:
         """
         result = self(image, time_seconds=time_seconds, pose=pose)
         if self._transfers is None or not isinstance(result.image_array, wp.array):
+            _ = result.image  # kept: the next frame writes the same array
             return result
         return dataclasses.replace(result, download=self._transfers.download(result.image_array))
 

@@ -9,8 +9,7 @@ may keep; they are copied to and from the slots on the device, which takes a hun
 from __future__ import annotations
 
 import itertools
-import weakref
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -29,23 +28,6 @@ _COPY_ROWS = 256
 """Rows from which splitting a host copy pays for handing parts over."""
 
 
-class Download:
-    """A picture on its way to the host."""
-
-    def __init__(self, transfers: Transfers, slot: _Slot) -> None:
-        self._transfers = transfers
-        self._slot = slot
-        self._image: Image | None = None
-
-    def take(self) -> Image:
-        """The picture, an array of its own; waits for it if it is not there yet."""
-        if self._image is None:
-            wp.synchronize_event(self._slot.downloaded)
-            self._image = np.empty_like(self._slot.from_device_host)
-            self._transfers.copy(self._image, self._slot.from_device_host)
-        return self._image
-
-
 class _Slot:
     """Buffers of one frame under way."""
 
@@ -56,7 +38,7 @@ class _Slot:
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.uploaded, self.consumed, self.rendered, self.downloaded = (wp.Event(device) for _ in range(4))
-        self.download: weakref.ref[Download] | None = None
+        self.fetched: Future[Image] | None = None
 
 
 class Transfers:
@@ -74,13 +56,15 @@ class Transfers:
         self._slots = [_Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
         self._pool = ThreadPoolExecutor(COPY_THREADS, "warp_ar-copy") if shape[0] >= 2 * _COPY_ROWS else None
+        self._fetcher = ThreadPoolExecutor(1, "warp_ar-fetch")
 
     def close(self) -> None:
         """Stop the copying threads."""
+        self._fetcher.shutdown()
         if self._pool is not None:
             self._pool.shutdown()
 
-    def copy(self, target: Image, source: Image) -> None:
+    def _copy(self, target: Image, source: Image) -> None:
         """Copy one host picture to another."""
         if self._pool is None:
             np.copyto(target, source)
@@ -99,27 +83,34 @@ class Transfers:
             wp.synchronize_event(slot.uploaded)
             self._up.wait_event(slot.consumed)
         self._uploads += 1
-        self.copy(slot.to_device_host, image)
+        self._copy(slot.to_device_host, image)
         wp.copy(slot.frame, slot.to_device, stream=self._up)
         self._up.record_event(slot.uploaded)
         self._compute.wait_event(slot.uploaded)
         wp.copy(frame_out, slot.frame, stream=self._compute)
         self._compute.record_event(slot.consumed)
 
-    def download(self, image: Any) -> Download:
-        """Send the device's picture to the host as soon as the kernels launched so far have written it."""
+    def download(self, image: Any) -> Future[Image]:
+        """Send the device's picture to the host as soon as the kernels launched so far have written it.
+
+        Returns:
+            Gives the picture, an array of its own; a thread waits for it and copies it out of pinned memory.
+        """
         slot = self._slots[self._downloads % SLOTS]
         self._downloads += 1
-        earlier = slot.download() if slot.download is not None else None
-        if earlier is not None:
-            earlier.take()  # nobody has asked for it yet, but its buffer is needed now
-        if slot.download is not None:
+        if slot.fetched is not None:
+            slot.fetched.result()  # its buffers are needed now
             self._compute.wait_event(slot.downloaded)
         wp.copy(slot.image, image, stream=self._compute)
         self._compute.record_event(slot.rendered)
         self._down.wait_event(slot.rendered)
         wp.copy(slot.from_device, slot.image, stream=self._down)
         self._down.record_event(slot.downloaded)
-        download = Download(self, slot)
-        slot.download = weakref.ref(download)
-        return download
+        slot.fetched = self._fetcher.submit(self._fetch, slot)
+        return slot.fetched
+
+    def _fetch(self, slot: _Slot) -> Image:
+        wp.synchronize_event(slot.downloaded)
+        image: Image = np.empty(slot.from_device_host.shape, np.uint8)
+        self._copy(image, slot.from_device_host)
+        return image
