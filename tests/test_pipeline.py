@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 import warp as wp
 
 from warp_ar.errors import UsageError
-from warp_ar.pipeline import Pipeline, Result
+from warp_ar.pipeline import Pipeline, Result, resample_light
+from warp_ar.quality import PRESETS
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -27,6 +29,8 @@ from warp_ar.sources import Synthetic
 from warp_ar.tracking import TrackState
 
 SIZE = (320, 240)
+# Mean over the seen part of a map whose border moves by half a texel of 32 rows.
+RESAMPLED = 0.05
 Frames = list[npt.NDArray[np.uint8]]
 
 
@@ -276,6 +280,55 @@ def test_a_new_pipeline_continues_with_the_light(frames: Frames) -> None:
         np.testing.assert_array_equal(new.arrays["environment_radiance"].numpy(), light)
         result = new(np.full_like(frames[0], 90), time_seconds=9.0)  # no marker in sight: the kept light is still there
         assert result.environment_array is not None
+
+
+@pytest.mark.parametrize("recover", ["white_card", "shading"])
+def test_handing_over_between_equals_shows_nothing(recover: str, frames: Frames, device: str) -> None:
+    """One pipeline, and two that take turns: light, recovered lamps, exposure and clock go along."""
+    quality = PRESETS["low"].with_rungs(recover=recover, expose="ball")
+    scene = make_scene(exposure=Exposure("auto"))
+    outputs = ("image", "environment")
+    with contextlib.ExitStack() as stack:
+        alone, one, other = (
+            stack.enter_context(Pipeline(scene, device=device, quality=quality, outputs=outputs)) for _ in range(3)
+        )
+        for index, image in enumerate(frames * 2):
+            expected = alone(image, time_seconds=index / 30)
+            if index > 0:
+                one.continue_from(other)
+            result = one(image, time_seconds=index / 30)
+            np.testing.assert_array_equal(result.environment, expected.environment)
+            np.testing.assert_array_equal(result.image, expected.image)
+            one, other = other, one
+
+
+def test_light_is_kept_at_another_size(frames: Frames, device: str) -> None:
+    with contextlib.ExitStack() as stack:
+        small, large = (
+            stack.enter_context(Pipeline(make_scene(), device=device, quality=quality)) for quality in ("low", "medium")
+        )
+        run(small, frames)
+        for old, new in ((small, large), (large, small)):
+            before = old.arrays["environment_radiance"].numpy()
+            new.continue_from(old)
+            after = new.arrays["environment_radiance"].numpy()
+            assert after.shape != before.shape
+            seen = old.arrays["environment_confidence"].numpy() > 0.5
+            assert after[new.arrays["environment_confidence"].numpy() > 0.5].mean() == pytest.approx(
+                before[seen].mean(), rel=RESAMPLED
+            )
+
+
+def test_resampled_light_is_constant_where_it_was() -> None:
+    radiance = np.full((16, 32, 3), 2.5, np.float32)
+    confidence = np.random.default_rng(0).random((16, 32)).astype(np.float32)
+    confidence[:4] = 0.0
+    radiance[:4] = 0.0
+    for shape in ((8, 16), (32, 64), (5, 10)):
+        light, known, clipped = resample_light(radiance, confidence, np.ones_like(radiance), shape)
+        assert light.shape == (*shape, 3)
+        np.testing.assert_allclose(light[known > 1e-3], 2.5, rtol=1e-5)
+        np.testing.assert_allclose(clipped[known > 1e-3], 1.0, rtol=1e-5)
 
 
 def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: str) -> None:

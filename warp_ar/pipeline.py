@@ -218,10 +218,17 @@ class Pipeline:
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         kept = [name for name in LIGHT_ARRAYS if name in self._arrays and name in other._arrays]
-        if other._has_light and kept and self._arrays[kept[0]].shape == other._arrays[kept[0]].shape:
-            for name in kept:
-                wp.copy(self._arrays[name], other._arrays[name])
+        if other._has_light and kept:
+            if self._arrays[kept[0]].shape == other._arrays[kept[0]].shape:
+                for name in kept:
+                    wp.copy(self._arrays[name], other._arrays[name])
+            else:
+                radiance, confidence, clipped = (other._arrays[name].numpy() for name in LIGHT_ARRAYS)
+                light = resample_light(radiance, confidence, clipped, self._arrays[kept[0]].shape)
+                for name, values in zip(LIGHT_ARRAYS, light, strict=True):
+                    self._arrays[name].assign(values)
             self._has_light = True
+        self._scheduler.continue_from(other._scheduler)
 
     def _write_exposure(self, scene: Scene) -> None:
         scale = scene.exposure.scale
@@ -353,6 +360,23 @@ class Pipeline:
         else:
             self._transfers.upload(host_image, self._frame)
         self._arrays.touch("frame")
+
+
+def resample_light(
+    radiance: npt.NDArray[np.float32],
+    confidence: npt.NDArray[np.float32],
+    clipped: npt.NDArray[np.float32],
+    shape: tuple[int, int],
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """The remembered light at another size, (rows, columns): means weighted by confidence."""
+
+    def resize(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        way = cv2.INTER_AREA if shape[0] < values.shape[0] else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(values, (shape[1], shape[0]), interpolation=way), np.float32)
+
+    known = resize(confidence)
+    weight = np.where(known > 0.0, known, 1.0)[..., None]
+    return resize(radiance * confidence[..., None]) / weight, known, resize(clipped * confidence[..., None]) / weight
 
 
 def pixel_rays(camera: Camera) -> npt.NDArray[np.float32]:

@@ -7,6 +7,7 @@ device idle, run beside others.
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import os
@@ -25,6 +26,8 @@ Step = tuple[Stage, list[Pass]]
 
 # Bands shorter than this cost more in launching than they save.
 MIN_BAND_ROWS = 8
+# From this height on there are two bands per thread: rows are not alike, and who is done first takes what is left.
+UNEVEN_ROWS = 96
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,16 +52,17 @@ class Scheduler:
             plan: What runs.
             arrays: Resources; the pipeline's inputs must be there already.
             device: Warp device.
-            bands: Bands per CPU pass; None means one per core that this process may use.
+            bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
         """
         self.plan = plan
         self.arrays = arrays
         self.device = device
-        self.bands = bands or (
-            len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        )
-        self._pool = ThreadPoolExecutor(self.bands, "warp_ar") if device.is_cpu and self.bands > 1 else None
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.bands = bands
+        self._threads = min(cores, bands or cores)
+        helpers = max(self._threads - 1, 1)
+        self._pool = ThreadPoolExecutor(helpers, "warp_ar") if device.is_cpu and (bands or cores) > 1 else None
         self._stages: list[Step] = []
         self._seen: dict[str, tuple[int, ...]] = {}
         self._translated: set[Pass] = set()
@@ -82,6 +86,22 @@ class Scheduler:
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
         self._seen.clear()
+
+    def continue_from(self, other: Scheduler) -> None:
+        """Let stages go on from what the same stages of another plan remember, where it fits."""
+        others = {stage.name: stage for stage, _ in other._stages}
+        for stage, _ in self._stages:
+            if stage.name not in others or others[stage.name] is stage:
+                continue
+            fits = [
+                name
+                for name in stage.remembers
+                if name in other.arrays and other.arrays[name].shape == self.arrays[name].shape
+            ]
+            if len(fits) == len(stage.remembers):
+                for name in fits:
+                    wp.copy(self.arrays[name], other.arrays[name])
+                stage.resume(others[stage.name])
 
     def run(self) -> Mapping[str, StageTiming]:
         """Run the stages whose inputs changed since they last ran; returns the time of each."""
@@ -119,18 +139,14 @@ class Scheduler:
             step.launch(None if step.extent is None else step.extent())
             return
         start, stop = step.extent() if step.extent is not None else (0, step.rows)
-        bands = min(self.bands, max(1, (stop - start) // MIN_BAND_ROWS))
-        # The first launch translates its kernel. Python 3.11's parser is not safe in two threads at once (seen: "AST
-        # constructor recursion depth mismatch"), and one thread would only wait for the other.
-        if stop > start and step not in self._translated:
-            self._translated.add(step)
-            bands = 1
+        wanted = self.bands or self._threads * (2 if stop - start >= UNEVEN_ROWS else 1)
+        bands = min(wanted, max(1, (stop - start) // MIN_BAND_ROWS))
         edges = [start + (stop - start) * band // bands for band in range(bands + 1)]
-        # This thread takes the last band itself: one hand-over less per pass.
-        futures: list[Future[None]] = [
-            self._pool.submit(_call, step.launch, (edges[band], edges[band + 1])) for band in range(bands - 1)
-        ]
-        step.launch((edges[-2], edges[-1]))
+        waiting = collections.deque(itertools.pairwise(edges))
+        # This thread works as well: one hand-over less per pass.
+        helpers = min(bands - 1, max(self._threads - 1, 1))
+        futures: list[Future[None]] = [self._pool.submit(_drain, step.launch, waiting) for _ in range(helpers)]
+        _drain(step.launch, waiting)
         for future in futures:
             future.result()
 
@@ -218,8 +234,14 @@ def _segments(due: list[Step]) -> list[tuple[bool, list[Step]]]:
     ]
 
 
-def _call(launch: Callable[[Rows | None], None], rows: Rows) -> None:
-    launch(rows)
+def _drain(launch: Callable[[Rows | None], None], waiting: collections.deque[Rows]) -> None:
+    """Launch bands until none is waiting."""
+    while True:
+        try:
+            rows = waiting.popleft()
+        except IndexError:
+            return
+        launch(rows)
 
 
 def add_inputs(arrays: Arrays, inputs: Mapping[str, Any]) -> None:

@@ -114,6 +114,8 @@ class Stage(abc.ABC):
     """Ways to do the work, cheapest first."""
     summary: ClassVar[str]
     """What it does, in one line for ``explain``."""
+    remembers: ClassVar[tuple[str, ...]] = ()
+    """Its arrays that carry over from frame to frame, and so to the pipeline of another quality."""
 
     def __init__(self, request: Request, wiring: Wiring) -> None:
         self.request = request
@@ -140,3 +142,6 @@ class Stage(abc.ABC):
     def changed(self, name: str) -> bool:
         """Whether the last run changed the written resource ``name`` enough for its readers to run again."""
         return True
+
+    def resume(self, other: Stage) -> None:  # noqa: B027  (most stages remember nothing on the host)
+        """Take over what the same stage of another pipeline remembers on the host; its arrays have been copied."""

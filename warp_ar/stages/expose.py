@@ -18,6 +18,7 @@ class Expose(Stage):
 
     name = "expose"
     rungs = ("plain", "box", "glow", "ball")
+    remembers = ("expose_scale",)
     summary = "another exposure: over-exposed regions keep what they can be guessed to have had"
 
     @classmethod

@@ -33,6 +33,7 @@ class Recover(Stage):
     name: ClassVar[str] = "recover"
     rungs: ClassVar[tuple[str, ...]] = recovery.RUNGS
     summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
+    remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "lamps")
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
@@ -76,7 +77,7 @@ class Recover(Stage):
         proxies = trace_config(scene).proxies
         self._arrays, self._on_cpu = arrays, device.is_cpu
         arrays["recover_points"].assign(self._surfaces.points)
-        solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
+        self._solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
         cells = arrays["recover_cells"]
         points = len(self._surfaces.points)
         self.estimate: recovery.Estimate | None = None
@@ -144,7 +145,7 @@ class Recover(Stage):
             if not due:
                 return
             self._waited, self._last = 0, arrays["seconds"]()
-            self.estimate = solver.update(
+            self.estimate = self._solver.update(
                 cells.numpy(),
                 arrays["recover_transfer"].numpy(),
                 arrays["recover_mirrored"].numpy(),
@@ -188,6 +189,15 @@ class Recover(Stage):
         """Whether this frame is one to estimate from."""
         waited = abs(self._arrays["seconds"]() - self._last) > EVERY_SECONDS - 1e-3
         return self._frames < EVERY_FRAME or (waited and self._waited + 1 >= EVERY_FRAME)
+
+    def resume(self, other: Stage) -> None:
+        """Keep the lamps that were found, and when; on another rung, or on another desk, look anew."""
+        if not isinstance(other, Recover) or other.rung != self.rung:
+            return
+        mine, yours = self.request.scene, other.request.scene
+        if (mine.marker, mine.probes, mine.proxies) == (yours.marker, yours.probes, yours.proxies):
+            self._solver, self.estimate = other._solver, other.estimate
+            self._frames, self._waited, self._last = other._frames, other._waited, other._last
 
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``."""
