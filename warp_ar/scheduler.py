@@ -143,8 +143,11 @@ class Scheduler:
         bands = min(wanted, max(1, (stop - start) // MIN_BAND_ROWS))
         edges = [start + (stop - start) * band // bands for band in range(bands + 1)]
         waiting = collections.deque(itertools.pairwise(edges))
-        # This thread works as well: one hand-over less per pass.
-        helpers = min(bands - 1, max(self._threads - 1, 1))
+        # This thread works as well: one hand-over less per pass. It works alone at first, when kernels are translated:
+        # Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
+        helpers = min(bands - 1, max(self._threads - 1, 1)) if step in self._translated else 0
+        if stop > start:
+            self._translated.add(step)
         futures: list[Future[None]] = [self._pool.submit(_drain, step.launch, waiting) for _ in range(helpers)]
         _drain(step.launch, waiting)
         for future in futures:
