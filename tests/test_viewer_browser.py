@@ -100,7 +100,11 @@ def url(scene_file: Path) -> Iterator[str]:
         assert found, (line, process.poll())
         yield found[0]
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=PATIENCE)
+        try:
+            _, errors = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
     assert process.returncode == 130, errors
     assert errors == ""
 

@@ -211,6 +211,8 @@ def serve_page(options: argparse.Namespace) -> int:
         if not options.no_browser and local and _has_display():
             webbrowser.open(address.url)
 
+    # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server(make_host, Address(options.host, port, token, tls))
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
