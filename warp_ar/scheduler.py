@@ -136,7 +136,8 @@ class Scheduler:
 
     def _run_pass(self, step: Pass) -> None:
         if self._pool is None or step.rows is None:
-            step.launch(None if step.extent is None else step.extent())
+            # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
+            step.launch(step.extent() if step.extent is not None and self.device.is_cpu else None)
             return
         start, stop = step.extent() if step.extent is not None else (0, step.rows)
         wanted = self.bands or self._threads * (2 if stop - start >= UNEVEN_ROWS else 1)
