@@ -29,6 +29,8 @@ from warp_ar.sources import Synthetic
 from warp_ar.tracking import TrackState
 
 SIZE = (320, 240)
+# Codes by which a picture may lag where its light moved too little for readers to run again; when that is, differs.
+SPARED = 1
 # Mean over the seen part of a map whose border moves by half a texel of 32 rows.
 RESAMPLED = 0.05
 Frames = list[npt.NDArray[np.uint8]]
@@ -282,24 +284,39 @@ def test_a_new_pipeline_continues_with_the_light(frames: Frames) -> None:
         assert result.environment_array is not None
 
 
+def dimmed(frames: Frames) -> Frames:
+    """The frames again and again, darker and brighter: light, and what clips of it, keeps changing."""
+    return [np.uint8(image * gain) for gain in (1.0, 0.5, 0.8, 0.4) for image in frames]
+
+
 @pytest.mark.parametrize("recover", ["white_card", "shading"])
 def test_handing_over_between_equals_shows_nothing(recover: str, frames: Frames, device: str) -> None:
     """One pipeline, and two that take turns: light, recovered lamps, exposure and clock go along."""
     quality = PRESETS["low"].with_rungs(recover=recover, expose="ball")
-    scene = make_scene(exposure=Exposure("auto"))
+    scene = make_scene(exposure=Exposure("auto"), lights=(Light("point", 3.0, at=(0.0, -0.1, 0.3)),))
     outputs = ("image", "environment")
     with contextlib.ExitStack() as stack:
         alone, one, other = (
             stack.enter_context(Pipeline(scene, device=device, quality=quality, outputs=outputs)) for _ in range(3)
         )
-        for index, image in enumerate(frames * 2):
+        one.warm_up()
+        for index, image in enumerate(dimmed(frames)):
             expected = alone(image, time_seconds=index / 30)
             if index > 0:
                 one.continue_from(other)
             result = one(image, time_seconds=index / 30)
             np.testing.assert_array_equal(result.environment, expected.environment)
-            np.testing.assert_array_equal(result.image, expected.image)
+            assert np.abs(result.image.astype(int) - expected.image).max() <= SPARED
             one, other = other, one
+        assert 0.0 < other.arrays["expose_scale"].numpy()[0] < 1.0
+
+
+def test_warmed_up_equals_fresh(frames: Frames, device: str) -> None:
+    with contextlib.ExitStack() as stack:
+        warm, fresh = (stack.enter_context(Pipeline(make_scene(), device=device, quality="medium")) for _ in range(2))
+        warm.warm_up()
+        for one, other in zip(run(warm, frames), run(fresh, frames), strict=True):
+            np.testing.assert_array_equal(one.image, other.image)
 
 
 def test_light_is_kept_at_another_size(frames: Frames, device: str) -> None:

@@ -212,6 +212,10 @@ class Pipeline:
         self.scene, self.plan = scene, plan
         return True
 
+    def warm_up(self) -> None:
+        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline."""
+        self._scheduler.warm_up()
+
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
         self._start_time, self._last_time = other._start_time, other._last_time

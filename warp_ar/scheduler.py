@@ -8,6 +8,7 @@ device idle, run beside others.
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import os
@@ -64,6 +65,7 @@ class Scheduler:
         helpers = max(self._threads - 1, 1)
         self._pool = ThreadPoolExecutor(helpers, "warp_ar") if device.is_cpu and (bands or cores) > 1 else None
         self._stages: list[Step] = []
+        self._fills: dict[str, Any] = {}
         self._seen: dict[str, tuple[int, ...]] = {}
         self._translated: set[Pass] = set()
         self._graphs: dict[tuple[str, ...], Any] = {}
@@ -76,6 +78,7 @@ class Scheduler:
                 stage = kind(plan.request, wiring)
                 for name, spec in stage.arrays().items():
                     arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
+                    self._fills[name] = spec.fill
                 self._stages.append((stage, stage.build(arrays, device)))
 
     def close(self) -> None:
@@ -93,15 +96,33 @@ class Scheduler:
         for stage, _ in self._stages:
             if stage.name not in others or others[stage.name] is stage:
                 continue
-            fits = [
-                name
-                for name in stage.remembers
-                if name in other.arrays and other.arrays[name].shape == self.arrays[name].shape
-            ]
-            if len(fits) == len(stage.remembers):
-                for name in fits:
+            names = self._remembered(stage)
+            if all(name in other.arrays and other.arrays[name].shape == self.arrays[name].shape for name in names):
+                for name in names:
                     wp.copy(self.arrays[name], other.arrays[name])
                 stage.resume(others[stage.name])
+
+    def _remembered(self, stage: Stage) -> list[str]:
+        """Arrays of a stage that carry over; a rung need not have all of them."""
+        return [name for name in stage.remembers if name in self.arrays]
+
+    def warm_up(self) -> None:
+        """Launch everything once on whatever the arrays hold, so that the first frame finds its kernels loaded.
+
+        The host's own steps are left out. On CUDA it runs on a stream of its own, beside what others do.
+        """
+        with contextlib.ExitStack() as stack:
+            if self.device.is_cuda:
+                stack.enter_context(wp.ScopedStream(wp.Stream(self.device)))
+            for stage, passes in self._stages:
+                for step in passes:
+                    if not step.on_host:
+                        step.launch(None)
+                        self._translated.add(step)
+                for name in self._remembered(stage):
+                    self.arrays[name].fill_(self._fills[name])
+            if self.device.is_cuda:
+                wp.synchronize_stream(wp.get_stream(self.device))
 
     def run(self) -> Mapping[str, StageTiming]:
         """Run the stages whose inputs changed since they last ran; returns the time of each."""

@@ -18,6 +18,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import os
 import platform
 import statistics
 import sys
@@ -41,13 +42,11 @@ from warp_ar.ladder import (
     Choice,
     Knob,
     Price,
-    choose,
     choose_for_error,
     frontier,
     relevant_knobs,
     setting,
     turn,
-    undominated,
 )
 from warp_ar.live import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
 from warp_ar.metrics import ArrayError, array_error, changed_region, clipped_region, flip_map, latlong_weights
@@ -65,7 +64,7 @@ BASE = PRESETS["high"]
 WARM_UP = 3
 """Frames that are not timed: modules load, caches fill."""
 DEFAULT_FRAMES = 12
-TRIES = 3
+TRIES = 7
 """Runs at most to find what fits a budget."""
 MIN_COLUMNS = 110
 """Of the tables: where output is no terminal, narrower ones would be cut."""
@@ -187,16 +186,15 @@ def read_image(path: Path) -> Image:
     return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
 
 
-def shrink(image: Image, size: tuple[int, int] | None) -> Image:
-    """A picture at another width and height, or as it is."""
-    if size is None:
+def shrink(image: Image, times: int) -> Image:
+    """A picture at a whole fraction of its size."""
+    if times == 1:
         return image
+    size = image.shape[1] // times, image.shape[0] // times
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def load_case(
-    name: str, scene: Scene, count: int, truth: Path | None = None, size: tuple[int, int] | None = None
-) -> Case:
+def load_case(name: str, scene: Scene, count: int, truth: Path | None = None, times: int = 1) -> Case:
     """Read frames, find the marker in each once, and read the truth's pictures of those frames.
 
     Args:
@@ -204,21 +202,22 @@ def load_case(
         scene: Its clip is read.
         count: Frames at most.
         truth: Folder of ``NNNN.png``: what the camera would have seen.
-        size: Width and height to shrink everything to.
+        times: By how much everything is shrunk.
     """
     if scene.source is None or scene.source.path is None:
         raise UsageError(f"scene {scene.name!r} has no clip to compare rungs on; expected [source] path")
     with open_source(scene.source.path, fps=scene.source.fps) as source:
         frames = tuple(
-            dataclasses.replace(frame, image=shrink(frame.image, size)) for frame in itertools.islice(source, count)
+            dataclasses.replace(frame, image=shrink(frame.image, times)) for frame in itertools.islice(source, count)
         )
-        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*(size or source.size)))
+        width, height = source.size
+        scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(width // times, height // times))
     poses: tuple[Pose | None, ...] = (None,) * len(frames)
     if make_plan(Request(scene, PRESETS["reference"], (scene.camera.width, scene.camera.height))).needs("pose"):
         tracker = Tracker(scene.marker, scene.camera)
         poses = tuple(tracker.track(frame.image, frame.time).pose for frame in frames)
     pictures = sorted(truth.glob("*.png")) if truth is not None else []
-    wanted = {int(path.stem): shrink(read_image(path), size) for path in pictures if int(path.stem) < len(frames)}
+    wanted = {int(path.stem): shrink(read_image(path), times) for path in pictures if int(path.stem) < len(frames)}
     return Case(name, scene, frames, poses, wanted)
 
 
@@ -234,7 +233,7 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
         name = options.scene or "desk"
         path = Path(name)
         truth = truth_of(path) if path.is_file() else None
-        yield load_case(path.stem, load_scene(name), options.frames, truth, options.size)
+        yield load_case(path.stem, load_scene(name), options.frames, truth, options.shrink)
     if options.truth is None:
         return
     folders = [options.truth] if (options.truth / "case.json").is_file() else sorted(options.truth.iterdir())
@@ -246,7 +245,7 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
         for version in versions:
             found = True
             scene = load_scene(folder / f"scene_{version}.toml")
-            yield load_case(f"{folder.name} {version}", scene, options.frames, folder / version, options.size)
+            yield load_case(f"{folder.name} {version}", scene, options.frames, folder / version, options.shrink)
     if not found:
         raise UsageError(
             f"--truth {options.truth}: expected folders with scene_*.toml, as scene_both.toml beside both/"
@@ -379,11 +378,20 @@ def sweep(case: Case, knob: Knob, device: str, base: Quality = BASE) -> tuple[li
                 "truth" if case.truth else "last rung",
             )
         )
-    prices = [Price(knob.name, row.rung, row.milliseconds, row.flip) for row in rows]
-    kept = {price.rung for price in undominated(prices)}
     best = min(row.flip for row in rows)
-    rows = [dataclasses.replace(row, excess=row.flip - best, dominated=row.rung not in kept) for row in rows]
+    rows = [dataclasses.replace(row, excess=row.flip - best, dominated=_is_dominated(row, rows)) for row in rows]
     return rows, {rung: outcome.images[case.shown[-1]] for rung, outcome in outcomes.items()}
+
+
+def _is_dominated(row: Row, rows: Sequence[Row]) -> bool:
+    """Whether another rung costs no more and errs no more, in the picture and in what the stage writes."""
+
+    def beats(other: Row) -> bool:
+        mine = row.milliseconds, row.flip, row.stage_error.relative_rmse if row.stage_error else 0.0
+        yours = other.milliseconds, other.flip, other.stage_error.relative_rmse if other.stage_error else 0.0
+        return all(y <= m for y, m in zip(yours, mine, strict=True)) and yours != mine
+
+    return any(beats(other) for other in rows)
 
 
 def _stage_error(outcome: Outcome, last: Outcome) -> ArrayError | None:
@@ -415,13 +423,12 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
     labelled = list(outcomes.items())
     everything = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
     if {knob.name for knob in everything} == {knob.name for knob in knobs}:
-        # Knobs share stages, so their times overlap: costs are taken relative to the base's, over what the base costs.
+        # Knobs share stages, so their times overlap: costs are relative to the base's, and only order the choices.
         front = frontier(_relative_prices(rows, knobs, BASE))
-        offset = outcomes["high"].milliseconds
         paper = outcomes["paper"]
         error = _predicted(rows, knobs, paper.quality)
         advance("equal time, equal error")
-        labelled.append(("ours in the paper's time", _run_within(case, front, paper.milliseconds, offset, device)))
+        labelled.append(("ours in the paper's time", _run_within(case, front, paper.milliseconds, device)))
         labelled.append(("ours at the paper's error", run(case, _chosen(choose_for_error(front, error)), device)))
     wholes = tuple(
         Whole(
@@ -438,15 +445,20 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
     return CaseReport(case, reference, tuple(rows), pictures, wholes, region)
 
 
-def _run_within(case: Case, front: Sequence[Choice], budget: float, offset: float, device: str) -> Outcome:
-    """Run the best choice for a budget; where the sum of its prices was too low, the budget for the sum is lowered."""
-    aim = budget
+def _run_within(case: Case, front: Sequence[Choice], budget: float, device: str) -> Outcome:
+    """Run the best choice whose measured time fits a budget: prices say the order, bisection finds the place."""
+    low, high = 0, len(front)
+    best = run(case, _chosen(front[low]), device)
     for _ in range(TRIES):
-        outcome = run(case, _chosen(choose(front, aim - offset)), device)
-        if outcome.milliseconds <= budget:
+        if high - low <= 1:
             break
-        aim *= budget / outcome.milliseconds
-    return outcome
+        middle = (low + high) // 2
+        outcome = run(case, _chosen(front[middle]), device)
+        if outcome.milliseconds <= budget:
+            low, best = middle, outcome
+        else:
+            high = middle
+    return best
 
 
 def _chosen(choice: Choice) -> Quality:
@@ -496,13 +508,13 @@ _FIGURES = (
 def make_figures(device: str, count: int, truth: Path | None, size: tuple[int, int] | None = None) -> Iterator[Figure]:
     """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours; in cases with a truth against that."""
     for title, bundled, version, knob, rungs, text in _FIGURES:
-        cases = [(f"{title}: {bundled}", load_case(bundled, load_scene(bundled), count, None, size))]
+        cases = [(f"{title}: {bundled}", load_case(bundled, load_scene(bundled), count, None, times))]
         if truth is not None and version:
             folders = [truth] if (truth / "case.json").is_file() else sorted(truth.iterdir())
             for folder in folders:
                 file = folder / f"scene_{version}.toml"
                 if file.is_file():
-                    case = load_case(folder.name, load_scene(file), count, folder / version, size)
+                    case = load_case(folder.name, load_scene(file), count, folder / version, times)
                     cases.append((f"{title} against the truth: {folder.name.replace('_', ' ')}", case))
         for name, case in cases:
             index = case.shown[-1]
@@ -560,8 +572,18 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
 
 
 def device_name(device: Any) -> str:
-    """The device as a person would name it."""
-    return platform.processor() or platform.machine() if device.is_cpu else str(device.name)
+    """The device as a person would name it; for a CPU with the cores that this process may use."""
+    if not device.is_cpu:
+        return str(device.name)
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [
+            line.partition(":")[2].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return f"{model}, {cores} cores"
 
 
 def print_report(report: CaseReport, console: Console) -> None:
@@ -638,23 +660,10 @@ def make_parser() -> argparse.ArgumentParser:
         help=f"versions of the cases (default: {','.join(VERSIONS)})",
     )
     add("--frames", type=int, default=DEFAULT_FRAMES, metavar="N", help=f"frames per run (default: {DEFAULT_FRAMES})")
-    add(
-        "--size",
-        type=_read_size,
-        metavar="WxH",
-        help="shrink frames to this width and height, which must keep their proportions",
-    )
+    add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add("--out", type=Path, metavar="DIR", help="write tradeoff.jsonl, price_list.json and tradeoff.html here")
     return parser
-
-
-def _read_size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(part) for part in text.split("x"))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size; expected one like 320x240") from error
-    return width, height
 
 
 def chosen_knobs(case: Case, name: str | None) -> tuple[Knob, ...]:
@@ -671,6 +680,8 @@ def tradeoff(options: argparse.Namespace) -> int:
     """Measure, print and write."""
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected 1 or more")
+    if options.shrink < 1:
+        raise UsageError(f"--shrink {options.shrink}: expected 1 or more")
     from warp_ar.device import resolve_device
 
     device = resolve_device(options.device)
@@ -703,7 +714,7 @@ def tradeoff(options: argparse.Namespace) -> int:
         (options.out / "tradeoff.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
         (options.out / "price_list.json").write_text(json.dumps(price_list, indent=1) + "\n", encoding="utf-8")
         figures = (
-            list(make_figures(str(device), options.frames, options.truth, options.size))
+            list(make_figures(str(device), options.frames, options.truth, options.shrink))
             if options.stage is None
             else []
         )

@@ -118,9 +118,11 @@ def strip(columns: Sequence[tuple[str, Image]], reference: Image | None, box: Bo
     parts = [style, *(figure(crop(image, box), f"<b>{html.escape(label)}</b>") for label, image in columns)]
     if reference is not None:
         for _, image in columns:
+            if image is reference:
+                parts.append("<figure><figcaption>what the others are compared with</figcaption></figure>")
+                continue
             errors = flip_map(reference, image)
-            same = image is reference
-            text = "compared with" if same else f"FLIP {errors[box].mean():.4f} here, {errors.mean():.4f} overall"
+            text = f"FLIP {errors[box].mean():.4f} here, {errors.mean():.4f} overall"
             parts.append(figure(crop(error_colors(errors), box), text, photo=False))
     return "".join([*parts, "</div>"])
 
@@ -208,7 +210,7 @@ def _knob_table(rows: Sequence[Row]) -> str:
     def cells(row: Row) -> list[str]:
         error = row.stage_error
         numbers = (
-            ["", "", ""]
+            ["–", "–", "–"]
             if error is None
             else [f"{error.relative_rmse:.2%}", f"{error.worst:.2f}", f"{error.energy_drift:+.2%}"]
         )
@@ -222,15 +224,15 @@ def _comparisons(rows: Sequence[Row]) -> str:
     """The cheapest rung, normally the paper's, against the best of equal time and the cheapest of equal error."""
     lines = []
     for row in rows:
-        faster = [other for other in rows if other.milliseconds <= row.milliseconds and other.flip < row.flip]
+        faster = [other for other in rows if other.milliseconds <= row.milliseconds and other.flip < 0.99 * row.flip]
         if faster:
             best = min(faster, key=lambda other: other.flip)
             lines.append(f"In the time of {row.rung}, {best.rung} errs {1 - best.flip / row.flip:.0%} less.")
-        same = [other for other in rows if other.flip <= row.flip and other.milliseconds < row.milliseconds]
+        same = [other for other in rows if other.flip <= row.flip and other.milliseconds < 0.95 * row.milliseconds]
         if same:
             best = min(same, key=lambda other: other.milliseconds)
             lines.append(f"For the error of {row.rung}, {best.rung} takes {best.milliseconds / row.milliseconds:.0%}.")
-    return " ".join(dict.fromkeys(lines)) or "Every rung buys something: no other is as fast at its error."
+    return " ".join(dict.fromkeys(lines)) or "No rung is beaten by more than the measurement can tell."
 
 
 # ------------------------------------------------------------------------------------------------------------- sections
@@ -302,12 +304,12 @@ def _knob_section(report: CaseReport, rows: Sequence[Row]) -> str:
     difference = np.abs(pictures[0][1].astype(int) - pictures[-1][1].astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = [*pictures, ("truth", reference)] if report.case.truth else pictures
-    points = [(row.rung, row.milliseconds, row.flip, row.dominated) for row in rows]
+    points = [(row.rung, row.milliseconds, row.excess, row.dominated) for row in rows]
     return "".join(
         [
             f"<h3>{html.escape(knob.replace('_', ' '))}</h3>",
             '<div class="split"><div class="card">',
-            scatter(points, "milliseconds of its stages", "FLIP against " + rows[0].against),
+            scatter(points, "milliseconds of its stages", f"FLIP against {rows[0].against}, above the best rung's"),
             '</div><div class="card">',
             _knob_table(rows),
             f"<p class=soft>{html.escape(_comparisons(rows))}</p></div></div>",

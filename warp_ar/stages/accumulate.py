@@ -18,6 +18,7 @@ class Accumulate(Stage):
     name: ClassVar[str] = "accumulate"
     rungs: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
+    remembers: ClassVar[tuple[str, ...]] = ("accumulate_change",)
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
