@@ -505,7 +505,7 @@ _FIGURES = (
 """Title, bundled scene, version of cases that show the same with its truth, knob, its plain, paper's and best rung."""
 
 
-def make_figures(device: str, count: int, truth: Path | None, size: tuple[int, int] | None = None) -> Iterator[Figure]:
+def make_figures(device: str, count: int, truth: Path | None, times: int = 1) -> Iterator[Figure]:
     """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours; in cases with a truth against that."""
     for title, bundled, version, knob, rungs, text in _FIGURES:
         cases = [(f"{title}: {bundled}", load_case(bundled, load_scene(bundled), count, None, times))]
