@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.quality import DEFAULT_PRESET, PRESETS
 from warp_ar.run_log import RunLog, print_plan
@@ -74,7 +75,18 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add("--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})")
+    add(
+        "--quality",
+        default=DEFAULT_PRESET,
+        metavar="NAME",
+        help=f"{', '.join(PRESETS)}, or {AUTO}: what errs least within a budget (default: {DEFAULT_PRESET})",
+    )
+    add(
+        "--budget-ms",
+        type=float,
+        metavar="X",
+        help=f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})",
+    )
     add("--frames", type=int, metavar="N", help="stop after N frames")
     add(
         "--output",
@@ -221,6 +233,19 @@ def serve_page(options: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
+def _print_choice(pipeline: AutoPipeline) -> None:
+    """Say what the budget bought."""
+    status = pipeline.status()
+    if "settings" not in status:
+        print(f"{AUTO}: no marker was seen, so nothing was chosen")
+        return
+    chosen = ", ".join(f"{knob} {rung}" for knob, rung in status["settings"].items())
+    print(
+        f"{AUTO}: {chosen}; {status['expected_ms']:.1f} of {status['budget_ms']:g} ms, expected error "
+        f"{status['expected_error']:.4f} FLIP above the best, changed {len(status['changes']) - 1} times"
+    )
+
+
 def _has_display() -> bool:
     """Whether a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -234,6 +259,10 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_DONE
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
+    if options.budget_ms is not None and options.quality != AUTO:
+        raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
+    if options.quality == AUTO and options.output is None and not options.headless:
+        raise UsageError(f"--quality {AUTO} needs --output or --headless; the page has a dial for the budget")
     if options.output is None and not options.headless:
         return serve_page(options)
     output = options.output
@@ -253,6 +282,7 @@ def run(options: argparse.Namespace) -> int:
                 calibration=options.calibration,
                 device=options.device,
                 quality=options.quality,
+                budget_ms=options.budget_ms,
                 outputs=tuple(outputs),
                 loop=options.loop,
             )
@@ -296,6 +326,8 @@ def run(options: argparse.Namespace) -> int:
                 options.report.write_text(json.dumps(log.report(), indent=1))
     if not options.headless:
         print_plan(session.pipeline.plan, log)
+        if isinstance(session.pipeline, AutoPipeline):
+            _print_choice(session.pipeline)
         Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {output}", highlight=False)
     return EXIT_INTERRUPTED if stopped else EXIT_DONE
 

@@ -10,6 +10,7 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
+from warp_ar.auto_quality import AUTO, AutoPipeline
 from warp_ar.graph import Plan
 from warp_ar.pipeline import TRACK, Pipeline, Result
 from warp_ar.stages import STAGES
@@ -22,7 +23,7 @@ WARM_UP = 3
 class RunLog:
     """Collects poses and timings, frame by frame."""
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    def __init__(self, pipeline: Pipeline | AutoPipeline) -> None:
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: dict[str, int] = {}
@@ -74,8 +75,9 @@ class RunLog:
         return {
             "device": str(self._pipeline.device),
             "warp": wp.__version__,
-            "quality": self._pipeline.quality.name,
+            "quality": AUTO if isinstance(self._pipeline, AutoPipeline) else self._pipeline.quality.name,
             "fps": round(self.fps, 3),
+            **({"auto": self._pipeline.status()} if isinstance(self._pipeline, AutoPipeline) else {}),
             "frames": self._frames,
             "stages_run": stage_names(plan),
             "recovered": self._recovered(),

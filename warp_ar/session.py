@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
+from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result
 from warp_ar.quality import DEFAULT_PRESET, Quality
@@ -35,6 +36,7 @@ class Session:
         calibration: str | Path | None = None,
         device: str = "auto",
         quality: str | Quality = DEFAULT_PRESET,
+        budget_ms: float | None = None,
         outputs: tuple[str, ...] = ("image",),
         loop: bool = False,
     ) -> None:
@@ -45,7 +47,8 @@ class Session:
             source: Frames instead of the scene's own: a folder, a video file, or a capture device's index.
             calibration: OpenCV calibration file instead of the scene's camera numbers.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            quality: A preset's name or a value of one's own.
+            quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
+            budget_ms: Milliseconds per frame for ``auto``; None means 33.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
             loop: Start a clip again when it ends.
 
@@ -58,6 +61,8 @@ class Session:
         if calibration is not None:
             camera = Camera.load_calibration(calibration, self.scene.camera.transfer)
             self.scene = dataclasses.replace(self.scene, camera=camera)
+        if budget_ms is not None and quality != AUTO:
+            raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
         chosen = source
         if chosen is None:
             spec = self.scene.source
@@ -67,7 +72,16 @@ class Session:
         fps = self.scene.source.fps if self.scene.source is not None and source is None else None
         self.source: Source = open_source(chosen, fps=fps, loop=loop)
         try:
-            self.pipeline = Pipeline(self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs)
+            self.pipeline: Pipeline | AutoPipeline
+            if quality == AUTO:
+                budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
+                self.pipeline = AutoPipeline(
+                    self.scene, budget_ms=budget, device=device, size=self.source.size, outputs=outputs
+                )
+            else:
+                self.pipeline = Pipeline(
+                    self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs
+                )
         except BaseException:
             self.source.close()
             raise

@@ -22,7 +22,7 @@ import os
 import platform
 import statistics
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,6 @@ from warp_ar.ladder import (
     Choice,
     Knob,
     Price,
-    choose_for_error,
     frontier,
     relevant_knobs,
     setting,
@@ -74,6 +73,9 @@ NORMALS = (24, 48)
 """Orientations at which irradiance is compared, whatever form it has."""
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
 """Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
+
+_WITHOUT_BRUTE_FORCE = PRESETS["reference"].with_rungs(diffuse="clusters", specular="energy_mip", room_shadow="none")
+"""The reference's light without what it takes to show it."""
 
 _OUTPUT = {
     "unwrap": "probe_radiance",
@@ -114,7 +116,7 @@ class Outcome:
     quality: Quality
     images: Mapping[int, Image]
     stages: Mapping[str, float]
-    """Median milliseconds per frame of every stage, the marker's tracking left out."""
+    """Median milliseconds of every stage over the frames in which it ran, the marker's tracking left out."""
     output: npt.NDArray[Any] | None
     """What the knob's stage had written at the end."""
 
@@ -255,7 +257,9 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
 # ------------------------------------------------------------------------------------------------------------ measuring
 
 
-def run(case: Case, quality: Quality, device: str, knob: Knob | None = None, *, sparse: bool = False) -> Outcome:
+def run(
+    case: Case, quality: Quality, device: str, knob: Knob | None = None, *, between: Quality | None = None
+) -> Outcome:
     """Run a case's frames at one quality, one after another, and time every stage.
 
     Args:
@@ -263,20 +267,20 @@ def run(case: Case, quality: Quality, device: str, knob: Knob | None = None, *, 
         quality: What to run at.
         device: Where.
         knob: What was turned: what its stage wrote is kept.
-        sparse: Only wanted pictures are worth its time: the frames between them run at ``BASE``, which keeps the light.
+        between: Only wanted pictures are worth its time: the frames between them run at this, which keeps the light.
     """
     images: dict[int, Image] = {}
     times: dict[str, list[float]] = {}
-    timed = case.shown if sparse else range(min(WARM_UP, len(case.frames) - 1), len(case.frames))
+    timed = case.shown if between is not None else range(min(WARM_UP, len(case.frames) - 1), len(case.frames))
 
     def open_pipeline(at: Quality) -> Pipeline:
         return Pipeline(case.scene, device=device, quality=at, outputs=("image",), profile=True)
 
     with open_pipeline(quality) as pipeline, contextlib.ExitStack() as stack:
-        between = stack.enter_context(open_pipeline(BASE)) if sparse else pipeline
+        cheap = pipeline if between is None else stack.enter_context(open_pipeline(between))
         before = pipeline
         for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
-            now = pipeline if index in case.shown else between
+            now = pipeline if index in case.shown else cheap
             if now is not before and index > 0:
                 now.continue_from(before)
             before = now
@@ -285,10 +289,10 @@ def run(case: Case, quality: Quality, device: str, knob: Knob | None = None, *, 
                 images[index] = result.image
             if index in timed:
                 for name, timing in result.stages.items():
-                    times.setdefault(name, []).append(timing.milliseconds)
+                    times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
         output = None if knob is None else _read_output(pipeline, knob)
     times.pop(TRACK, None)
-    return Outcome(quality, images, {name: statistics.median(own) for name, own in times.items()}, output)
+    return Outcome(quality, images, {name: statistics.median(own or [0.0]) for name, own in times.items()}, output)
 
 
 def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
@@ -357,7 +361,7 @@ def picture_error(case: Case, reference: Mapping[int, Image], images: Mapping[in
 def sweep(case: Case, knob: Knob, device: str, base: Quality = BASE) -> tuple[list[Row], dict[str, Image]]:
     """Every rung of one knob: its row, and its last picture."""
     outcomes = {
-        rung: run(case, turn(base, {knob.name: rung}), device, knob, sparse=rung == "brute_force")
+        rung: run(case, turn(base, {knob.name: rung}), device, knob, between=base if rung == "brute_force" else None)
         for rung in knob.rungs
     }
     last = outcomes[knob.rungs[-1]]
@@ -418,7 +422,7 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
         pictures.update({(knob.name, rung): image for rung, image in shown.items()})
     advance("presets")
     outcomes = {name: run(case, PRESETS[name], device) for name in RUNS}
-    best = None if case.truth else run(case, PRESETS["reference"], device, sparse=True)
+    best = None if case.truth else run(case, PRESETS["reference"], device, between=_WITHOUT_BRUTE_FORCE)
     reference = case.truth or (best.images if best is not None else {})
     labelled = list(outcomes.items())
     everything = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
@@ -426,10 +430,17 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
         # Knobs share stages, so their times overlap: costs are relative to the base's, and only order the choices.
         front = frontier(_relative_prices(rows, knobs, BASE))
         paper = outcomes["paper"]
-        error = _predicted(rows, knobs, paper.quality)
+        aim = picture_error(case, reference, paper.images)
         advance("equal time, equal error")
-        labelled.append(("ours in the paper's time", _run_within(case, front, paper.milliseconds, device)))
-        labelled.append(("ours at the paper's error", run(case, _chosen(choose_for_error(front, error)), device)))
+        same_time = _bisect(case, front, device, lambda outcome: outcome.milliseconds <= paper.milliseconds)
+        # From the other end: the cheapest that errs no more than the paper is next to the dearest that errs more.
+        dearest_worse = _bisect(
+            case, front, device, lambda outcome: picture_error(case, reference, outcome.images) > aim
+        )
+        place = next(index for index, choice in enumerate(front) if _chosen(choice) == dearest_worse.quality)
+        errs_more = picture_error(case, reference, dearest_worse.images) > aim
+        same_error = run(case, _chosen(front[min(place + errs_more, len(front) - 1)]), device)
+        labelled += [("ours in the paper's time", same_time), ("ours at the paper's error", same_error)]
     wholes = tuple(
         Whole(
             label,
@@ -445,8 +456,8 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
     return CaseReport(case, reference, tuple(rows), pictures, wholes, region)
 
 
-def _run_within(case: Case, front: Sequence[Choice], budget: float, device: str) -> Outcome:
-    """Run the best choice whose measured time fits a budget: prices say the order, bisection finds the place."""
+def _bisect(case: Case, front: Sequence[Choice], device: str, fits: Callable[[Outcome], bool]) -> Outcome:
+    """Run the dearest choice that fits, or the cheapest if none does: prices give the order, measuring the place."""
     low, high = 0, len(front)
     best = run(case, _chosen(front[low]), device)
     for _ in range(TRIES):
@@ -454,7 +465,7 @@ def _run_within(case: Case, front: Sequence[Choice], budget: float, device: str)
             break
         middle = (low + high) // 2
         outcome = run(case, _chosen(front[middle]), device)
-        if outcome.milliseconds <= budget:
+        if fits(outcome):
             low, best = middle, outcome
         else:
             high = middle
@@ -470,11 +481,6 @@ def _relative_prices(rows: Sequence[Row], knobs: Sequence[Knob], base: Quality) 
     cost = {(row.knob, row.rung): row.milliseconds for row in rows}
     own = {knob.name: cost[knob.name, setting(base, knob)] for knob in knobs}
     return [Price(row.knob, row.rung, row.milliseconds - own[row.knob], row.excess) for row in rows]
-
-
-def _predicted(rows: Sequence[Row], knobs: Sequence[Knob], quality: Quality) -> float:
-    excess = {(row.knob, row.rung): row.excess for row in rows}
-    return sum(excess[knob.name, setting(quality, knob)] for knob in knobs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -545,7 +551,8 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
         rows = [row for report in reports for row in report.rows if row.knob == knob.name]
         if not rows:
             continue
-        by_rung = {rung: [row for row in rows if row.rung == rung] for rung in knob.rungs}
+        measured = {row.rung for row in rows}
+        by_rung = {rung: [row for row in rows if row.rung == rung] for rung in knob.rungs if rung in measured}
         flips = {rung: statistics.fmean(row.flip for row in own) for rung, own in by_rung.items()}
         best = min(flips.values())
         errors[knob.name] = {rung: round(flip - best, 6) for rung, flip in flips.items()}
