@@ -5,12 +5,24 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import warp as wp
 
 from warp_ar.errors import UsageError
+
+_CUDA = threading.RLock()
+
+
+def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
+    """Keeps other threads off a CUDA device for as long as it is entered; on CPU it does nothing.
+
+    Warp's current stream, current device and running capture belong to the process, not to the thread: what one thread
+    allocates or launches while another captures would end up in that graph, or break it.
+    """
+    return _CUDA if device.is_cuda else contextlib.nullcontext()
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import resolve_device
+from warp_ar.device import exclusive, resolve_device
 from warp_ar.errors import UsageError
 from warp_ar.frame_block import FrameBlock
 from warp_ar.graph import make_plan
@@ -61,12 +61,18 @@ class Result:
         """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
         if self.download is not None:
             return self.download.result()
-        return np.array(self.image_array.numpy() if isinstance(self.image_array, wp.array) else self.image_array)
+        if not isinstance(self.image_array, wp.array):
+            return np.array(self.image_array)
+        with exclusive(self.image_array.device):
+            return np.array(self.image_array.numpy())
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
         """The room's light as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
-        return None if self.environment_array is None else np.array(self.environment_array.numpy())
+        if self.environment_array is None:
+            return None
+        with exclusive(self.environment_array.device):
+            return np.array(self.environment_array.numpy())
 
 
 def resolve_quality(quality: str | Quality) -> Quality:
@@ -126,9 +132,10 @@ class Pipeline:
         self._index = 0
         self._has_light = False
         self._arrays = Arrays()
-        with wp.ScopedDevice(self.device):
-            self._add_inputs()
-        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+        with exclusive(self.device):
+            with wp.ScopedDevice(self.device):
+                self._add_inputs()
+            self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
 
     def __enter__(self) -> Pipeline:
         return self
@@ -207,7 +214,8 @@ class Pipeline:
         if scene.exposure != self.scene.exposure:
             self._write_exposure(scene)
         if scene.objects != self.scene.objects or scene.lights != self.scene.lights:
-            self._host_scene.update(scene)
+            with exclusive(self.device):
+                self._host_scene.update(scene)
             self._arrays.touch("objects")
         self.scene, self.plan = scene, plan
         return True
@@ -221,6 +229,11 @@ class Pipeline:
         self._start_time, self._last_time = other._start_time, other._last_time
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
+        with exclusive(self.device):
+            self._take_light(other)
+            self._scheduler.continue_from(other._scheduler)
+
+    def _take_light(self, other: Pipeline) -> None:
         kept = [name for name in LIGHT_ARRAYS if name in self._arrays and name in other._arrays]
         if other._has_light and kept:
             if self._arrays[kept[0]].shape == other._arrays[kept[0]].shape:
@@ -232,7 +245,6 @@ class Pipeline:
                 for name, values in zip(LIGHT_ARRAYS, light, strict=True):
                     self._arrays[name].assign(values)
             self._has_light = True
-        self._scheduler.continue_from(other._scheduler)
 
     def _write_exposure(self, scene: Scene) -> None:
         scale = scene.exposure.scale
@@ -258,7 +270,8 @@ class Pipeline:
         if self._transfers is None or not isinstance(result.image_array, wp.array):
             _ = result.image  # kept: the next frame writes the same array
             return result
-        return dataclasses.replace(result, download=self._transfers.download(result.image_array))
+        with exclusive(self.device):
+            return dataclasses.replace(result, download=self._transfers.download(result.image_array))
 
     def __call__(
         self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None, pose: Pose | None = None
@@ -287,9 +300,10 @@ class Pipeline:
             pose, state = track.pose, track.state
         lost = self._tracker is not None and pose is None
         if not lost:
-            self._set_frame_values(pose, now)
-            self._upload(image, host_image)
-            timings.update(self._scheduler.run())
+            with exclusive(self.device):
+                self._set_frame_values(pose, now)
+                self._upload(image, host_image)
+                timings.update(self._scheduler.run())
             self._has_light = True
         self._last_time = now
         self._index += 1

@@ -8,7 +8,6 @@ device idle, run beside others.
 from __future__ import annotations
 
 import collections
-import contextlib
 import dataclasses
 import itertools
 import os
@@ -19,6 +18,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_ar.device import exclusive
 from warp_ar.graph import INPUTS, Plan
 from warp_ar.stages.base import Arrays, Pass, Rows, Stage
 
@@ -109,20 +109,25 @@ class Scheduler:
     def warm_up(self) -> None:
         """Launch everything once on whatever the arrays hold, so that the first frame finds its kernels loaded.
 
-        The host's own steps are left out. On CUDA it runs on a stream of its own, beside what others do.
+        The host's own steps are left out. On CUDA it runs on a stream of its own, and frames of others come between
+        its steps.
         """
-        with contextlib.ExitStack() as stack:
-            if self.device.is_cuda:
-                stack.enter_context(wp.ScopedStream(wp.Stream(self.device)))
-            for stage, passes in self._stages:
-                for step in passes:
-                    if not step.on_host:
+        stream = None
+        if self.device.is_cuda:
+            with exclusive(self.device):
+                stream = wp.Stream(self.device)
+        for stage, passes in self._stages:
+            for step in passes:
+                if not step.on_host:
+                    with exclusive(self.device), wp.ScopedStream(stream):
                         step.launch(None)
-                        self._translated.add(step)
+                    self._translated.add(step)
+            with exclusive(self.device), wp.ScopedStream(stream):
                 for name in self._remembered(stage):
                     self.arrays[name].fill_(self._fills[name])
-            if self.device.is_cuda:
-                wp.synchronize_stream(wp.get_stream(self.device))
+        if stream is not None:
+            with exclusive(self.device):
+                wp.synchronize_stream(stream)
 
     def run(self) -> Mapping[str, StageTiming]:
         """Run the stages whose inputs changed since they last ran; returns the time of each."""
