@@ -27,11 +27,11 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import warp as wp
 
@@ -77,7 +77,8 @@ REGRET = 5.0
 KNOB_SECONDS = 0.5
 """Shortest time between two rungs of one knob."""
 
-_BASE = PRESETS["medium"]
+BASE = PRESETS["medium"]
+"""What costs are measured from, and what runs until something is chosen."""
 _MEASURED_FRAMES = 6
 _WARM_UP = 3
 _KEPT_PIPELINES = 6
@@ -129,6 +130,23 @@ class Controller:
         self._calm_since: float | None = None
         self._raised: float | None = None
         self.settings: dict[str, str] = dict(self._best(AIM).settings)
+
+    def set_budget(self, budget_ms: float) -> None:
+        """Choose anew for another budget; what is known of the load stays."""
+        self.budget_ms = budget_ms
+        self.settings = dict(self._best(AIM).settings)
+        self._calm_since = self._raised = None
+        self.restart()
+
+    @property
+    def choices(self) -> list[Choice]:
+        """All that a budget may buy, cheapest first; milliseconds are relative to the base."""
+        return self._front
+
+    @property
+    def factor(self) -> float:
+        """Measured time over predicted time: the load."""
+        return self._factor
 
     def _best(self, share: float) -> Choice:
         return choose(self._front, share * self.budget_ms / self._factor - self._base)
@@ -227,17 +245,31 @@ def measure_costs(
         size: Width and height.
         knobs: What may be turned.
     """
-    base = _time_stages(scene, image, pose, device, size, _BASE)
+    steps = measure_steps(scene, image, pose, device, size, knobs)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(Costs, end.value)
+
+
+def measure_steps(
+    scene: Scene, image: Any, pose: Pose | None, device: str, size: tuple[int, int], knobs: Sequence[Knob]
+) -> Generator[float, None, Costs]:
+    """``measure_costs`` in small steps, for whoever has other things to do; yields the share that is done."""
+    count, done = sum(len(knob.rungs) for knob in knobs) + 1, 1
+    base = _time_stages(scene, image, pose, device, size, BASE)
+    yield done / count
     rungs: dict[str, dict[str, float]] = {}
     for knob in knobs:
-        start = setting(_BASE, knob)
-        tried = [rung for rung in knob.rungs if rung != "brute_force"]
-        times = {
-            rung: base
-            if rung == start
-            else _time_stages(scene, image, pose, device, size, turn(_BASE, {knob.name: rung}))
-            for rung in tried
-        }
+        start = setting(BASE, knob)
+        times: dict[str, dict[str, float]] = {}
+        for rung in knob.rungs:
+            if rung != "brute_force":
+                quality = turn(BASE, {knob.name: rung})
+                times[rung] = base if rung == start else _time_stages(scene, image, pose, device, size, quality)
+            done += 1
+            yield done / count
         # Stages that run whatever the rung is cost the same: what was measured of them is noise.
         common = set.intersection(*(set(own) for own in times.values())) - set(knob.stages)
         own = {rung: sum(ms for name, ms in stages.items() if name not in common) for rung, stages in times.items()}
@@ -374,8 +406,8 @@ class AutoPipeline:
         self._builder = ThreadPoolExecutor(1, "warp_ar-build")
         self._building: Future[Pipeline] | None = None
         self._kept: dict[Quality, Pipeline] = {}
-        self._now = self._open(_BASE)
-        self._kept[_BASE] = self._now
+        self._now = self._open(BASE)
+        self._kept[BASE] = self._now
         self.knobs = relevant_knobs(self._now.scene, self._now.size)
         self._costs = costs
         self._controller: Controller | None = None
@@ -473,7 +505,7 @@ class AutoPipeline:
 
     def _wanted(self) -> Quality:
         assert self._controller is not None
-        return turn(_BASE, self._controller.settings)
+        return turn(BASE, self._controller.settings)
 
     def _want(self) -> None:
         quality = self._wanted()

@@ -214,6 +214,7 @@ def serve_page(options: argparse.Namespace) -> int:
             source=options.source,
             device=options.device,
             quality=options.quality,
+            budget_ms=options.budget_ms,
             frames=options.frames,
             **callbacks,
         )
@@ -261,8 +262,6 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
-    if options.quality == AUTO and options.output is None and not options.headless:
-        raise UsageError(f"--quality {AUTO} needs --output or --headless; the page has a dial for the budget")
     if options.output is None and not options.headless:
         return serve_page(options)
     output = options.output

@@ -18,9 +18,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.auto_quality import AUTO
+from warp_ar.device import exclusive
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result, resolve_quality
-from warp_ar.quality import PRESETS, Quality
+from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.run_log import left_out, stage_names
 from warp_ar.scene import Camera, Scene, SourceSpec, bundled_scenes, dumps_scene, load_scene
 from warp_ar.sinks import VideoSink, write_environment
@@ -28,6 +30,7 @@ from warp_ar.sources import Frame, QueueSource, Source, open_source
 from warp_ar.stages import STAGES
 from warp_ar.tracking import Pose, TrackState
 from warp_ar.viewer import edits, protocol
+from warp_ar.viewer.dial import Dial
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
 
@@ -43,6 +46,8 @@ _LIGHT_SECONDS: Final = 0.25
 """How often the environment is looked at."""
 _COST_FRAMES: Final = 30
 _SETTLED: Final = 10
+_MEASURING_REST: Final = 0.15
+"""Seconds that the frames rest, one from the next, while rungs are timed: what runs beside them spoils the times."""
 _STILL_SECONDS: Final = 0.25
 """How often a held frame is looked at again, where nothing was edited."""
 _ESTIMATE_SECONDS: Final = 30.0
@@ -117,9 +122,17 @@ class _Slot:
         self.swaps = 0
 
     def _build(self, target: _Target) -> Pipeline:
-        return Pipeline(
-            target.scene, device=self._device, quality=target.quality, size=target.size, outputs=target.outputs
+        # On CUDA only a pipeline that profiles knows what each stage takes.
+        pipeline = Pipeline(
+            target.scene,
+            device=self._device,
+            quality=target.quality,
+            size=target.size,
+            outputs=target.outputs,
+            profile=True,
         )
+        pipeline.warm_up()
+        return pipeline
 
     def _fits(self, pipeline: Pipeline, target: _Target) -> bool:
         request = pipeline.plan.request
@@ -185,6 +198,7 @@ class Host:
         source: str | int | Path | None = None,
         device: str = "auto",
         quality: str | Quality = "medium",
+        budget_ms: float | None = None,
         frames: int | None = None,
         publish: Callable[[Lit], None] = lambda lit: None,
         notify: Callable[[dict[str, Any]], None] = lambda message: None,
@@ -195,7 +209,8 @@ class Host:
             scene: What to show first.
             source: Frames instead of the scene's own.
             device: ``auto``, ``cpu`` or ``cuda:N``.
-            quality: A preset's name or a value.
+            quality: A preset's name, a value, or ``auto``.
+            budget_ms: Milliseconds per frame for ``auto``; None means 33.
             frames: End after so many frames.
             publish: Takes every lit frame, on the host's own thread.
             notify: Takes what else viewers should know, on any thread.
@@ -206,14 +221,17 @@ class Host:
         self._publish, self._notify = publish, notify
         self._given_source, self._frames = source, frames
         self._lock = threading.Condition()
-        self._wanted = Wanted(scene, resolve_quality(quality))
+        self._dial = Dial(notify)
+        if quality == AUTO:
+            self._dial.switch(budget_ms or self._dial.last_budget)
+        self._preset = PRESETS[DEFAULT_PRESET] if quality == AUTO else resolve_quality(quality)
+        self._wanted = Wanted(scene, self._dial.start_quality() if quality == AUTO else self._preset)
         self._original = self._wanted
         self._good = self._wanted
         self._edits = 0
         self._playing = True
         self._watchers = 0
         self._compare = ""
-        self._budget: float | None = None
         self._stopped = False
         self._camera_owner: object | None = None
         self._estimator: FocalEstimator | None = None
@@ -297,14 +315,11 @@ class Host:
             case protocol.Effect(name, on):
                 self._change(lambda w: w.with_effect(name, on))
             case protocol.SetQuality(name):
-                quality = resolve_quality(name)
-                self._budget = None
-                self._change(lambda w: dataclasses.replace(w, quality=quality))
+                self._set_budget(self._dial.last_budget if name == AUTO else None, name)
             case protocol.Rung(stage, rung):
                 self._change(lambda w: w.with_rung(stage, rung))
             case protocol.Budget(ms):
-                with self._lock:
-                    self._budget, self._since_swap = ms, 0
+                self._set_budget(ms, self._preset.name)
             case protocol.Compare(other):
                 if other not in ("", CAMERA, *PRESETS):
                     raise UsageError(f"compare with {other!r}; expected {CAMERA} or a preset: {', '.join(PRESETS)}")
@@ -321,7 +336,7 @@ class Host:
             case protocol.OpenScene(name):
                 self._open_scene(name)
             case protocol.Reset():
-                self._change(lambda _: self._original)
+                self._change(lambda w: dataclasses.replace(self._original, quality=w.quality))
             case protocol.UseCamera(width, height):
                 self._use_camera(width, height, owner)
             case protocol.LeaveCamera():
@@ -330,6 +345,17 @@ class Host:
                 with self._lock:
                     self._start_recording() if on else self._stop_recording()
                 self._notify(self.state_message())
+
+    def _set_budget(self, budget: float | None, preset: str) -> None:
+        """Keep to a budget, or with None show a preset."""
+        if budget is None:
+            quality = self._preset = resolve_quality(preset)
+        else:
+            auto = self._wanted.quality.name == AUTO
+            quality = self._wanted.quality if auto else self._dial.start_quality()
+        self._dial.switch(budget)
+        self._change(lambda w: dataclasses.replace(w, quality=quality))
+        self._notify(self.state_message())
 
     def _open(self, scene: Scene) -> Source:
         if self._given_source is not None:
@@ -342,7 +368,8 @@ class Host:
         if name not in bundled_scenes():
             raise UsageError(f"no bundled scene {name!r}; expected {', '.join(bundled_scenes())}")
         scene = load_scene(name)
-        wanted = self._original = Wanted(scene, self._wanted.quality)
+        auto = self._wanted.quality.name == AUTO
+        wanted = self._original = Wanted(scene, self._dial.start_quality() if auto else self._wanted.quality)
         self._costs.clear()
         if self._feed.is_browser or self._given_source is not None:
             self._change(lambda _: wanted)
@@ -511,10 +538,12 @@ class Host:
                 self._good = wanted
         except WarpArError as error:
             self._notify({"type": "notice", "text": str(error), "bad": True})
+            self._dial.switch(None)
             self._change(lambda _: self._good)
             pipeline = self._main.pipeline
         if self._main.swaps != before:
             self._since_swap = 0
+            self._dial.restart()
             self._notify(self.plan_message())
         if self._then is None:
             self._second.close()
@@ -541,7 +570,7 @@ class Host:
         self._base = now + 1.0 / PLAY_RATE
         other = self._other(frame, now)
         self._look_at_light(pipeline)
-        self._watch_cost(pipeline, result, light_ms)
+        self._watch_cost(pipeline, frame.image, result, light_ms)
         self._id += 1
         self._times.append(time.monotonic())
         stages = tuple((name, round(t.milliseconds, 3), t.skipped) for name, t in result.stages.items())
@@ -561,6 +590,9 @@ class Host:
         )
         self._record(image)
         self._publish(self.latest)
+        if self._dial.measuring:
+            with self._lock:
+                self._lock.wait_for(self._leaving, timeout=_MEASURING_REST)
         return True
 
     def _other(self, frame: Frame, now: float) -> Image | None:
@@ -577,26 +609,28 @@ class Host:
             return
         self._light_time = now
         light = pipeline.arrays.get("environment")
-        self._light = None if light is None else np.array(light.numpy())
+        if light is None:
+            self._light = None
+            return
+        with exclusive(pipeline.device):
+            self._light = np.array(light.numpy())
 
-    def _watch_cost(self, pipeline: Pipeline, result: Result, light_ms: float) -> None:
-        """Learn what the preset costs; under a budget, take another one when it costs too much or leaves room."""
+    def _watch_cost(self, pipeline: Pipeline, image: Image, result: Result, light_ms: float) -> None:
+        """Learn what the preset costs; under a budget, turn the knobs that it asks for."""
         if result.pose is None and pipeline.plan.needs("pose"):
             return
         self._since_swap += 1
-        if self._since_swap <= _SETTLED or self._main.busy:
-            return
-        name = self._wanted.quality.name
-        if pipeline.quality.name not in (name, "custom"):
-            return
-        self._costs.setdefault(name, collections.deque(maxlen=_COST_FRAMES)).append(light_ms)
-        budget = self._budget
-        if budget is None or self._since_swap < _SETTLED + _COST_FRAMES // 2:
-            return
-        chosen = choose_preset(name, budget, self.costs())
-        if chosen != name:
-            self._since_swap = 0
-            self._change(lambda w: dataclasses.replace(w, quality=PRESETS[chosen]))
+        wanted = self._wanted
+        # A held frame changes nothing, a pipeline on its way out says nothing about the next one.
+        busy = self._main.busy or self._dial.measuring or not self._playing
+        counts = not busy and pipeline.quality == wanted.shown_quality()
+        if counts and self._since_swap > _SETTLED:
+            self._costs.setdefault(wanted.quality.name, collections.deque(maxlen=_COST_FRAMES)).append(light_ms)
+        self._dial.look(pipeline, image, result.pose, self._builder)
+        chosen = self._dial.choose(light_ms if counts else None, time.monotonic())
+        if chosen is not None and chosen != wanted.quality:
+            self._costs.pop(AUTO, None)
+            self._change(lambda w: dataclasses.replace(w, quality=chosen) if w.quality.name == AUTO else w)
 
     def costs(self) -> dict[str, float]:
         """Median milliseconds per frame of every preset that has run on this scene."""
@@ -724,7 +758,8 @@ class Host:
             "building": self._main.busy or self._second.busy,
             "compare": self._compare,
             "compare_ready": self._compare in ("", CAMERA) or second is not None,
-            "budget": self._budget,
+            "budget": self._dial.budget,
+            "auto": self._dial.state(),
             "costs": self.costs(),
             "watchers": self._watchers,
             "difference": self._measured_difference(),
@@ -741,9 +776,14 @@ class Host:
         """The room's light, latlong linear RGB, as it was a moment ago."""
         return self._light
 
+    def dial_message(self) -> dict[str, Any]:
+        """What budgets buy."""
+        return self._dial.record()
+
     def close(self) -> None:
         """Let the source, the pipelines and all temporary files go."""
         self._stopped = True
+        self._dial.stop()
         with self._lock, contextlib.suppress(WarpArError):
             self._stop_recording()
         for feed in (self._feed, self._next):
@@ -753,21 +793,3 @@ class Host:
         self._second.close()
         self._builder.shutdown()
         self._folder.cleanup()
-
-
-def choose_preset(current: str, budget: float, costs: dict[str, float]) -> str:
-    """Preset for a budget: one step down from what costs too much, one step up where that fits or nobody knows.
-
-    Args:
-        current: The preset that runs.
-        budget: Milliseconds per frame.
-        costs: Milliseconds per frame of the presets that have run.
-    """
-    ladder = [name for name in PRESETS if name != "paper"]
-    place = ladder.index(current) if current in ladder else 0
-    if costs.get(current, 0.0) > budget:
-        return ladder[max(place - 1, 0)]
-    above = ladder[min(place + 1, len(ladder) - 1)]
-    # An unknown step up is tried where the present one leaves half of the budget.
-    fits = costs[above] < 0.9 * budget if above in costs else costs.get(current, budget) < 0.5 * budget
-    return above if fits else current

@@ -338,7 +338,12 @@ class Server:
         sender = asyncio.create_task(self._send_safely(viewer))
         try:
             viewer.tell(json.dumps(self._hello()))
-            for message in (self.host.plan_message(), self.host.scene_message(), self.host.state_message()):
+            for message in (
+                self.host.plan_message(),
+                self.host.scene_message(),
+                self.host.dial_message(),
+                self.host.state_message(),
+            ):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(self.host.light()))
             await self._receive(viewer)

@@ -53,10 +53,8 @@ handles.addEventListener("released", () => {
   waiting = null;
 });
 
-connection.addEventListener("plan", ({ detail }) => {
-  time.plan = detail;
-  quality.plan = detail;
-});
+connection.addEventListener("plan", ({ detail }) => (time.plan = detail));
+connection.addEventListener("dial", ({ detail }) => (quality.dial = detail));
 
 connection.addEventListener("state", ({ detail }) => {
   const before = state;

@@ -257,7 +257,7 @@ export class TimePanel {
     const bar = el("b");
     const time = el("span", { class: "ms" }, out ? "–" : "");
     const row = el("li", { class: out ? "out" : "", tabindex: "0", title: why.firstChild.textContent },
-      el("span", { class: "name" }, el("i"), entry.stage), out ? el("span", { class: "ms" }, "left out") : el("span", { class: "bar" }, bar), time, why);
+      el("span", { class: "name" }, el("i"), entry.stage.replaceAll("_", " ")), out ? el("span", { class: "ms" }, "left out") : el("span", { class: "bar" }, bar), time, why);
     row.style.setProperty("--c", tint);
     row.dataset.stage = entry.stage;
     this.#rows.set(entry.stage, { row, bar, time, tint, why, out, summary: entry.summary });
@@ -322,19 +322,32 @@ export class TimePanel {
       if (y < 4) continue;
       context.fillStyle = style;
       context.fillRect(0, y, width, scale);
-      context.fillText(`${ms.toFixed(0)} ms`, 4 * scale, y - 3 * scale);
+      // The budget is written on the right, where it does not cover the other.
+      const own = ms === this.budget;
+      context.textAlign = own ? "right" : "left";
+      context.fillText(`${ms.toFixed(0)} ms`, own ? width - 4 * scale : 4 * scale, y - 3 * scale);
     }
   }
 }
 
-const DIAL = { low: 4, high: 1000 };
+const DIAL = { low: 1, high: 1000 };
+const AIM = 0.9; // the share of a budget that the program plans for
+const along = (ms) => Math.min(Math.max(Math.log(ms / DIAL.low) / Math.log(DIAL.high / DIAL.low), 0), 1);
+const brief = (ms) => ms.toFixed(ms < 10 ? 1 : 0);
+const SVG = "http://www.w3.org/2000/svg";
+const shape = (name, attributes, text = "") => {
+  const element = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.textContent = text;
+  return element;
+};
 
 export class QualityPanel {
   #connection;
   #time;
   #state = null;
-  #plan = null;
-  #presets = [];
+  #dial = null;
+  #later = 0;
 
   constructor(connection, time) {
     this.#connection = connection;
@@ -342,16 +355,20 @@ export class QualityPanel {
     this.holder = document.getElementById("presets");
     this.range = document.getElementById("budget");
     this.flip = document.getElementById("budget-on");
+    this.plot = document.getElementById("frontier");
     this.range.addEventListener("input", () => {
       this.flip.setAttribute("aria-checked", "true");
-      this.#tell();
       this.#draw();
+      // What the budget buys is known here at once; the picture follows when the hand rests.
+      clearTimeout(this.#later);
+      this.#later = setTimeout(() => this.#tell(), 150);
     });
     this.flip.addEventListener("click", () => {
-      this.flip.setAttribute("aria-checked", String(this.flip.getAttribute("aria-checked") !== "true"));
+      this.flip.setAttribute("aria-checked", String(!this.#on));
       this.#tell();
       this.#draw();
     });
+    new ResizeObserver(() => this.#draw()).observe(this.plot);
   }
 
   get #ms() {
@@ -363,60 +380,120 @@ export class QualityPanel {
   }
 
   #tell() {
+    this.#later = 0;
     this.#connection.send("budget", { ms: this.#on ? Math.round(this.#ms * 10) / 10 : null });
   }
 
   set presets(names) {
-    this.#presets = names;
-    this.holder.replaceChildren(...names.map((name) => el("button", { role: "radio", "data-preset": name, onclick: () => this.#connection.send("quality", { name }) }, name, el("small", {}, "–"))));
+    const buttons = names.map((name) => el("button", { role: "radio", "data-preset": name, "aria-checked": "false", onclick: () => this.#connection.send("quality", { name }) }, name, el("small", {}, "–")));
+    this.holder.replaceChildren(...buttons);
+    this.holder.onkeydown = (event) => {
+      const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
+      const place = buttons.indexOf(document.activeElement);
+      if (!step || place < 0) return;
+      event.preventDefault();
+      buttons[(place + step + buttons.length) % buttons.length].focus();
+    };
   }
 
   set scene(scene) {
     for (const button of this.holder.children) button.setAttribute("aria-checked", String(button.dataset.preset === scene.quality));
-    this.quality = scene.quality;
-    this.#draw();
   }
 
-  set plan(plan) {
-    this.#plan = plan;
+  set dial(dial) {
+    this.#dial = dial;
     this.#draw();
   }
 
   set state(state) {
     this.#state = state;
-    if (document.activeElement !== this.range) {
+    if (!this.#later && !this.range.matches(":active")) {
       this.flip.setAttribute("aria-checked", String(state.budget !== null));
-      if (state.budget !== null) this.range.value = (1000 * Math.log(state.budget / DIAL.low)) / Math.log(DIAL.high / DIAL.low);
+      if (state.budget !== null && document.activeElement !== this.range) this.range.value = 1000 * along(state.budget);
     }
     for (const button of this.holder.children) {
       const cost = state.costs[button.dataset.preset];
-      button.lastChild.textContent = cost === undefined ? "–" : `${cost.toFixed(cost < 10 ? 1 : 0)} ms`;
+      button.lastChild.textContent = cost === undefined ? "–" : `${brief(cost)} ms`;
     }
     this.#draw();
   }
 
+  /** What the slider's budget buys, as the program chooses; null while costs are unknown. */
+  #bought() {
+    const { known, base, choices } = this.#dial ?? {};
+    if (!known) return null;
+    const factor = this.#state?.auto?.factor ?? 1;
+    const took = (choice) => factor * (base + choice.ms);
+    const fitting = choices.filter((choice) => took(choice) <= AIM * this.#ms);
+    const choice = fitting.at(-1) ?? choices[0];
+    return { choice, took, fits: fitting.length > 0 };
+  }
+
   #draw() {
-    const ms = this.#ms;
     const on = this.#on;
-    this.#time.budget = on ? ms : null;
-    document.getElementById("budget-value").textContent = on ? `${ms.toFixed(ms < 10 ? 1 : 0)} ms · ${(1000 / ms).toFixed(0)} a second` : "free";
-    this.range.style.opacity = on ? 1 : 0.5;
-    const costs = Object.entries(this.#state?.costs ?? {});
-    const ticks = document.getElementById("budget-ticks");
-    ticks.replaceChildren(...costs.map(([name, cost]) => {
-      const share = Math.min(Math.max(Math.log(cost / DIAL.low) / Math.log(DIAL.high / DIAL.low), 0), 1);
-      const tick = el("span", { class: on && cost <= ms ? "fits" : "" }, name);
-      tick.style.left = `calc(8px + ${100 * share}% - ${16 * share}px)`;
-      return tick;
-    }));
-    const note = document.getElementById("budget-note");
-    const rungs = (this.#plan?.run ?? []).filter((entry) => entry.rungs.length > 1 && entry.rung !== "default").map((entry) => `${entry.stage} ${entry.rung}`);
-    const cost = this.#state?.costs[this.quality];
-    const parts = [`It buys ${this.quality ?? "…"}${cost === undefined ? "" : ` (${cost.toFixed(1)} ms measured here)`}: ${rungs.join(", ") || "no rungs to choose"}.`];
-    if (on && cost > ms) parts.push("Nothing cheaper is left.");
+    this.#time.budget = on ? this.#ms : null;
+    document.getElementById("budget-value").textContent = on ? `${brief(this.#ms)} ms · ${(1000 / this.#ms).toFixed(0)} fps` : "off";
+    this.range.setAttribute("aria-valuetext", `${brief(this.#ms)} milliseconds`);
+    if (!this.plot.parentElement.offsetParent) return;
+    const bought = this.#bought();
+    this.plot.parentElement.classList.toggle("off", !on);
+    this.plot.style.display = bought ? "" : "none";
+    if (bought) this.#plot(bought);
+    document.getElementById("buys").replaceChildren(...(bought && on ? this.#rungs(bought.choice) : []));
+    document.getElementById("budget-note").textContent = this.#note(bought);
+  }
+
+  #note(bought) {
+    const { measuring } = this.#dial ?? {};
+    if (typeof measuring === "number") return `Measuring what each rung costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
+    if (!bought) return "The program then chooses the rungs that err least within this time. What each costs on this device is measured once, in about half a minute.";
+    const { choice, took, fits } = bought;
+    const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];
+    if (!fits) parts.push("Nothing cheaper is left.");
     const { difference, compare } = this.#state ?? {};
     if (difference !== null && difference !== undefined) parts.push(`Against ${compare}, the picture differs by ${difference.toFixed(2)} % of full scale on average.`);
-    else parts.push("Compare with another preset to measure what that costs in accuracy.");
-    note.textContent = parts.join(" ");
+    return parts.join(" ");
+  }
+
+  /** Error over time of all that can be bought, over the slider's own scale. */
+  #plot({ choice, took }) {
+    const { choices, presets, base } = this.#dial;
+    const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
+    const [left, top] = [8, 14];
+    const x = (ms) => left + along(ms) * (width - 2 * left);
+    const most = Math.max(...choices.map((c) => c.error), ...Object.values(presets).map((p) => p.error), 1e-6);
+    const y = (e) => top + (1 - e / most) * (height - top - 6);
+    const placed = [];
+    const label = (name, px, py) => {
+      const at = [Math.min(px + 6, width - 44), Math.max(py - 4, 10)];
+      if (placed.some(([ox, oy]) => Math.abs(at[0] - ox) < 42 && Math.abs(at[1] - oy) < 11)) return [];
+      placed.push(at);
+      return [shape("text", { x: at[0], y: at[1] }, name)];
+    };
+    let path = "";
+    for (const c of choices) path += path ? `H${x(took(c)).toFixed(1)}V${y(c.error).toFixed(1)}` : `M${x(took(c)).toFixed(1)} ${top}V${y(c.error).toFixed(1)}`;
+    const at = x(this.#ms);
+    const parts = [
+      shape("path", { class: "area", d: `${path}H${width - left}V${height}H${x(took(choices[0])).toFixed(1)}Z` }),
+      shape("path", { class: "line", d: `${path}H${width - left}` }),
+      shape("line", { class: "budget", x1: at, x2: at, y1: 4, y2: height }),
+      ...Object.entries(presets).flatMap(([name, price]) => {
+        const [px, py] = [x(took({ ms: price.ms })), y(price.error)];
+        return [shape("circle", { class: "preset", cx: px, cy: py, r: 3 }), ...label(name, px, py)];
+      }),
+      shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }),
+    ];
+    this.plot.replaceChildren(...parts);
+    this.plot.setAttribute("aria-label", `Error over time: ${brief(took(choice))} milliseconds, error ${error(choice.error)}, base ${brief(base)} milliseconds`);
+  }
+
+  #rungs(choice) {
+    return Object.entries(this.#dial.ladders).map(([name, ladder], index) => {
+      const place = choice.rungs[index];
+      const pips = el("span", { class: "pips", "aria-hidden": "true" }, ...ladder.map((_, i) => el("i", { class: i <= place ? "on" : "" })));
+      return el("li", {}, el("span", { class: "name" }, name.replaceAll("_", " ")), pips, el("span", {}, ladder[place].replaceAll("_", " ")));
+    });
   }
 }
+
+const error = (value) => `${value.toFixed(3)} FLIP`;

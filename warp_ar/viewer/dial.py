@@ -1,0 +1,200 @@
+"""The time/accuracy dial: what a budget buys on this device, and how far off that is.
+
+Errors come from the price list, costs from measurements on this device, both as for ``--quality auto``; they are
+measured here one rung at a time between other work, so that frames and edits go on meanwhile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Generator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.auto_quality import (
+    AUTO,
+    BASE,
+    DEFAULT_BUDGET_MS,
+    Controller,
+    Costs,
+    cache_folder,
+    cost_key,
+    measure_steps,
+    read_costs,
+    write_costs,
+)
+from warp_ar.errors import WarpArError
+from warp_ar.graph import make_plan
+from warp_ar.ladder import Knob, load_errors, relevant_knobs, setting, turn
+from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS, Quality
+from warp_ar.tracking import Pose
+
+
+class Dial:
+    """Holds the budget and what it buys. The thread that lights frames calls its methods, unless they say otherwise."""
+
+    def __init__(self, notify: Callable[[dict[str, Any]], None], folder: Path | None = None) -> None:
+        """Start switched off.
+
+        Args:
+            notify: Takes ``record`` whenever it has changed, on any thread.
+            folder: Where costs are kept; None means the user's cache folder.
+        """
+        self._notify, self._folder = notify, folder or cache_folder()
+        self._errors = load_errors()
+        self._budget: float | None = None
+        self._last_budget = DEFAULT_BUDGET_MS
+        self._controller: Controller | None = None
+        self._key: str | None = None
+        self._costs: Costs | None = None
+        self._progress: float | None = None
+        self._failed: str | None = None
+        self._knobs: tuple[Knob, ...] = ()
+        self._stopped = False
+
+    @property
+    def budget(self) -> float | None:
+        """Milliseconds per frame; None while switched off."""
+        return self._budget
+
+    @property
+    def last_budget(self) -> float:
+        """The last one that was set, or the default."""
+        return self._last_budget
+
+    @property
+    def measuring(self) -> bool:
+        """Whether costs are being measured: frames do well to leave room for that."""
+        return self._progress is not None
+
+    def switch(self, budget: float | None) -> None:
+        """Set the budget, or with None switch off. From any thread."""
+        self._last_budget = budget or self._last_budget
+        self._budget = budget
+
+    def stop(self) -> None:
+        """Measure no more. From any thread."""
+        self._stopped = True
+
+    def start_quality(self) -> Quality:
+        """What runs under a budget until something can be chosen."""
+        return dataclasses.replace(BASE, name=AUTO)
+
+    def look(self, pipeline: Pipeline, image: npt.NDArray[np.uint8], pose: Pose | None, helper: Executor) -> None:
+        """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as the dial is on.
+
+        Args:
+            pipeline: What lights the frames, with the scene as it is edited.
+            image: A frame that shows what the scene needs to see.
+            pose: The camera's in it.
+            helper: Runs the measurements, a step at a time.
+        """
+        if self.measuring or self._stopped:
+            return
+        scene, size = pipeline.scene, pipeline.size
+        # Edits change costs as load does; only another scene, its frames' size or an unknown knob ask for a new look.
+        key = f"{scene.name} {size}"
+        if key != self._key:
+            self._key, self._costs, self._controller = key, None, None
+            self._knobs = relevant_knobs(scene, size)
+            plan = make_plan(dataclasses.replace(pipeline.plan.request, quality=BASE))
+            self._cache_key = cost_key(plan, pipeline.device, self._knobs)
+            self._adopt(read_costs(self._folder, self._cache_key, self._knobs))
+            self._notify(self.record())
+        if self._costs is None and self._budget is not None and key != self._failed:
+            self._progress = 0.0
+            self._notify(self.record())
+            steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._knobs)
+            helper.submit(self._step, helper, steps, key)
+
+    def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
+        progress = None
+        try:
+            if not self._stopped:
+                progress = next(steps)
+        except StopIteration as end:
+            write_costs(self._folder, self._cache_key, end.value)
+            self._adopt(end.value)
+        except WarpArError as error:
+            self._failed = key
+            self._notify({"type": "notice", "text": f"What rungs cost cannot be measured: {error}", "bad": True})
+        finally:
+            self._progress = progress
+        self._notify(self.record())
+        if progress is not None:
+            helper.submit(self._step, helper, steps, key)
+
+    def _adopt(self, costs: Costs | None) -> None:
+        self._costs = costs
+        self._controller = None if costs is None else Controller(costs, self._errors, self._last_budget)
+
+    def choose(self, milliseconds: float | None, now: float) -> Quality | None:
+        """What to run under the budget, or None while that is not known or the dial is off.
+
+        Args:
+            milliseconds: What the last frame took; None if it says nothing about the present choice.
+            now: Seconds on a clock that does not jump.
+        """
+        controller, budget = self._controller, self._budget
+        if controller is None or budget is None:
+            return None
+        if controller.budget_ms != budget:
+            controller.set_budget(budget)
+        elif milliseconds is not None:
+            controller.observe(milliseconds, now)
+        return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
+
+    def restart(self) -> None:
+        """Forget the frames so far: another pipeline lights those to come."""
+        if self._controller is not None:
+            self._controller.restart()
+
+    def state(self) -> dict[str, Any] | None:
+        """What is chosen now; None while nothing is. From any thread."""
+        controller = self._controller
+        if controller is None or self._budget is None:
+            return None
+        return {
+            "settings": dict(controller.settings),
+            "expected_ms": round(controller.expected_ms, 2),
+            "expected_error": round(controller.expected_error, 5),
+            "factor": round(controller.factor, 4),
+        }
+
+    def record(self) -> dict[str, Any]:
+        """All that can be bought, as a message for the page. From any thread."""
+        controller, costs = self._controller, self._costs
+        message: dict[str, Any] = {"type": "dial", "measuring": self._progress, "known": controller is not None}
+        if controller is None or costs is None:
+            return message
+        names = [knob.name for knob in self._knobs]
+        ladders = {knob.name: list(knob.rungs) for knob in self._knobs}
+        return {
+            **message,
+            "base": costs.base,
+            "ladders": ladders,
+            "choices": [
+                {
+                    "ms": round(choice.milliseconds, 3),
+                    "error": round(choice.error, 5),
+                    "rungs": [ladders[name].index(dict(choice.settings)[name]) for name in names],
+                }
+                for choice in controller.choices
+            ],
+            "presets": {name: price for name in PRESETS if (price := self._price(PRESETS[name], costs)) is not None},
+        }
+
+    def _price(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
+        """What a preset should cost and err; None where it has rungs that are not measured."""
+        rungs = {knob.name: setting(quality, knob) for knob in self._knobs}
+        if any(rung not in costs.rungs[knob] for knob, rung in rungs.items()):
+            return None
+        return {
+            "ms": round(sum(costs.rungs[knob][rung] for knob, rung in rungs.items()), 3),
+            "error": round(sum(self._errors[knob][rung] for knob, rung in rungs.items()), 5),
+        }
