@@ -31,7 +31,7 @@ from warp_ar.kernels.latlong import PI, direction_from_latlong, latlong_from_dir
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.probe import is_clipped, project, reflecting_normal
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import TraceConfig, make_trace
+from warp_ar.kernels.visibility import FAR, ROUNDING, TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 
@@ -148,7 +148,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
             cell.direction = wp.normalize(lost_toward)
-        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, 1.0e8):
+        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR):
             cell.modelled = 1.0
         cells_out[row, column] = cell
 
@@ -243,6 +243,17 @@ def add_excess(
         rows=rows,
         device=recovered_out.device,
     )
+
+
+@wp.func
+def leave_surface(scene: RayScene, point: SurfacePoint, direction: wp.vec3) -> wp.vec3:
+    """Origin of a ray from a surface point; which proxy it lies on is not kept, so the largest bounds the rounding."""
+    size = wp.float32(0.0)
+    for index in range(scene.proxies.shape[0]):
+        shape = scene.proxies[index]
+        size = wp.max(size, shape.scale * wp.length(shape.extent))
+    error = ROUNDING * (8.0 * wp.max(wp.abs(point.position)) + 32.0 * size)
+    return offset_origin(point.position, point.normal, direction, error)
 
 
 @wp.func
@@ -419,7 +430,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 for k in range(probes.shape[0]):
                     share *= 1.0 - hidden_share(probes[k].center, probes[k].radius, point.position, middle, angle)
                 target = m
-                hit = trace.closest_proxy(scene, point.position + 1.0e-5 * point.normal, middle, 1.0e8)
+                hit = trace.closest_proxy(scene, leave_surface(scene, point, middle), middle, FAR)
                 if hit.shape >= 0:
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
@@ -449,7 +460,8 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
             if cosine > 0.0 and away > lamp[3]:
                 direction = ray / away
                 given = cosine / (away * away)
-                if trace.occluded_by_proxies(scene, point.position + 1.0e-5 * point.normal, direction, away - lamp[3]):
+                origin = leave_surface(scene, point, direction)
+                if trace.occluded_by_proxies(scene, origin, direction, away - lamp[3]):
                     given = 0.0
                 for k in range(probes.shape[0]):
                     if wp.dot(probes[k].center - point.position, direction) < away:

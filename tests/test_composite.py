@@ -2,15 +2,13 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import composite as reference
 from warp_ar.kernels import color, composite
 from warp_ar.kernels.structs import FrameParams
 
 H, W = 24, 40
-# float32 composing errs by some 1e-7 relative: only codes whose exact value lies this close to a half may differ, and
-# by one.
-NEAR_HALF = 1e-3
 
 CONFIGS = [composite.CompositeConfig(v, a, r) for v in (False, True) for a in (False, True) for r in (False, True)]
 
@@ -61,8 +59,7 @@ def run(config, frame, virtual=None, added=None, ratio=None, params=None, transf
 
 
 def assert_codes(got, linear):
-    exact = reference_color.encoded_srgb(np.clip(linear, 0.0, 1.0))
-    assert (np.abs(got - exact) <= 0.5 + NEAR_HALF).all()
+    check_error("composite", got, reference_color.encoded_srgb(np.clip(linear, 0.0, 1.0)))
 
 
 def test_opaque_layer_replaces_the_frame(device):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import declip as reference
 from warp_ar.kernels import color, declip
@@ -136,7 +137,9 @@ def test_matches_twin(device, shape):
     frame = np.clip(rng.normal(210.0, 60.0, (*shape, 3)), 0, 255).astype(np.uint8)
     frame[40:] //= 2  # tiles that take no part
     expected, active = reference.declip(frame, linear(frame))
-    np.testing.assert_allclose(run(frame), np.where(active[..., None], expected, 0.0), rtol=FLOAT)
+    found, expected = run(frame), np.where(active[..., None], expected, 0.0)
+    np.testing.assert_allclose(found, expected, rtol=FLOAT)
+    check_error("declip", found, expected)
 
 
 @pytest.mark.parametrize("value", [0, 255])

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import exposure as reference
-from tests.test_composite import CONFIGS, NEAR_HALF, H, array, make_layers, make_params, tables
+from tests.test_composite import CONFIGS, H, array, make_layers, make_params, tables
 from warp_ar.kernels import color, exposure, summed_area
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
@@ -74,7 +75,7 @@ def test_scale_zero_is_black(device, frame, rung):
 def test_plain_scales_linear_light(device, scale):
     frame = make_layers(1)[0]
     exact = reference_color.encoded_srgb(np.clip(linear(frame) * np.float64(scale), 0.0, 1.0))
-    assert (np.abs(run(frame, scale, "plain") - exact) <= 0.5 + NEAR_HALF).all()
+    check_error("expose", run(frame, scale, "plain"), exact)
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -82,7 +83,7 @@ def test_box_matches_twin(device, scale):
     frame = np.concatenate([disc(48, 10), make_layers(2)[0][:, :40].repeat(2, 0)], axis=1)
     gains = reference.gains(frame, scale, exposure.largest_box(frame.shape[0]))
     exact = reference_color.encoded_srgb(np.clip(linear(frame) * gains[..., None] * np.float64(scale), 0.0, 1.0))
-    assert (np.abs(run(frame, scale) - exact) <= 0.5 + NEAR_HALF).all()
+    check_error("expose", run(frame, scale), exact)
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])
@@ -91,7 +92,7 @@ def test_layers_are_composed_before_they_are_exposed(device, scale):
     gains = reference.gains(frame, scale, exposure.largest_box(H))
     total = reference_composite.compose(linear(frame) * gains[..., None], virtual, added, ratio)
     exact = reference_color.encoded_srgb(np.clip(scale * total, 0.0, 1.0))
-    assert (np.abs(run(frame, scale, "box", CONFIGS[7], virtual, added, ratio) - exact) <= 0.5 + NEAR_HALF).all()
+    check_error("expose", run(frame, scale, "box", CONFIGS[7], virtual, added, ratio), exact)
 
 
 def test_centre_stays_bright_and_edge_fades(device):
@@ -114,7 +115,7 @@ def test_declipped_pixels_show_their_estimate(device, scale):
     frame[::5, ::5] = 255
     radiance = declipped(frame) if scale < 1.0 else linear(frame)  # only a shorter exposure shows it
     exact = reference_color.encoded_srgb(np.clip(radiance * np.float64(scale), 0.0, 1.0))
-    assert (np.abs(run(frame, scale, "declipped") - exact) <= 0.5 + NEAR_HALF).all()
+    check_error("expose", run(frame, scale, "declipped"), exact)
 
 
 def test_pixel_with_a_hue_is_not_lifted(device):

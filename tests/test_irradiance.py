@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.kernels import irradiance, pyramid
@@ -241,6 +242,7 @@ def test_projection_is_the_twin_s(device, size, order):
     np.testing.assert_allclose(
         ours, twin, atol=1e-3 * np.abs(twin).max() if min(size) < 4 else 1e-4 * np.abs(twin).max()
     )
+    check_error("diffuse", ours, twin)
 
 
 def test_order_4_map_is_the_twin_s(device):
@@ -258,6 +260,7 @@ def test_the_reference_is_the_twin_s(device, size):
     out = clusters(radiance, None, (6, 12)).numpy().reshape(-1, 3)
     twin = reference.irradiance(radiance, latlong.directions(6, 12).reshape(-1, 3))
     np.testing.assert_allclose(out, twin, atol=REFERENCE_SPREAD * twin.max())
+    check_error("diffuse", out, twin)
 
 
 def test_the_reference_agrees_with_monte_carlo(device):

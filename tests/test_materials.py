@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import materials as reference
 from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe, sample_texture
 from warp_ar.kernels.prefilter import integrate_dfg
@@ -204,6 +205,7 @@ def test_phong_matches_reference(device, exponent):
     cosine = 1 - 0.5 * np.sum((mirror - wi) ** 2, -1)
     expected = reference.phong_lobe(np.stack([cosine], -1), np.ones((4000, 1)), exponent)
     np.testing.assert_allclose(lobe, expected, rtol=LOBE_TOLERANCE, atol=1e-6)
+    check_error("shade", lobe, expected)
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.03, 0.1, 0.35, 0.7, 1.0])
@@ -221,6 +223,7 @@ def test_ggx_matches_reference(device, roughness):
     _, lobe = lobes(wi, wo, roughness, device)
     expected = reference.ggx_lobe(np.array([0.0, 0.0, 1.0]), half, wi, wo, roughness, float(MIN_ALPHA))
     np.testing.assert_allclose(lobe, expected, rtol=GGX_TOLERANCE, atol=1e-6 * expected.max())
+    check_error("shade", lobe, expected)
 
 
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])

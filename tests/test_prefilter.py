@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
@@ -213,6 +214,7 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
         directions = latlong.directions(*level.shape[:2]).reshape(-1, 3)
         twin = reference.integrate_lobe(radiance, directions, prefilter.lobe_alpha(height, index), lobe)
         np.testing.assert_allclose(level.reshape(-1, 3), twin, rtol=1e-4, atol=ROUNDING)
+        check_error("specular", level.reshape(-1, 3), twin)
 
 
 @pytest.mark.parametrize("lobe", LOBES)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import latlong as latlong_reference
 from tests.reference import probe as reference
 from warp_ar.kernels import environment, probe
@@ -179,6 +180,7 @@ def test_corners_match_twin(device, distortion):
     assert (got[blind, 2] == -1).all()
     assert (got[~blind, 2] >= 0).all()
     np.testing.assert_allclose(got[~blind], expected[~blind], atol=PIXEL)
+    check_error("unwrap", got[~blind], expected[~blind])
 
 
 @pytest.mark.parametrize("rung", probe.RUNGS)
@@ -200,6 +202,7 @@ def test_gather_matches_twin(device, rung):
     assert agree.mean() > (0.99 if rung == "nearest" else 0.999)
     if rung == "bilinear":
         assert agree.all()
+    check_error("unwrap", got[0][agree], expected[0][agree])
     np.testing.assert_allclose(got[1], expected[1], atol=SAMPLE)
     if rung != "nearest":
         assert (np.abs(got[2] - expected[2]).max(-1) < SAMPLE).mean() > 0.995

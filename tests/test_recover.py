@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 from scipy.optimize import nnls
 
+from tests.error_model import check_error
 from tests.reference import recover as reference
 from warp_ar import recovery
 from warp_ar.geometry import rotation_matrix
@@ -27,8 +28,6 @@ QUADRATURE = 0.003
 """A sum over cells of 5.6 degrees against an integral of a cosine: their middles stand for them."""
 FURNACE = 0.02
 """The same where the ball hides and mirrors: its outline crosses cells, and its edge is taken as straight."""
-FLOAT = 2e-4
-"""float32 against float64, relative to the largest: three steps of the search for the mirroring point as well."""
 SOLVED = 1e-8
 """Two exact methods on one quadratic problem."""
 
@@ -148,7 +147,7 @@ def test_transfer_agrees_with_its_twin(device):
     for k in range(3):
         expected = reference.trace_transfer(positions[k], normals[k], d, solid_angle, center, radius, 0.85)
         for got, want in zip((straight[k], mirrored[k]), expected, strict=True):
-            assert np.abs(got - want).max() < 3 * FLOAT * want.max()
+            check_error("recover", got, want)
 
 
 def test_proxies_send_the_share_to_where_the_ball_sees_them(device, scene):

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import relight as reference
 from tests.test_composite import tables
@@ -268,6 +269,7 @@ def test_matches_twin(device, rung):
     sure = margin > RIM
     assert sure.mean() > 0.95
     np.testing.assert_allclose(got[sure], expected[sure], rtol=3e-4, atol=1e-6)
+    check_error("relight", got[sure], expected[sure])
     assert (got[sure] == 0.0).any()  # there is shadow
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
@@ -223,6 +224,8 @@ def test_matches_reference(device):
     # A pixel is either its centre or the mean of its samples; which of the two is the edge test's business.
     error = np.minimum(np.abs(image - smooth).max(-1), np.abs(image - center).max(-1))
     assert (error > TWIN_TOLERANCE).mean() < TWIN_OUTLIERS
+    nearest = np.where((np.abs(image - smooth).max(-1) < np.abs(image - center).max(-1))[..., None], smooth, center)
+    check_error("shade", image[error <= TWIN_TOLERANCE], nearest[error <= TWIN_TOLERANCE])
     # Where the object changes between neighbours, it must be the mean.
     _, which, _ = reference.closest(world.bodies, np.zeros_like(directions), directions)
     which = which.reshape(SIZE)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import visibility as reference
 from warp_ar.geometry import Mesh, rotation_matrix, smooth_normals, sphere_mesh, torus_mesh
 from warp_ar.kernels import structs
@@ -261,6 +262,7 @@ def test_matches_reference(device):
     assert (turned > NORMAL_TOLERANCE).mean() < 2e-3  # rays at the edge between two faces
     points = origins + t[:, None] * directions
     np.testing.assert_allclose(objects["point"][steep], points[steep], atol=1e-4)
+    check_error("visibility", objects["t"][steep], t[steep])
 
     nothing, proxies, occluded = shoot(world.scene(proxies=True), origins, directions, device)
     assert (nothing["shape"] == -1).all()

@@ -54,11 +54,9 @@ def print_numerics() -> None:
     """Print the error model: per stage its precision, expected and measured worst error, and rows of hard cases."""
     table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
     for stage in STAGES:
-        numbers = NUMERICS.get(stage.name)
-        if numbers is not None:
-            measured = "" if numbers.measured is None else f"{numbers.measured:.1e}"
-            rows = " ".join(map(str, numbers.rows))
-            table.add_row(stage.name, numbers.precision, numbers.expected, measured, rows)
+        numbers = NUMERICS[stage.name]
+        rows = " ".join(map(str, numbers.rows))
+        table.add_row(stage.name, numbers.precision, numbers.expected, f"{numbers.measured:.1e}", rows)
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 

@@ -118,9 +118,27 @@ def make_quality(**rungs: str) -> Quality:
     return base.with_rungs(**{**switched, **rungs})
 
 
+SOFT = "soft"
+"""A way of two stages, tried as one more rung of each: lights with a size, and the most samples along edges."""
+LIGHT_RADIUS = 0.02
+"""Metres, at scale 1."""
+
+
+def with_sized_lights(scene: Scene, scale: float = 1.0) -> Scene:
+    """The scene with spheres for its point and spot lights."""
+    radius = scale * LIGHT_RADIUS
+    lights = (one if one.kind == "directional" else dataclasses.replace(one, radius=radius) for one in scene.lights)
+    return dataclasses.replace(scene, lights=tuple(lights))
+
+
 @functools.cache
 def request_for(stage: str, rung: str) -> Request | None:
     """A request whose plan holds ``stage`` on ``rung``; None if that rung means that the stage does not run."""
+    if rung == SOFT:
+        request = request_for(stage, next(one.rungs[-1] for one in STAGES if one.name == stage))
+        assert request is not None
+        quality = dataclasses.replace(request.quality.with_rungs(light_shadow=SOFT), edge_samples=16)
+        return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
     rungs = {} if rung == "default" else {stage: rung}
     # Some stages run only where another one is on its best rung, some only without a change of exposure.
     for others in ({}, {one.name: one.rungs[-1] for one in STAGES if len(one.rungs) > 1}):
@@ -138,9 +156,14 @@ def plan_names(plan: Plan) -> tuple[str, ...]:
 
 
 RUNGS: dict[str, tuple[str, ...]] = {
-    stage.name: tuple(rung for rung in stage.rungs if request_for(stage.name, rung) is not None) for stage in STAGES
+    stage.name: tuple(
+        rung
+        for rung in (*stage.rungs, *((SOFT,) if stage.name in ("relight", "shade") else ()))
+        if request_for(stage.name, rung) is not None
+    )
+    for stage in STAGES
 }
-"""Every rung on which a stage does something, by stage."""
+"""Every rung on which a stage does something, by stage; ``none`` of a stage is that it is left out."""
 STAGE_RUNGS = [(stage, rung) for stage, rungs in RUNGS.items() for rung in rungs]
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from tests.hard_cases import generators, long_run
-from tests.hard_cases.rig import RUNGS, SIZE, Rig
+from tests.hard_cases.rig import RUNGS, SIZE, Rig, solid_angles
 from warp_ar.scene import Exposure
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
+# Energy of the map: what is left of a frame after two seconds, and of a search that began elsewhere.
+REMEMBERED = 0.05
 
 
 @pytest.mark.atlas(row=7, stage="pipeline")
@@ -42,6 +44,22 @@ def test_an_automatic_exposure_that_was_spoilt_heals(device, rung, bad):
             image = rig.frame(FRAMES["ramp"])
         np.testing.assert_allclose(rig.get("expose_scale"), expected, rtol=1e-3)
         assert image.any()
+
+
+@pytest.mark.atlas(row=7, stage="recover")
+@pytest.mark.parametrize("rung", RUNGS["recover"])
+@pytest.mark.parametrize("bad", ["white", "black", "noise"])
+def test_recovered_light_forgets_a_corrupt_frame(device, rung, bad):
+    """What is remembered on the host, too: two seconds later the map is what it is where that frame never was."""
+    with Rig(device, "recover", rung) as rig, Rig(device, "recover", rung) as clean:
+        for index in range(90):
+            for one in (rig, clean):
+                one.frame(FRAMES[bad] if one is rig and index == 25 else FRAMES["top half saturated"])
+        expected, found = clean.get("environment"), rig.get("environment")
+    assert np.isfinite(found).all()
+    assert expected.max() > 1.1, "something must have been recovered"
+    energy = solid_angles(*expected.shape[:2])[..., None]
+    np.testing.assert_allclose((energy * found).sum((0, 1)), (energy * expected).sum((0, 1)), rtol=REMEMBERED)
 
 
 @pytest.mark.atlas(row=7, stage="accumulate")

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, RUNGS, LoneStage, solid_angles
+from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, RUNGS, SIZE, LoneStage, solid_angles
 from warp_ar.kernels import prefilter
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
 HEIGHT = ENVIRONMENT_HEIGHT
 MAP = (HEIGHT, 2 * HEIGHT)
@@ -85,3 +86,108 @@ def test_samples_of_a_lamp_hold_its_flux(device, row, column, exponent):
     found = float((samples["measure"] * samples["radiance"][:, 0].astype(float)).sum())
     # A stratified sum: a lamp's share of 1,024 samples is right to one of them, or two where it crosses strata.
     assert found == pytest.approx(flux, rel=0.02)
+
+
+# --- White things in a white room -------------------------------------------------------------------------------------
+
+WHITE = {
+    "lambert": {"model": LAMBERT, "base_color": 1.0},
+    "phong": {"model": PHONG, "base_color": 0.0, "specular": 1.0, "shininess": 40.0},
+    "gold without colour": {"model": METALLIC_ROUGHNESS, "base_color": 1.0, "metallic": 1.0, "roughness": 0.3},
+    "mirror": {"model": MIRROR, "base_color": 1.0},
+}
+# A rough metal's lobe is looked up in two tables of 32 x 32, and its lost energy given back by a fit.
+TABLES = 0.02
+# What an object receives is a sum over one set of the room's samples, averaged over its neighbours: see
+# tests/test_object_light.py.
+SAMPLED, SAMPLED_MEAN = 0.25, 0.03
+# Share of the light that dies out between white objects and the desk.
+LOST = 0.3
+
+
+@pytest.fixture
+def furnace_for(rig_for):
+    """A rig in which the room, the desk's picture and every object are white, and no lamp shines.
+
+    The ball and the box lie far below: where they hide the desk from the camera, nobody knows what it looks like.
+    """
+    used = []
+
+    def made(stage, rung, material):
+        rig = rig_for(stage, rung)
+        scene = rig.pipeline._host_scene.ray_scene
+        for array in (scene.materials, scene.proxies):
+            used.append((array, array.numpy().copy()))
+        records = scene.materials.numpy().copy()
+        for field, value in material.items():
+            records[field] = value
+        records["base_texture"] = records["specular_texture"] = -1
+        scene.materials.assign(records)
+        for array, field, index in ((scene.proxies, "position", 1), (rig.arrays["probes"], "center", 0)):
+            records = array.numpy().copy()
+            records[field][index] = (0.0, 0.0, -1e3)
+            array.assign(records)
+        rig.poke("frame", np.full((SIZE[1], SIZE[0], 3), 255, np.uint8))
+        rig.poke("environment", 1.0)
+        lights = rig.get("light_array")
+        lights["intensity"] = 0.0
+        rig.arrays["light_array"].assign(lights)
+        if "lamps" in rig.arrays:
+            rig.arrays["lamps"].zero_()
+        for name, value in (("physical_ratio", 1.0), ("physical_added", 0.0)):
+            if name in rig.arrays:
+                rig.poke(name, value)
+        names = [one.name for one, _ in rig.pipeline._scheduler._stages]
+        for name in names[min(map(names.index, {"key_lights", "diffuse"} & set(names))) : names.index(stage)]:
+            if name not in ("room_shadow", "relight"):
+                rig.run(name)
+        return rig
+
+    yield made
+    for array, records in used:
+        array.assign(records)
+
+
+@pytest.mark.atlas(row=18, stage="shade")
+@pytest.mark.parametrize("rung", RUNGS["shade"])
+@pytest.mark.parametrize("name", WHITE)
+def test_white_objects_cannot_be_told_from_a_white_room(furnace_for, rung, name):
+    virtual = furnace_for("shade", rung, WHITE[name]).run("shade")["virtual"]
+    covered = virtual[..., 3] > 0
+    ratio = virtual[covered][:, :3] / virtual[covered][:, 3:]
+    near = rung != "environment" and name != "mirror"
+    assert covered.any()
+    np.testing.assert_allclose(ratio.mean(0), 1.0, atol=SAMPLED_MEAN if near else TABLES)
+    np.testing.assert_allclose(ratio, 1.0, atol=SAMPLED if near else TABLES)
+    if name in ("lambert", "mirror") and not near:
+        np.testing.assert_allclose(ratio, 1.0, atol=FURNACE)
+
+
+@pytest.mark.atlas(row=18, stage="object_light")
+@pytest.mark.parametrize("name", WHITE)
+def test_what_surrounds_a_white_object_is_white(furnace_for, name):
+    rig = furnace_for("object_light", "default", WHITE[name])
+    outputs = rig.run("object_light")
+    seen = rig.get("hit_object") >= 0
+    mirrored = outputs["object_mirrored"][seen]
+    np.testing.assert_allclose(mirrored[:, :3], mirrored[:, 3:].repeat(3, 1), atol=TABLES)
+    if name == "lambert":
+        received = outputs["object_irradiance"][seen]
+        np.testing.assert_allclose(received.mean(0) / np.pi, 1.0, atol=SAMPLED_MEAN)
+        np.testing.assert_allclose(received / np.pi, 1.0, atol=SAMPLED)
+
+
+@pytest.mark.atlas(row=18, stage="room_shadow")
+@pytest.mark.parametrize("rung", RUNGS["room_shadow"])
+def test_white_objects_give_back_the_light_that_they_take(furnace_for, rung):
+    """Black ones only take; with bounces, white ones give it back but for what dies out between them and the desk."""
+    black = furnace_for("room_shadow", rung, {**WHITE["lambert"], "base_color": 0.0}).run("room_shadow")
+    white = furnace_for("room_shadow", rung, WHITE["lambert"]).run("room_shadow")
+    taken, left = 1.0 - black["physical_ratio"], 1.0 - white["physical_ratio"]
+    assert taken.min() >= 0.0
+    assert taken.max() > 0.2, "the objects throw shadows"
+    if rung in ("coarse", "sampled"):
+        np.testing.assert_array_equal(left, taken)
+    else:
+        assert abs(left).mean() < LOST * taken.mean()
+        assert -left.min() < SAMPLED

@@ -157,7 +157,12 @@ def test_directions_an_ulp_beyond_unit_length(device):
 
 @pytest.mark.atlas(row=5)
 @pytest.mark.parametrize(
-    ("stage", "rung"), [(stage, rung) for stage in ("visibility", "shade", "relight") for rung in RUNGS[stage]]
+    ("stage", "rung"),
+    [
+        (stage, rung)
+        for stage in ("recover", "visibility", "relight", "room_shadow", "object_light", "shade", "declip")
+        for rung in RUNGS[stage]
+    ],
 )
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_looking_exactly_along_the_axis(rig_for, stage, rung, up):

@@ -20,7 +20,7 @@ from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 LIGHTS = generators.lights()
 WHOLE = (0, SIZE[1], 0, SIZE[0])
-SHADING = [(stage, rung) for stage in ("shade", "room_shadow") for rung in RUNGS[stage]]
+SHADING = [(stage, rung) for stage in ("shade", "room_shadow", "object_light") for rung in RUNGS[stage]]
 ENDS = (
     {"model": PHONG, "shininess": 0.0},
     {"model": PHONG, "shininess": 1e5},

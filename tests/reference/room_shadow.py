@@ -61,3 +61,12 @@ def sphere_form_factor(point, center, radius):
     offset = np.asarray(center) - point
     distance = np.linalg.norm(offset, axis=-1)
     return (radius / distance) ** 2 * offset[..., 2] / distance
+
+
+def cumulative_sums(environment, side_weight):
+    """Brightness summed along rows (h, w), and over rows: (weighted brightness, weight) of whole rows, (h, 2)."""
+    height, width = environment.shape[:2]
+    along = environment.mean(-1).cumsum(1)
+    wi, solid_angle = texel_directions(height, width)
+    weight = (side_weight + np.maximum(wi[:, 0, 2], 0)) * solid_angle[:, 0]
+    return along, np.stack([weight * along[:, -1], weight * width], -1).cumsum(0)

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import pyramid, room_samples
 from warp_ar.kernels.room_samples import RoomSample
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.shade import sees_near, shade_config
@@ -20,10 +20,15 @@ REFERENCE_SIZE = (32, 64)
 """Texels of the map that the reference sums over."""
 
 
-def sample_count(request: Request) -> int:
-    """Samples that the rungs of a request read."""
-    reference = request.quality.rung("room_shadow") == "brute_force"
-    return REFERENCE_SIZE[0] * REFERENCE_SIZE[1] if reference else SAMPLES
+def lists_texels(request: Request) -> bool:
+    """Whether the reference asks for every texel of the room, beside the samples that follow its light."""
+    return request.quality.rung("room_shadow") == "brute_force"
+
+
+def sample_names(request: Request) -> tuple[str, str, str]:
+    """Arrays that shadows read: directions, flux, samples."""
+    listed = "room_samples_texel_directions", "room_samples_texel_flux", "room_samples_texels"
+    return listed if lists_texels(request) else ("room_samples_directions", "room_samples_flux", "room_samples")
 
 
 def knows_lamps(request: Request) -> bool:
@@ -49,41 +54,51 @@ class RoomSamples(Stage):
         return Wiring(("environment", *lamps), ("room_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The samples, and the sums that are inverted to draw them."""
+        """The samples, and the sums that are inverted to draw them; for the reference a small map's texels as well."""
         height = self.request.quality.environment_height
-        count = sample_count(self.request)
         specs = {
-            "room_samples": ArraySpec((count,), RoomSample, RoomSample()),
-            "room_samples_directions": ArraySpec((count,), wp.vec3),
-            "room_samples_flux": ArraySpec((count,), wp.vec3),
-        }
-        if self.request.quality.rung("room_shadow") == "brute_force":
-            size = min(REFERENCE_SIZE[0], height), min(REFERENCE_SIZE[1], 2 * height)
-            return {**specs, "room_samples_map": ArraySpec(size, wp.vec3)}
-        return {
-            **specs,
+            "room_samples": ArraySpec((SAMPLES,), RoomSample, RoomSample()),
+            "room_samples_directions": ArraySpec((SAMPLES,), wp.vec3),
+            "room_samples_flux": ArraySpec((SAMPLES,), wp.vec3),
             "room_samples_cumulative": ArraySpec((height, 2 * height), wp.float32),
             "room_samples_rows": ArraySpec((height,), wp.vec2),
         }
+        if not lists_texels(self.request):
+            return specs
+        texels = REFERENCE_SIZE[0] * REFERENCE_SIZE[1]  # a smaller room leaves the rest without measure
+        return {
+            **specs,
+            "room_samples_map": ArraySpec(
+                (min(REFERENCE_SIZE[0], height), min(REFERENCE_SIZE[1], 2 * height)), wp.vec3
+            ),
+            "room_samples_texels": ArraySpec((texels,), RoomSample, RoomSample()),
+            "room_samples_texel_directions": ArraySpec((texels,), wp.vec3),
+            "room_samples_texel_flux": ArraySpec((texels,), wp.vec3),
+        }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Sum, then invert; or list the texels of a small map."""
+        """Sum, then invert; and list the texels of a small map."""
         environment, samples = arrays["environment"], arrays["room_samples"]
-        directions, flux = arrays["room_samples_directions"], arrays["room_samples_flux"]
+        cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
+        out = arrays["room_samples_directions"], arrays["room_samples_flux"], samples
         origin = wp.vec3(*self.request.scene.probes[0].center)
-        small = arrays.get("room_samples_map")
-        if small is not None:
-            passes = [
+        passes = [
+            Pass(lambda rows: room_samples.sum_environment(environment, cumulative, sums)),
+            Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, *out)),
+        ]
+        found = [samples]
+        if lists_texels(self.request):
+            small, texels = arrays["room_samples_map"], [arrays[name] for name in sample_names(self.request)]
+            passes += [
                 Pass(lambda rows: pyramid.reduce_latlong(environment, small)),
-                Pass(lambda rows: room_samples.list_texels(small, origin, directions, flux, samples)),
+                Pass(lambda rows: room_samples.list_texels(small, origin, *texels)),
             ]
-        else:
-            cumulative, sums = arrays["room_samples_cumulative"], arrays["room_samples_rows"]
-            out = directions, flux, samples
-            passes = [
-                Pass(lambda rows: room_samples.sum_environment(environment, cumulative, sums)),
-                Pass(lambda rows: room_samples.draw_samples(environment, cumulative, sums, origin, *out)),
-            ]
+            found.append(texels[-1])
         if knows_lamps(self.request):
-            passes.append(Pass(lambda _: room_samples.place_lamps(arrays["lamps"], samples)))
+
+            def place(rows: Rows | None) -> None:
+                for one in found:
+                    room_samples.place_lamps(arrays["lamps"], one)
+
+            passes.append(Pass(place))
         return passes

@@ -14,7 +14,7 @@ from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room
-from warp_ar.stages.room_samples import REFERENCE_SIZE, knows_lamps
+from warp_ar.stages.room_samples import REFERENCE_SIZE, knows_lamps, sample_names
 from warp_ar.stages.shade import DFG_SIZE, shade_config
 from warp_ar.stages.visibility import GrowingRows
 
@@ -152,15 +152,14 @@ class RoomShadow(Stage):
             return max(start // rung.stride - reach, 0), min(-(-stop // rung.stride) + reach, ratio.shape[0])
 
         params, shaded = arrays["params"], arrays["room_shadow_shaded"]
+        samples = [arrays[name] for name in sample_names(self.request)]
 
         def estimate(rows: Rows | None) -> None:
             room_shadow.shade_room(
                 config,
                 *inputs,
                 room,
-                arrays["room_samples_directions"],
-                arrays["room_samples_flux"],
-                arrays["room_samples"],
+                *samples,
                 rung.stride,
                 ratio,
                 surface,

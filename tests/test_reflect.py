@@ -1,0 +1,119 @@
+"""Where the camera's picture shows a point of the desk, and where it does not."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.test_relight import H, W, records, shape
+from warp_ar.kernels.reflect import make_find_in_frame
+from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Probe, RayScene, Shape
+from warp_ar.kernels.visibility import TraceConfig
+
+FOCAL = 60.0
+UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
+# Pixels: a position is projected through a dozen roundings of 1e-7 of the frame's width.
+FLOAT = 1e-4
+
+
+@functools.cache
+def make_find_kernel(probes):
+    find_in_frame = make_find_in_frame(TraceConfig((), (PLANE, BOX)), probes)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        balls: wp.array[Probe],
+        points: wp.array[wp.vec3],
+        normals: wp.array[wp.vec3],
+        # Out:
+        found_out: wp.array[wp.vec2],
+    ):
+        i = wp.tid()
+        found_out[i] = find_in_frame(params[0], wp.static(H), wp.static(W), scene, balls, points[i], normals[i])
+
+    return find_kernel
+
+
+def find(points, normals, scale=1.0, shift=(0.0, 0.0, 0.0), proxies=(), ball=None):
+    """Pixels of points for a camera ``scale`` above the desk that looks straight down; x = -1 where not seen."""
+    shift = np.asarray(shift, float)
+    desk = shape(PLANE, shift, scale * np.array([5.0, 5.0, 0.0]))
+    scene = RayScene()
+    scene.objects = wp.zeros(0, Shape)
+    scene.proxies = records(
+        Shape, desk, *(shape(BOX, scale * np.array(at) + shift, scale * np.array(half)) for at, half in proxies)
+    )
+    camera = records(
+        FrameParams,
+        {
+            "camera_position": np.add(shift, (0.0, 0.0, scale)),
+            "world_from_camera": np.diag([1.0, -1.0, -1.0]),
+            "focal": (FOCAL, FOCAL),
+            "principal": ((W - 1) / 2, (H - 1) / 2),
+        },
+    )
+    balls = [] if ball is None else [{"center": scale * np.array(ball[0]) + shift, "radius": scale * ball[1]}]
+    out = wp.zeros(len(points), wp.vec2)
+    wp.launch(
+        make_find_kernel(bool(balls)),
+        dim=len(points),
+        inputs=[
+            camera,
+            scene,
+            records(Probe, *balls),
+            wp.array((scale * np.array(points) + shift).astype(np.float32), dtype=wp.vec3),
+            wp.array(np.array(normals, np.float32), dtype=wp.vec3),
+        ],
+        outputs=[out],
+    )
+    return out.numpy()
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift"),
+    [(1.0, (0, 0, 0)), (1e-3, (0, 0, 0)), (1e3, (0, 0, 0)), (30.0, (600.0, -800.0, 0.0))],
+    ids=["1 m", "1 mm", "1 km", "1 km away"],
+)
+def test_points_of_the_desk_are_where_they_project_at_any_scale(device, scale, shift):
+    """The desk itself is in the way of no point that lies on it."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-0.5, 0.5, 200), rng.uniform(-0.38, 0.38, 200), np.zeros(200)])
+    found = find(points, [UP] * 200, scale, shift)
+    expected = np.array([(W - 1) / 2, (H - 1) / 2]) + FOCAL * points[:, :2] * (1, -1)
+    # A kilometre away a point of float32 is known to 6e-5 m, of 30 m.
+    np.testing.assert_allclose(found, expected, atol=FLOAT if shift == (0, 0, 0) else 1e-3)
+
+
+def test_a_face_turned_away_is_not_in_the_picture(device):
+    along = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0)]  # seen edge-on from above the point, exactly
+    found = find([(0.0, 0.0, 0.0)] * 4, [DOWN, *along, UP])
+    assert (found[:3, 0] == -1).all()
+    assert found[3] == pytest.approx([(W - 1) / 2, (H - 1) / 2], abs=FLOAT)
+
+
+def test_what_a_proxy_hides_is_not_in_the_picture(device):
+    """A box floats above the desk's middle: it hides what is below it, and is seen itself from above."""
+    box = ((0.0, 0.0, 0.5), (0.1, 0.1, 0.05))
+    points = [(0.0, 0.0, 0.0), (0.15, 0.1, 0.0), (0.3, 0.0, 0.0), (0.0, 0.0, 0.55), (0.0, 0.0, 0.45)]
+    found = find(points, [UP, UP, UP, UP, DOWN], proxies=[box])
+    assert (found[:, 0] >= 0).tolist() == [False, False, True, True, False]
+    assert (find(points[:3], [UP] * 3)[:, 0] >= 0).all(), "without the box nothing is hidden"
+
+
+def test_what_a_ball_hides_is_not_in_the_picture(device):
+    points = [(0.0, 0.0, 0.0), (0.35, 0.0, 0.0)]
+    assert (find(points, [UP] * 2, ball=((0.0, 0.0, 0.5), 0.1))[:, 0] >= 0).tolist() == [False, True]
+
+
+def test_outside_the_picture_and_behind_the_camera(device):
+    half = 0.5 * (W - 1) / FOCAL
+    points = [(half - 1e-3, 0.0, 0.0), (half + 1e-3, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0)]
+    found = find(points, [UP, UP, UP, DOWN, UP])
+    assert (found[:, 0] >= 0).tolist() == [True, False, False, False, False]
+    assert np.isfinite(found).all()
