@@ -2,6 +2,7 @@
 
     python scenes/make_clips.py [--clip desk] [--variant cuda_ad_rgb] [--frames N] [--spp 512] [--out scenes/clips]
     python scenes/make_clips.py --truth FOLDER [--scene torus] [--frames N]
+    python scenes/make_clips.py --bundle [--scene torus] [--spp 512]
 
 A clip is what a camera would have seen: one room, one desk, a printed marker, a mirror ball, and clutter that no scene
 file mentions. Everything is made here, in code: geometry, textures, light. Radiance is in camera values throughout
@@ -9,7 +10,8 @@ file mentions. Everything is made here, in code: geometry, textures, light. Radi
 
 The virtual things are never in a clip. ``--truth`` reads them from the scene file and renders the same frames with the
 objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's
-centre.
+centre. ``--bundle`` writes one frame of each scene as ``truth/SCENE_NNNN.png``, transparent wherever the virtual things
+(or the clipping that a shorter exposure undoes) change nothing: what ``warp_ar.tradeoff`` compares pictures with.
 
 Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly,
 and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
@@ -636,6 +638,8 @@ SCENES = {
     "darken": "darken",
 }
 """The clip that each bundled scene plays."""
+BUNDLED = {"desk": 24, "torus": 84, "mirror": 24, "wire_coincident": 36, "wire_opposing": 36, "darken": 36}
+"""Frame of each scene whose truth is bundled: daylight, ceiling lamp, daylight; the light of the others is still."""
 
 
 # ---- the virtual things of a scene file, for truth -----------------------------------------------
@@ -876,12 +880,38 @@ def make_truth(name: str, options: argparse.Namespace) -> None:
     print(f"{folder}: frames {chosen}", flush=True)
 
 
+def bundle_truth(name: str, options: argparse.Namespace) -> None:
+    """One frame of a scene as it should look, opaque where that differs from the camera's frame."""
+    clip, index = SCENES[name], BUNDLED[name]
+    scene = tomllib.loads((HERE / f"{name}.toml").read_text())
+    moment, scale = times(clip, None)[index], scene.get("exposure", {}).get("scale", 1.0)
+    virtual = {kind: scene.get(kind, []) for kind in ("object", "light")}
+    camera = Renderer(clip, options.spp).frame(moment, 5000 + index)
+    plain = encode(camera)
+    if scale == 1.0:
+        truth = encode(Renderer(clip, options.spp, virtual).frame(moment, 5000 + index))
+        # As warp_ar.metrics.changed_region, but finer and wider: faint shadows and light end softly.
+        difference = np.abs(truth.astype(np.float32) - plain).max(-1) / 255
+        region, reach = cv2.GaussianBlur(difference, (0, 0), 3.0) > 0.01, 15
+    else:
+        truth, region, reach = encode(camera * scale), (plain >= 254).any(-1), 5
+    alpha = cv2.dilate(region.astype(np.uint8) * 255, np.ones((reach, reach), np.uint8))
+    path = HERE / "truth" / f"{name}_{index:04d}.png"
+    path.parent.mkdir(exist_ok=True)
+    picture = np.where(alpha[..., None] > 0, truth, 0)[..., ::-1]
+    cv2.imwrite(str(path), np.concatenate([picture, alpha[..., None]], -1), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    print(f"{path}: {(alpha > 0).mean():.1%} of the picture, {path.stat().st_size} bytes", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--variant", default="cuda_ad_rgb", help="Mitsuba variant: cuda_ad_rgb or llvm_ad_rgb")
     parser.add_argument("--clip", action="append", choices=sorted(CLIPS), help="clip to render (default: all)")
     parser.add_argument(
-        "--scene", action="append", choices=sorted(SCENES), help="with --truth: scene to render (default: all)"
+        "--scene",
+        action="append",
+        choices=sorted(SCENES),
+        help="with --truth or --bundle: scene to render (default: all)",
     )
     parser.add_argument("--frames", type=int, help="render this many frames, spread over the clip's whole motion")
     parser.add_argument("--spp", type=int, default=512, help="samples per pixel (default 512)")
@@ -889,8 +919,13 @@ def main() -> None:
     parser.add_argument("--stills", type=int, default=0, help="also write every so many frames as PNG")
     parser.add_argument("--out", type=pathlib.Path, default=HERE / "clips", help="folder of the clips")
     parser.add_argument("--truth", type=pathlib.Path, help="render truth into this folder instead of clips")
+    parser.add_argument("--bundle", action="store_true", help="render the truth that is bundled instead of clips")
     options = parser.parse_args()
     mi.set_variant(options.variant)
+    if options.bundle:
+        for name in options.scene or SCENES:
+            bundle_truth(name, options)
+        return
     if options.truth:
         for name in options.scene or SCENES:
             make_truth(name, options)

@@ -7,6 +7,7 @@ import dataclasses
 import html.parser
 import json
 import re
+import time
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from rich.console import Console
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar import tradeoff, tradeoff_page
-from warp_ar.ladder import KNOBS, frontier, read_errors
+from warp_ar.ladder import KNOBS, read_errors
 from warp_ar.live import EXIT_DONE, EXIT_USAGE
 from warp_ar.metrics import ArrayError
 from warp_ar.quality import PRESETS
@@ -87,6 +88,9 @@ def test_dominated_means_in_every_respect():
 
     rows = [row("a", 1.0, 0.3, 0.3), row("b", 2.0, 0.4, 0.4), row("c", 3.0, 0.3, 0.1), row("d", 4.0, 0.1, 0.1)]
     assert [tradeoff._is_dominated(one, rows) for one in rows] == [False, True, False, False]
+    # What cannot be told apart counts as equal, and of equals the first stays.
+    equal = [row("a", 1.0, 0.3, 0.3), row("b", 1.01, 0.3001, 0.301), row("c", 1.0, 0.3, 0.3)]
+    assert [tradeoff._is_dominated(one, equal) for one in equal] == [False, True, True]
 
 
 # ---------------------------------------------------------------------------------------------------- irradiance
@@ -217,12 +221,58 @@ def test_price_list_is_what_ladder_reads(report):
     errors = read_errors(json.loads(json.dumps(made)))
     assert errors["diffuse"]["top_mip"] == pytest.approx(0.1)
     assert errors["diffuse"]["sh2"] == 0.0
-    assert made["milliseconds"]["diffuse"] == {"top_mip": 0.5, "sh2": 1.0}
-    assert frontier(
-        tradeoff._relative_prices(
-            report.rows, [dataclasses.replace(knob("diffuse"), rungs=("top_mip", "sh2"))], PRESETS["low"]
-        )
-    )
+    assert made["stage_errors"]["diffuse"] == {"top_mip": 0.3}
+
+
+def test_choices_are_made_from_the_committed_list(report, monkeypatch):
+    """Not from the errors of the case that they are scored on, unless there is no list yet."""
+    listed = {"diffuse": {"top_mip": 0.7, "sh2": 0.2}}
+    monkeypatch.setattr(tradeoff, "load_errors", lambda: listed)
+    assert tradeoff.listed_errors(report.rows) is listed
+    monkeypatch.setattr(tradeoff, "load_errors", lambda: {"diffuse": {"top_mip": 0.0, "sh2": 0.0}})
+    assert tradeoff.listed_errors(report.rows) == {"diffuse": {"top_mip": 0.1, "sh2": 0.0}}
+
+
+# ------------------------------------------------------------------------------------------------------------ truth
+
+
+def test_bundled_scenes_end_with_their_truth():
+    case = tradeoff.open_scene("desk", 2, 4)
+    assert len(case.frames) == 2
+    assert list(case.truth) == [1]
+    region = case.regions[1]
+    camera, truth = case.frames[1].image, case.truth[1]
+    assert 0.05 < region.mean() < 0.5
+    # Nothing virtual, nothing changed.
+    np.testing.assert_array_equal(truth[~region], camera[~region])
+    assert np.abs(truth[region].astype(int) - camera[region]).mean() > 5.0
+
+
+def test_where_nothing_clips_the_truth_of_a_shorter_exposure_is_known():
+    case = tradeoff.open_scene("darken", 1, 1)
+    camera, truth, region = case.frames[0].image, case.truth[0], case.regions[0]
+    decode = tradeoff.decode_table("srgb")[:, 0]
+    scaled = 0.5 * decode[camera[~region]]
+    # Rounding to a code: half of the step between codes there.
+    assert np.abs(decode[truth[~region]] - scaled).max() <= 0.51 * np.diff(decode).max()
+    assert region[(camera >= 255).any(-1)].mean() > 0.95
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 1.0])
+def test_scaling_codes_is_scaling_radiance(scale):
+    image = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, -1)
+    scaled = tradeoff.scale_codes(image, scale, "linear")
+    np.testing.assert_array_equal(scaled[0, :, 0], np.floor(np.arange(256) * scale + 0.5))
+
+
+def test_in_turn_is_alone(case, device):
+    """Qualities that run in turn do not touch each other."""
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_rungs(diffuse="sh4")}
+    times, images = tradeoff.run_in_turn(case, qualities, device, time.perf_counter)
+    for label, quality in qualities.items():
+        alone = tradeoff.run(case, quality, device)
+        np.testing.assert_array_equal(images[label][3], alone.images[3])
+        assert len(times[label]) == len(case.frames) - tradeoff.WARM_UP
 
 
 # --------------------------------------------------------------------------------------------------- the command

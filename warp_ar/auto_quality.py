@@ -80,7 +80,9 @@ KNOB_SECONDS = 0.5
 BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""
 _MEASURED_FRAMES = 6
-_WARM_UP = 3
+_WARM_UP = 2
+_ENOUGH_MS = 300.0
+"""Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
 _KEPT_PIPELINES = 6
 _CACHE_FILE = "costs.json"
 
@@ -93,6 +95,15 @@ class Costs:
     """Milliseconds per frame of the preset that rungs were measured from, tracking included."""
     rungs: Mapping[str, Mapping[str, float]]
     """By knob and rung: milliseconds per frame more than the base takes."""
+
+
+def make_prices(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[Price]:
+    """Costs measured on a device beside errors by knob and rung."""
+    return [
+        Price(knob, rung, milliseconds, errors[knob][rung])
+        for knob, own in costs.rungs.items()
+        for rung, milliseconds in own.items()
+    ]
 
 
 # ----------------------------------------------------------------------------------------------------------- the choice
@@ -111,11 +122,7 @@ class Controller:
         """
         self.budget_ms = budget_ms
         self._base = costs.base
-        prices = [
-            Price(knob, rung, milliseconds, errors[knob][rung])
-            for knob, own in costs.rungs.items()
-            for rung, milliseconds in own.items()
-        ]
+        prices = make_prices(costs, errors)
         self._prices = {(price.knob, price.rung): price for price in prices}
         self._ladders = {
             knob: [price.rung for price in undominated([price for price in prices if price.knob == knob])]
@@ -233,7 +240,13 @@ class Controller:
 
 
 def measure_costs(
-    scene: Scene, image: Any, pose: Pose | None, device: str, size: tuple[int, int], knobs: Sequence[Knob]
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    knobs: Sequence[Knob],
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Costs:
     """Time every rung but brute force on one frame that is shown again and again.
 
@@ -244,8 +257,9 @@ def measure_costs(
         device: ``cpu`` or ``cuda:N``.
         size: Width and height.
         knobs: What may be turned.
+        clock: Seconds, on CPU.
     """
-    steps = measure_steps(scene, image, pose, device, size, knobs)
+    steps = measure_steps(scene, image, pose, device, size, knobs, clock)
     while True:
         try:
             next(steps)
@@ -254,11 +268,17 @@ def measure_costs(
 
 
 def measure_steps(
-    scene: Scene, image: Any, pose: Pose | None, device: str, size: tuple[int, int], knobs: Sequence[Knob]
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    knobs: Sequence[Knob],
+    clock: Callable[[], float] = time.perf_counter,
 ) -> Generator[float, None, Costs]:
     """``measure_costs`` in small steps, for whoever has other things to do; yields the share that is done."""
     count, done = sum(len(knob.rungs) for knob in knobs) + 1, 1
-    base = _time_stages(scene, image, pose, device, size, BASE)
+    base = _time_stages(scene, image, pose, device, size, BASE, clock)
     yield done / count
     rungs: dict[str, dict[str, float]] = {}
     for knob in knobs:
@@ -267,7 +287,7 @@ def measure_steps(
         for rung in knob.rungs:
             if rung != "brute_force":
                 quality = turn(BASE, {knob.name: rung})
-                times[rung] = base if rung == start else _time_stages(scene, image, pose, device, size, quality)
+                times[rung] = base if rung == start else _time_stages(scene, image, pose, device, size, quality, clock)
             done += 1
             yield done / count
         # Stages that run whatever the rung is cost the same: what was measured of them is noise.
@@ -278,17 +298,29 @@ def measure_steps(
 
 
 def _time_stages(
-    scene: Scene, image: Any, pose: Pose | None, device: str, size: tuple[int, int], quality: Quality
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    quality: Quality,
+    clock: Callable[[], float],
 ) -> dict[str, float]:
     times: dict[str, list[float]] = {}
+    spent = 0.0
     with Pipeline(scene, device=device, quality=quality, size=size, profile=True) as pipeline:
+        pipeline.scheduler.clock = clock
         for index in range(_WARM_UP + _MEASURED_FRAMES):
             # Brighter and darker by an eighth, else stages would be skipped.
             shown = image if index % 2 == 0 else image - image // 8
             result = pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
-            if index >= _WARM_UP:
-                for name, timing in result.stages.items():
-                    times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
+            if index < _WARM_UP:
+                continue
+            for name, timing in result.stages.items():
+                times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
+            spent += sum(timing.milliseconds for timing in result.stages.values())
+            if spent > _ENOUGH_MS:
+                break
     times.pop(TRACK, None)
     return {name: statistics.median(own or [0.0]) for name, own in times.items()}
 

@@ -152,6 +152,11 @@ class Pipeline:
             self._transfers.close()
 
     @property
+    def scheduler(self) -> Scheduler:
+        """What runs the stages and times them."""
+        return self._scheduler
+
+    @property
     def arrays(self) -> Arrays:
         """Every named array of the pipeline, on its device."""
         return self._arrays

@@ -1,14 +1,19 @@
-"""``python -m warp_ar.tradeoff [SCENE]`` shows what accuracy costs: errors and milliseconds of every rung.
+"""``python -m warp_ar.tradeoff [SCENE ...]`` shows what accuracy costs: errors and milliseconds of every rung.
 
 Every knob of a scene (see ``ladder``) is turned through its rungs, all others staying on ``BASE``. Per rung it notes
 
 - how far what the stage writes is from what the knob's last rung writes: relative RMSE, worst texel, energy drift;
-- how far the picture is from the truth (a path tracer's, where there is one) or else from the picture at the knob's
-  last rung: FLIP, summed over the picture and divided by the pixels that anything virtual changes, so that errors of
-  different knobs are on one scale;
+- how far the picture is from the truth (a path tracer's: bundled scenes come with one frame of it) or else from the
+  picture at the knob's last rung: FLIP, summed over the picture and divided by the pixels that anything virtual
+  changes, so that errors of different knobs are on one scale;
 - the median milliseconds per frame of the knob's own stages, and of those that run only for this rung.
 
-Then presets, and the best choices for the paper's time and for the paper's error, are run as a whole.
+Then presets, and the best choices for the paper's time and for the paper's error, are run as a whole, frame by frame in
+turn. Those choices are made from the committed price list, not from the errors of the case that they are scored on, and
+a choice in the paper's time must be measured to take no more of it.
+
+``--processor-time`` counts what all threads of this process work instead of the time by the clock: other programs that
+are busy at the same time then hardly matter.
 """
 
 from __future__ import annotations
@@ -18,10 +23,12 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import math
 import os
 import platform
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,36 +42,54 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from warp_ar import tradeoff_page
+from warp_ar.auto_quality import BASE as COST_BASE
+from warp_ar.auto_quality import make_prices, measure_costs
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.graph import make_plan
+from warp_ar.kernels.color import decode_table
 from warp_ar.ladder import (
     KNOBS,
     Choice,
     Knob,
-    Price,
+    choose,
     frontier,
+    load_errors,
     relevant_knobs,
     setting,
     turn,
 )
 from warp_ar.live import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
 from warp_ar.metrics import ArrayError, array_error, changed_region, clipped_region, flip_map, latlong_weights
-from warp_ar.pipeline import TRACK, Pipeline
+from warp_ar.pipeline import TRACK, Pipeline, Result
 from warp_ar.quality import PRESETS, Quality
-from warp_ar.scene import Scene, load_scene
+from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.sources import Frame, open_source
 from warp_ar.stages.base import Request
 from warp_ar.tracking import Pose, Tracker
 
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+Clock = Callable[[], float]
 
 BASE = PRESETS["high"]
 """What the other knobs stay on while one is turned."""
 WARM_UP = 3
 """Frames that are not timed: modules load, caches fill."""
 DEFAULT_FRAMES = 12
-TRIES = 7
-"""Runs at most to find what fits a budget."""
+TIMED = 5
+"""Last frames that are run at a rung, the first of them not timed; those before only bring the light."""
+REPEAT_BELOW = 2000.0
+"""Milliseconds: a frame that took less is run again where it was the only one, for it loaded the kernels."""
+TRIES = 6
+"""Runs at most to find what fits a budget or an error."""
+OVER = 1.02
+"""By how much more than the paper's a measured time counts as the paper's: the noise of a paired mean."""
+COST_NOISE = 0.03
+"""Share by which costs must differ to be told apart."""
+FLIP_NOISE = 2e-4
+"""FLIP by which pictures must differ to be told apart."""
+RMSE_NOISE = 0.02
+"""Share by which errors of arrays must differ to be told apart."""
 MIN_COLUMNS = 110
 """Of the tables: where output is no terminal, narrower ones would be cut."""
 RUNS = ("paper", "low", "medium", "high")
@@ -74,8 +99,15 @@ NORMALS = (24, 48)
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
 """Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
 
-_WITHOUT_BRUTE_FORCE = PRESETS["reference"].with_rungs(diffuse="clusters", specular="energy_mip", room_shadow="none")
-"""The reference's light without what it takes to show it."""
+_LIGHT_ONLY = {
+    "diffuse": "sh2",
+    "specular": "box_mip",
+    "relight": "paper",
+    "room_shadow": "none",
+    "shade": "environment",
+    "edge_samples": "1",
+}
+"""Rungs of what only shows the light, for frames that nobody looks at."""
 
 _OUTPUT = {
     "unwrap": "probe_radiance",
@@ -102,6 +134,8 @@ class Case:
     poses: tuple[Pose | None, ...]
     truth: Mapping[int, Image]
     """What the camera would have seen, by frame; empty where that is not known."""
+    regions: Mapping[int, Mask] = dataclasses.field(default_factory=dict)
+    """Pixels that anything virtual, or the exposure, changes, where the truth says so."""
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -153,9 +187,12 @@ class Whole:
 
     label: str
     milliseconds: float
+    """Mean per frame, tracking left out."""
     flip: float
     settings: Mapping[str, str]
     images: Mapping[int, Image]
+    over_paper: float = math.nan
+    """Median ratio of its frames' times to the paper preset's, paired."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,15 +214,16 @@ class CaseReport:
 
 
 def read_image(path: Path) -> Image:
-    """A picture as uint8 RGB.
+    """A picture as uint8 RGB, or RGBA if it says where it is transparent.
 
     Raises:
         UsageError: It cannot be read.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise UsageError(f"cannot read the picture {path}")
-    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint8 or image.ndim != 3:
+        raise UsageError(f"cannot read the picture {path}; expected 8-bit colour")
+    order = (2, 1, 0, 3)[: image.shape[2]]
+    return np.ascontiguousarray(image[..., order])
 
 
 def shrink(image: Image, times: int) -> Image:
@@ -196,31 +234,69 @@ def shrink(image: Image, times: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def load_case(name: str, scene: Scene, count: int, truth: Path | None = None, times: int = 1) -> Case:
-    """Read frames, find the marker in each once, and read the truth's pictures of those frames.
+def load_case(
+    name: str,
+    scene: Scene,
+    count: int,
+    truth: Mapping[int, Image] | None = None,
+    times: int = 1,
+    first: int = 0,
+) -> Case:
+    """Read frames, and find the marker in each once.
 
     Args:
         name: For tables.
         scene: Its clip is read.
         count: Frames at most.
-        truth: Folder of ``NNNN.png``: what the camera would have seen.
+        truth: By number of the frame in the clip: RGB, or RGBA that is transparent where nothing changes.
         times: By how much everything is shrunk.
+        first: Number of the first frame.
     """
     if scene.source is None or scene.source.path is None:
         raise UsageError(f"scene {scene.name!r} has no clip to compare rungs on; expected [source] path")
     with open_source(scene.source.path, fps=scene.source.fps) as source:
-        frames = tuple(
-            dataclasses.replace(frame, image=shrink(frame.image, times)) for frame in itertools.islice(source, count)
-        )
+        whole = tuple(itertools.islice(source, first, first + count))
         width, height = source.size
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(width // times, height // times))
+    frames = tuple(dataclasses.replace(frame, image=shrink(frame.image, times)) for frame in whole)
     poses: tuple[Pose | None, ...] = (None,) * len(frames)
     if make_plan(Request(scene, PRESETS["reference"], (scene.camera.width, scene.camera.height))).needs("pose"):
         tracker = Tracker(scene.marker, scene.camera)
         poses = tuple(tracker.track(frame.image, frame.time).pose for frame in frames)
-    pictures = sorted(truth.glob("*.png")) if truth is not None else []
-    wanted = {int(path.stem): shrink(read_image(path), times) for path in pictures if int(path.stem) < len(frames)}
-    return Case(name, scene, frames, poses, wanted)
+    pictures: dict[int, Image] = {}
+    regions: dict[int, Mask] = {}
+    for number, picture in (truth or {}).items():
+        index = number - first
+        if 0 <= index < len(frames):
+            complete, region = _complete(scene, whole[index].image, picture)
+            pictures[index] = shrink(complete, times)
+            regions[index] = shrink(region.astype(np.uint8) * 255, times) > 0
+    return Case(name, scene, frames, poses, pictures, regions)
+
+
+def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:
+    """The truth's whole picture, and the region in which it says anything that the frame does not."""
+    scale = scene.exposure.scale
+    darker = not isinstance(scale, str) and scale < 1.0
+    if truth.shape[2] == 3:
+        return truth, clipped_region(camera) if darker else changed_region(camera, truth)
+    # Where the truth is transparent nothing changes but the exposure, and nothing clips.
+    rest = camera if isinstance(scale, str) else scale_codes(camera, scale, scene.camera.transfer)
+    region = truth[..., 3] > 0
+    return np.where(region[..., None], truth[..., :3], rest), region
+
+
+def scale_codes(image: Image, scale: float, transfer: str | Path) -> Image:
+    """A frame at another exposure, as far as nothing in it clips."""
+    values = decode_table(transfer)
+    codes = np.arange(256)
+    tables = [np.interp(column * scale, column, codes) + 0.5 for column in values.T]
+    return np.stack([table.astype(np.uint8)[image[..., k]] for k, table in enumerate(tables)], -1)
+
+
+def read_truth(folder: Path) -> dict[int, Image]:
+    """Pictures of a folder of ``NNNN.png`` by their numbers."""
+    return {int(path.stem): read_image(path) for path in sorted(folder.glob("*.png"))}
 
 
 def truth_of(scene_file: Path) -> Path | None:
@@ -229,25 +305,45 @@ def truth_of(scene_file: Path) -> Path | None:
     return folder if scene_file.stem.startswith("scene_") and folder.is_dir() else None
 
 
+def open_scene(name: str, count: int, times: int = 1) -> Case:
+    """A case from a scene file or a bundled scene, with the truth that it comes with.
+
+    Bundled scenes come with one true frame, ``truth/SCENE_NNNN.png``; the frames end with it.
+    """
+    path = Path(name)
+    if path.is_file():
+        folder = truth_of(path)
+        return load_case(path.stem, load_scene(name), count, read_truth(folder) if folder else None, times)
+    scene = load_scene(name)
+    found = sorted((bundled_scenes()[name].parent / "truth").glob(f"{name}_[0-9]*.png"))
+    if not found:
+        return load_case(name, scene, count, None, times)
+    number = int(found[0].stem.rpartition("_")[2])
+    return load_case(name, scene, count, {number: read_image(found[0])}, times, max(0, number + 1 - count))
+
+
+def truth_folders(truth: Path) -> list[Path]:
+    """Cases under a folder, or the folder itself if it is one."""
+    return [truth] if (truth / "case.json").is_file() else sorted(path for path in truth.iterdir() if path.is_dir())
+
+
 def open_cases(options: argparse.Namespace) -> Iterator[Case]:
-    """What the command line asks for: a scene, or cases with truth, or both."""
-    if options.scene is not None or options.truth is None:
-        name = options.scene or "desk"
-        path = Path(name)
-        truth = truth_of(path) if path.is_file() else None
-        yield load_case(path.stem, load_scene(name), options.frames, truth, options.shrink)
+    """What the command line asks for: scenes, or cases with truth, or both."""
+    names = options.scenes or ([] if options.truth is not None else ["desk"])
+    for name in bundled_scenes() if names == ["all"] else names:
+        yield open_scene(name, options.frames, options.shrink)
     if options.truth is None:
         return
-    folders = [options.truth] if (options.truth / "case.json").is_file() else sorted(options.truth.iterdir())
     found = False
-    for folder in folders:
+    for folder in truth_folders(options.truth):
         versions = [version for version in options.versions if (folder / f"scene_{version}.toml").is_file()]
         if "both" in versions:
             versions = [version for version in versions if version not in ("object", "light")]
         for version in versions:
             found = True
             scene = load_scene(folder / f"scene_{version}.toml")
-            yield load_case(f"{folder.name} {version}", scene, options.frames, folder / version, options.shrink)
+            name = f"{folder.name.replace('_', ' ')}, {version.replace('_', ' ')}"
+            yield load_case(name, scene, options.frames, read_truth(folder / version), options.shrink)
     if not found:
         raise UsageError(
             f"--truth {options.truth}: expected folders with scene_*.toml, as scene_both.toml beside both/"
@@ -257,8 +353,20 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
 # ------------------------------------------------------------------------------------------------------------ measuring
 
 
+def light_only(quality: Quality) -> Quality:
+    """The same light, cheaply shown: for frames that only bring it."""
+    return turn(quality, _LIGHT_ONLY)
+
+
 def run(
-    case: Case, quality: Quality, device: str, knob: Knob | None = None, *, between: Quality | None = None
+    case: Case,
+    quality: Quality,
+    device: str,
+    knob: Knob | None = None,
+    *,
+    between: Quality | None = None,
+    timed: int = TIMED,
+    clock: Clock = time.perf_counter,
 ) -> Outcome:
     """Run a case's frames at one quality, one after another, and time every stage.
 
@@ -267,32 +375,74 @@ def run(
         quality: What to run at.
         device: Where.
         knob: What was turned: what its stage wrote is kept.
-        between: Only wanted pictures are worth its time: the frames between them run at this, which keeps the light.
+        between: Frames that are neither wanted nor timed run at this, which keeps the light; None runs all alike.
+        timed: Last frames that run at ``quality`` whatever is wanted; the first that does is not timed.
+        clock: Seconds, on CPU.
     """
     images: dict[int, Image] = {}
     times: dict[str, list[float]] = {}
-    timed = case.shown if between is not None else range(min(WARM_UP, len(case.frames) - 1), len(case.frames))
+    count = len(case.frames)
+    wanted = {*case.shown, *range(max(0, count - timed), count)} if between is not None else set(range(count))
+    skip = 1 if len(wanted) > 1 else 0
 
-    def open_pipeline(at: Quality) -> Pipeline:
-        return Pipeline(case.scene, device=device, quality=at, outputs=("image",), profile=True)
+    def note(result: Result) -> None:
+        for name, timing in result.stages.items():
+            times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
 
-    with open_pipeline(quality) as pipeline, contextlib.ExitStack() as stack:
-        cheap = pipeline if between is None else stack.enter_context(open_pipeline(between))
+    with _open(case, quality, device, clock) as pipeline, contextlib.ExitStack() as stack:
+        cheap = pipeline if between is None else stack.enter_context(_open(case, between, device, clock))
         before = pipeline
         for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
-            now = pipeline if index in case.shown else cheap
+            now = pipeline if index in wanted else cheap
             if now is not before and index > 0:
                 now.continue_from(before)
             before = now
             result = now(frame.image, time_seconds=frame.time, pose=pose)
             if index in case.shown:
                 images[index] = result.image
-            if index in timed:
-                for name, timing in result.stages.items():
-                    times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
+            if now is pipeline:
+                if skip > 0:
+                    skip -= 1
+                else:
+                    note(result)
         output = None if knob is None else _read_output(pipeline, knob)
+        if len(wanted) == 1 and sum(own[0] for own in times.values() if own) < REPEAT_BELOW:
+            times.clear()
+            pipeline.scheduler.forget()
+            note(pipeline(case.frames[-1].image, time_seconds=case.frames[-1].time + 1e-3, pose=case.poses[-1]))
     times.pop(TRACK, None)
     return Outcome(quality, images, {name: statistics.median(own or [0.0]) for name, own in times.items()}, output)
+
+
+def _open(case: Case, quality: Quality, device: str, clock: Clock) -> Pipeline:
+    pipeline = Pipeline(case.scene, device=device, quality=quality, outputs=("image",), profile=True)
+    pipeline.scheduler.clock = clock
+    return pipeline
+
+
+def run_in_turn(
+    case: Case, qualities: Mapping[str, Quality], device: str, clock: Clock
+) -> tuple[dict[str, list[float]], dict[str, dict[int, Image]]]:
+    """Run several qualities frame by frame in turn, so that whatever else goes on disturbs all alike.
+
+    Returns:
+        Milliseconds of every frame after the first ``WARM_UP``, tracking left out, and the wanted pictures; by label.
+    """
+    times: dict[str, list[float]] = {label: [] for label in qualities}
+    images: dict[str, dict[int, Image]] = {label: {} for label in qualities}
+    with contextlib.ExitStack() as stack:
+        pipelines = {
+            label: stack.enter_context(_open(case, quality, device, clock)) for label, quality in qualities.items()
+        }
+        for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
+            for label, pipeline in pipelines.items():
+                result = pipeline(frame.image, time_seconds=frame.time, pose=pose)
+                if index in case.shown:
+                    images[label][index] = result.image
+                if index >= min(WARM_UP, len(case.frames) - 1):
+                    own = (timing for name, timing in result.stages.items() if name != TRACK)
+                    times[label].append(sum(timing.milliseconds for timing in own))
+    return times, images
 
 
 def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
@@ -353,18 +503,32 @@ def picture_error(case: Case, reference: Mapping[int, Image], images: Mapping[in
     """Sum of FLIP over the picture divided by the pixels that anything virtual changes, mean over compared frames."""
     errors = []
     for index, picture in reference.items():
-        region = changed_region(case.frames[index].image, picture)
+        region = region_of(case, index, picture)
         errors.append(float(flip_map(picture, images[index]).sum()) / max(int(region.sum()), 1))
     return statistics.fmean(errors)
 
 
-def sweep(case: Case, knob: Knob, device: str, base: Quality = BASE) -> tuple[list[Row], dict[str, Image]]:
-    """Every rung of one knob: its row, and its last picture."""
-    outcomes = {
-        rung: run(case, turn(base, {knob.name: rung}), device, knob, between=base if rung == "brute_force" else None)
-        for rung in knob.rungs
-    }
-    last = outcomes[knob.rungs[-1]]
+def region_of(case: Case, index: int, reference: Image) -> Mask:
+    """Pixels of a frame that anything virtual, or the exposure, changes."""
+    return case.regions[index] if index in case.regions else changed_region(case.frames[index].image, reference)
+
+
+def sweep(
+    case: Case,
+    knob: Knob,
+    device: str,
+    base: Quality = BASE,
+    *,
+    rungs: Sequence[str] | None = None,
+    clock: Clock = time.perf_counter,
+) -> tuple[list[Row], dict[str, Image]]:
+    """Every rung of one knob, or those named: its row, and its last picture."""
+    outcomes: dict[str, Outcome] = {}
+    for rung in rungs or knob.rungs:
+        turned = turn(base, {knob.name: rung})
+        timed = 1 if rung == "brute_force" else TIMED
+        outcomes[rung] = run(case, turned, device, knob, between=light_only(turned), timed=timed, clock=clock)
+    last = list(outcomes.values())[-1]
     common = set.intersection(*(set(outcome.stages) for outcome in outcomes.values())) - set(knob.stages)
     reference = case.truth or last.images
     rows = []
@@ -388,14 +552,23 @@ def sweep(case: Case, knob: Knob, device: str, base: Quality = BASE) -> tuple[li
 
 
 def _is_dominated(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether another rung costs no more and errs no more, in the picture and in what the stage writes."""
+    """Whether another rung costs no more and errs no more, in the picture and in what the stage writes.
 
-    def beats(other: Row) -> bool:
-        mine = row.milliseconds, row.flip, row.stage_error.relative_rmse if row.stage_error else 0.0
-        yours = other.milliseconds, other.flip, other.stage_error.relative_rmse if other.stage_error else 0.0
-        return all(y <= m for y, m in zip(yours, mine, strict=True)) and yours != mine
+    What measurements cannot tell apart counts as equal; of equals the first in the ladder stays.
+    """
 
-    return any(beats(other) for other in rows)
+    def better(a: Row, b: Row) -> bool:
+        cheaper = a.milliseconds < (1.0 - COST_NOISE) * b.milliseconds
+        nearer = a.flip < b.flip - FLIP_NOISE
+        mine, yours = (x.stage_error.relative_rmse if x.stage_error else 0.0 for x in (a, b))
+        return cheaper or nearer or mine < (1.0 - RMSE_NOISE) * yours
+
+    place = list(rows).index(row)
+    return any(
+        not better(row, other) and (better(other, row) or index < place)
+        for index, other in enumerate(rows)
+        if index != place
+    )
 
 
 def _stage_error(outcome: Outcome, last: Outcome) -> ArrayError | None:
@@ -406,8 +579,25 @@ def _stage_error(outcome: Outcome, last: Outcome) -> ArrayError | None:
     return array_error(values, reference, latlong_weights(*reference.shape[:2]) if is_map else None)
 
 
-def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any = None) -> CaseReport:
-    """Sweep every knob, then run presets and the best choices."""
+def measure_case(
+    case: Case,
+    device: str,
+    knobs: Sequence[Knob],
+    progress: Any = None,
+    *,
+    quick: bool = False,
+    clock: Clock = time.perf_counter,
+) -> CaseReport:
+    """Sweep every knob, then run presets and the best choices.
+
+    Args:
+        case: Frames, and their truth if it is known.
+        device: Where.
+        knobs: What to turn.
+        progress: Told what comes next.
+        quick: Leave brute force out.
+        clock: Seconds, on CPU.
+    """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
 
@@ -417,70 +607,99 @@ def measure_case(case: Case, device: str, knobs: Sequence[Knob], progress: Any =
 
     for knob in knobs:
         advance(knob.name)
-        own, shown = sweep(case, knob, device)
+        rungs = [rung for rung in knob.rungs if not (quick and rung == "brute_force")]
+        own, shown = sweep(case, knob, device, rungs=rungs, clock=clock)
         rows += own
         pictures.update({(knob.name, rung): image for rung, image in shown.items()})
     advance("presets")
-    outcomes = {name: run(case, PRESETS[name], device) for name in RUNS}
-    best = None if case.truth else run(case, PRESETS["reference"], device, between=_WITHOUT_BRUTE_FORCE)
+    qualities = {name: PRESETS[name] for name in RUNS}
+    best = None
+    if not case.truth:
+        quality = PRESETS["reference"] if not quick else turn(PRESETS["reference"], {"room_shadow": "fine"})
+        best = run(case, quality, device, between=light_only(quality), timed=1)
     reference = case.truth or (best.images if best is not None else {})
-    labelled = list(outcomes.items())
     everything = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
-    if {knob.name for knob in everything} == {knob.name for knob in knobs}:
-        # Knobs share stages, so their times overlap: costs are relative to the base's, and only order the choices.
-        front = frontier(_relative_prices(rows, knobs, BASE))
-        paper = outcomes["paper"]
-        aim = picture_error(case, reference, paper.images)
+    if {knob.name for knob in everything} == {knob.name for knob in knobs} and "paper" in qualities:
         advance("equal time, equal error")
-        same_time = _bisect(case, front, device, lambda outcome: outcome.milliseconds <= paper.milliseconds)
-        # From the other end: the cheapest that errs no more than the paper is next to the dearest that errs more.
-        dearest_worse = _bisect(
-            case, front, device, lambda outcome: picture_error(case, reference, outcome.images) > aim
-        )
-        place = next(index for index, choice in enumerate(front) if _chosen(choice) == dearest_worse.quality)
-        errs_more = picture_error(case, reference, dearest_worse.images) > aim
-        same_error = run(case, _chosen(front[min(place + errs_more, len(front) - 1)]), device)
-        labelled += [("ours in the paper's time", same_time), ("ours at the paper's error", same_error)]
+        # As --quality auto does: costs measured here, errors from the list.
+        frame, size = case.frames[-1], (case.scene.camera.width, case.scene.camera.height)
+        costs = measure_costs(case.scene, frame.image, case.poses[-1], device, size, knobs, clock)
+        front = frontier(make_prices(costs, listed_errors(rows)))
+        qualities |= {
+            "ours in the paper's time": _find_same_time(case, front, costs.base, device, clock),
+            "ours at the paper's error": _find_same_error(case, front, device, reference),
+        }
+    times, images = run_in_turn(case, qualities, device, clock)
     wholes = tuple(
         Whole(
             label,
-            outcome.milliseconds,
-            picture_error(case, reference, outcome.images),
-            {knob.name: setting(outcome.quality, knob) for knob in everything},
-            outcome.images,
+            statistics.fmean(times[label]),
+            picture_error(case, reference, images[label]),
+            {knob.name: setting(quality, knob) for knob in everything},
+            images[label],
+            statistics.median(a / b for a, b in zip(times[label], times["paper"], strict=True))
+            if "paper" in times
+            else math.nan,
         )
-        for label, outcome in labelled
+        for label, quality in qualities.items()
     )
     index = case.shown[-1]
-    region = changed_region(case.frames[index].image, reference[index])
-    return CaseReport(case, reference, tuple(rows), pictures, wholes, region)
+    return CaseReport(case, reference, tuple(rows), pictures, wholes, region_of(case, index, reference[index]))
 
 
-def _bisect(case: Case, front: Sequence[Choice], device: str, fits: Callable[[Outcome], bool]) -> Outcome:
-    """Run the dearest choice that fits, or the cheapest if none does: prices give the order, measuring the place."""
-    low, high = 0, len(front)
-    best = run(case, _chosen(front[low]), device)
+def listed_errors(rows: Sequence[Row]) -> Mapping[str, Mapping[str, float]]:
+    """Errors by knob and rung, from the committed price list; while that is empty, as measured here."""
+    listed = load_errors()
+    if any(any(own.values()) for own in listed.values()):
+        return listed
+    return {knob: {row.rung: row.excess for row in own} for knob, own in itertools.groupby(rows, lambda row: row.knob)}
+
+
+def _find_same_time(case: Case, front: Sequence[Choice], base_ms: float, device: str, clock: Clock) -> Quality:
+    """Least error by the list of what is measured, in turn with the paper's preset, to take no more than that."""
+
+    def fits(choice: Choice) -> tuple[bool, float]:
+        qualities = {"paper": PRESETS["paper"], "ours": _chosen(choice)}
+        times, _ = run_in_turn(case, qualities, device, clock)
+        paper = statistics.fmean(times["paper"])
+        return statistics.fmean(times["ours"]) <= OVER * paper, paper
+
+    paper = fits(front[0])[1]
+    predicted = choose(front, paper - base_ms)
+    low, high, place = 0, len(front), front.index(predicted)
+    for _ in range(TRIES):
+        if fits(front[place])[0]:
+            low = place
+        else:
+            high = place
+        if high - low <= 1:
+            break
+        place = min(low + 2, high - 1) if high == len(front) else (low + high) // 2
+    return _chosen(front[low])
+
+
+def _find_same_error(case: Case, front: Sequence[Choice], device: str, reference: Mapping[int, Image]) -> Quality:
+    """Cheapest by the list of what is measured to err no more than the paper's preset: only the list orders."""
+
+    def error(quality: Quality) -> float:
+        between = light_only(quality)
+        return picture_error(case, reference, run(case, quality, device, between=between, timed=1).images)
+
+    aim = error(PRESETS["paper"])
+    low, high = -1, len(front) - 1
     for _ in range(TRIES):
         if high - low <= 1:
             break
         middle = (low + high) // 2
-        outcome = run(case, _chosen(front[middle]), device)
-        if fits(outcome):
-            low, best = middle, outcome
-        else:
+        if error(_chosen(front[middle])) <= aim:
             high = middle
-    return best
+        else:
+            low = middle
+    return _chosen(front[high])
 
 
 def _chosen(choice: Choice) -> Quality:
-    return turn(BASE, dict(choice.settings))
-
-
-def _relative_prices(rows: Sequence[Row], knobs: Sequence[Knob], base: Quality) -> list[Price]:
-    """Prices by what turning a knob away from the base saves or adds."""
-    cost = {(row.knob, row.rung): row.milliseconds for row in rows}
-    own = {knob.name: cost[knob.name, setting(base, knob)] for knob in knobs}
-    return [Price(row.knob, row.rung, row.milliseconds - own[row.knob], row.excess) for row in rows]
+    return turn(COST_BASE, dict(choice.settings))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -497,55 +716,79 @@ class Figure:
 
 
 _FIGURES = (
-    ("Figure 7", "darken", "dark_25", "expose", ("plain", "box", "ball"), "A shorter exposure, simulated"),
+    (
+        "Figure 7",
+        "darken",
+        ("dark_25", "dark_50"),
+        "expose",
+        ("plain", "box", "ball"),
+        "A shorter exposure, simulated: what clips in the frame must not just turn grey. Plain scaling; the paper's "
+        "box filter, which lets clipped pixels darken less where their surroundings clip too; ours, which estimates "
+        "what the clipped pixels had from the glow around them and from the mirror ball's view of the same lamps.",
+    ),
     (
         "Figure 8",
         "wire_coincident",
-        "",
+        (),
         "relight",
         ("flat", "paper", "reflectance"),
-        "Light from where the room's comes",
+        "A virtual spotlight from where the room's own lamp shines, over wires that no model knows. Flat light; the "
+        "paper's blend, which takes the frame's brightness for relief; ours, which divides the frame by the light that "
+        "falls there and lights the reflectance that remains.",
     ),
-    ("Figure 9", "wire_opposing", "light", "relight", ("flat", "paper", "reflectance"), "Light against the room's"),
+    (
+        "Figure 9",
+        "wire_opposing",
+        ("light",),
+        "relight",
+        ("flat", "paper", "reflectance"),
+        "The same against the room's lamp: what the frame shows bright now lies in shadow.",
+    ),
 )
-"""Title, bundled scene, version of cases that show the same with its truth, knob, its plain, paper's and best rung."""
+"""Title, bundled scene, versions of cases that show the same with its truth, knob, its plain, paper's and best rung."""
 
 
-def make_figures(device: str, count: int, truth: Path | None, times: int = 1) -> Iterator[Figure]:
-    """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours; in cases with a truth against that."""
-    for title, bundled, version, knob, rungs, text in _FIGURES:
-        cases = [(f"{title}: {bundled}", load_case(bundled, load_scene(bundled), count, None, times))]
-        if truth is not None and version:
-            folders = [truth] if (truth / "case.json").is_file() else sorted(truth.iterdir())
-            for folder in folders:
-                file = folder / f"scene_{version}.toml"
-                if file.is_file():
-                    case = load_case(folder.name, load_scene(file), count, folder / version, times)
-                    cases.append((f"{title} against the truth: {folder.name.replace('_', ' ')}", case))
-        for name, case in cases:
+def make_figures(
+    device: str, count: int, truth: Path | None, times: int = 1, clock: Clock = time.perf_counter
+) -> Iterator[Figure]:
+    """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours, each against the truth where that is known."""
+    for title, bundled, versions, knob, rungs, text in _FIGURES:
+        cases = [(f"{title}: {bundled.replace('_', ' ')}", open_scene(bundled, count, times))]
+        for folder in truth_folders(truth) if truth is not None else ():
+            version = next((name for name in versions if (folder / f"scene_{name}.toml").is_file()), None)
+            if version is not None:
+                scene = load_scene(folder / f"scene_{version}.toml")
+                case = load_case(folder.name, scene, count, read_truth(folder / version), times)
+                cases.append((f"{title} again: {folder.name.replace('_', ' ')}, {version.replace('_', ' ')}", case))
+        for number, (name, case) in enumerate(cases):
             index = case.shown[-1]
             camera = case.frames[index].image
-            images = [run(case, turn(BASE, {knob: rung}), device).images[index] for rung in rungs]
+            outcomes = []
+            for rung in rungs:
+                turned = turn(BASE, {knob: rung})
+                outcomes.append(run(case, turned, device, between=light_only(turned), timed=1, clock=clock))
+            images = [outcome.images[index] for outcome in outcomes]
             reference = case.truth.get(index)
             labels = (f"plain ({rungs[0]})", f"the paper ({rungs[1]})", f"ours ({rungs[2]})")
             columns = (("camera", camera), *zip(labels, images, strict=True))
             if reference is not None:
                 columns = (*columns, ("truth", reference))
-            region = clipped_region(camera) if knob == "expose" else changed_region(camera, images[0])
-            yield Figure(name, f"{text}; all else on the preset {BASE.name}.", columns, reference, region)
+            region = clipped_region(camera) if knob == "expose" else region_of(case, index, images[-1])
+            yield Figure(name, text if number == 0 else "", columns, reference, region)
 
 
 # ------------------------------------------------------------------------------------------------------------ reporting
 
 
 def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
-    """Errors and costs per rung, mean over the cases in which a knob matters; errors never rise along the ladder.
+    """Errors of every rung, and the rungs that another beats in every case.
 
-    Against the truth, noise and luck can favour a cheaper rung in one case; over all, a rung that errs more than a
-    cheaper one is marked as dominated.
+    ``errors`` is FLIP per changed pixel above that of the knob's best rung, mean over the cases in which the knob
+    matters. ``stage_errors`` is the relative RMSE of what the stage writes against its last rung, mean likewise.
+    Both depend on the device only by rounding; costs do not, so they are not kept here.
     """
     errors: dict[str, dict[str, float]] = {}
-    costs: dict[str, dict[str, float]] = {}
+    stage_errors: dict[str, dict[str, float]] = {}
     dominated: dict[str, list[str]] = {}
     for knob in KNOBS:
         rows = [row for report in reports for row in report.rows if row.knob == knob.name]
@@ -555,26 +798,25 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
         by_rung = {rung: [row for row in rows if row.rung == rung] for rung in knob.rungs if rung in measured}
         flips = {rung: statistics.fmean(row.flip for row in own) for rung, own in by_rung.items()}
         best = min(flips.values())
-        errors[knob.name] = {rung: round(flip - best, 6) for rung, flip in flips.items()}
-        costs[knob.name] = {
-            rung: round(statistics.fmean(row.milliseconds for row in own), 4) for rung, own in by_rung.items()
+        errors[knob.name] = {rung: round(flip - best, 5) for rung, flip in flips.items()}
+        arrays = {
+            rung: [row.stage_error.relative_rmse for row in own if row.stage_error is not None]
+            for rung, own in by_rung.items()
         }
-        kept = set().union(
-            *(
-                {row.rung for row in rows if row.case == case and not row.dominated}
-                for case in {row.case for row in rows}
-            )
-        )
-        dominated[knob.name] = [rung for rung in knob.rungs if rung not in kept]
+        stage_errors[knob.name] = {rung: round(statistics.fmean(own), 5) for rung, own in arrays.items() if own}
+        kept = {row.rung for row in rows if not row.dominated}
+        dominated[knob.name] = [rung for rung in by_rung if rung not in kept]
     return {
         "made": {
+            "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
             "device": device_name(device),
             "warp": wp.__version__,
-            "cases": [report.case.name for report in reports],
+            "against": "truth" if all(report.case.truth for report in reports) else "the last rung where no truth is",
+            "base": BASE.name,
         },
         "errors": errors,
-        "milliseconds": costs,
-        "dominated": dominated,
+        "stage_errors": stage_errors,
+        "dominated": {knob: rungs for knob, rungs in dominated.items() if rungs},
     }
 
 
@@ -624,10 +866,10 @@ def print_report(report: CaseReport, console: Console) -> None:
     console.print(table)
     table = Table(title=f"{report.case.name}: as a whole")
     table.add_column("quality")
-    table.add_column("ms", justify="right")
-    table.add_column("FLIP", justify="right")
+    for column in ("ms", "over paper's", "FLIP"):
+        table.add_column(column, justify="right")
     for whole in report.wholes:
-        table.add_row(whole.label, f"{whole.milliseconds:.2f}", f"{whole.flip:.4f}")
+        table.add_row(whole.label, f"{whole.milliseconds:.2f}", f"{whole.over_paper:.2f}", f"{whole.flip:.4f}")
     console.print(table)
 
 
@@ -644,6 +886,7 @@ def records(report: CaseReport, device: Any) -> Iterator[dict[str, Any]]:
             "case": report.case.name,
             "quality": whole.label,
             "milliseconds": whole.milliseconds,
+            "over_paper": whole.over_paper if math.isfinite(whole.over_paper) else None,
             "flip": whole.flip,
             "settings": dict(whole.settings),
             **common,
@@ -656,7 +899,12 @@ def make_parser() -> argparse.ArgumentParser:
         prog="python -m warp_ar.tradeoff", description="What accuracy costs: errors and milliseconds of every rung."
     )
     add = parser.add_argument
-    add("scene", nargs="?", metavar="SCENE", help="a scene file or a bundled scene's name (default: desk, or --truth)")
+    add(
+        "scenes",
+        nargs="*",
+        metavar="SCENE",
+        help="scene files or bundled scenes' names, or all for every bundled one (default: desk, or --truth)",
+    )
     add("--stage", metavar="NAME", help=f"turn only this: {', '.join(knob.name for knob in KNOBS)}")
     add("--truth", type=Path, metavar="DIR", help="a case with pictures of the truth, or a folder of cases")
     add(
@@ -669,7 +917,10 @@ def make_parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=DEFAULT_FRAMES, metavar="N", help=f"frames per run (default: {DEFAULT_FRAMES})")
     add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
+    add("--quick", action="store_true", help="leave brute force out: seconds instead of minutes on CPU")
+    add("--processor-time", action="store_true", help="on CPU count the work of all threads, not the time by the clock")
     add("--out", type=Path, metavar="DIR", help="write tradeoff.jsonl, price_list.json and tradeoff.html here")
+    add("--extra", type=Path, metavar="FILE", help="JSON lines of python -m bench precision, for the page")
     return parser
 
 
@@ -692,6 +943,9 @@ def tradeoff(options: argparse.Namespace) -> int:
     from warp_ar.device import resolve_device
 
     device = resolve_device(options.device)
+    if options.processor_time and not device.is_cpu:
+        raise UsageError(f"--processor-time counts a processor's work; it says nothing of {device}")
+    clock: Clock = time.process_time if options.processor_time else time.perf_counter
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
     reports = []
@@ -706,7 +960,7 @@ def tradeoff(options: argparse.Namespace) -> int:
             def advance(text: str, task: Any = task) -> None:
                 progress.update(task, advance=1, description=text)
 
-            reports.append(measure_case(case, str(device), knobs, advance))
+            reports.append(measure_case(case, str(device), knobs, advance, quick=options.quick, clock=clock))
             progress.remove_task(task)
             print_report(reports[-1], console)
     if not reports:
@@ -721,11 +975,13 @@ def tradeoff(options: argparse.Namespace) -> int:
         (options.out / "tradeoff.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
         (options.out / "price_list.json").write_text(json.dumps(price_list, indent=1) + "\n", encoding="utf-8")
         figures = (
-            list(make_figures(str(device), options.frames, options.truth, options.shrink))
+            list(make_figures(str(device), options.frames, options.truth, options.shrink, clock))
             if options.stage is None
             else []
         )
-        page = tradeoff_page.render(reports, figures, price_list["made"])
+        extra = [json.loads(line) for line in options.extra.read_text().splitlines()] if options.extra else []
+        made = price_list["made"] | {"clock": "processor time" if options.processor_time else "time"}
+        page = tradeoff_page.render(reports, figures, made, extra)
         (options.out / "tradeoff.html").write_text(page, encoding="utf-8")
         console.print(f"written to {options.out}", highlight=False)
     return EXIT_DONE

@@ -327,13 +327,16 @@ def _figure_section(shown: Figure) -> str:
     )
 
 
-def render(reports: Sequence[CaseReport], figures: Sequence[Figure], made: Mapping[str, Any]) -> str:
+def render(
+    reports: Sequence[CaseReport], figures: Sequence[Figure], made: Mapping[str, Any], extra: Sequence[Any] = ()
+) -> str:
     """The whole page.
 
     Args:
         reports: One per case.
         figures: The paper's figures, redone.
         made: On what it was measured: ``device`` and ``warp``.
+        extra: Lines of the bench of arithmetic.
     """
     anchors = [(f"case{index}", report) for index, report in enumerate(reports)]
     ramp = error_colors(np.linspace(0.0, 1.0, 64)[None] ** 2)
