@@ -384,6 +384,7 @@ def pull_level_kernel(
     offset: wp.int32,
     height: wp.int32,
     width: wp.int32,
+    most: wp.float32,
     # Out:
     levels_out: wp.array[wp.vec4],
 ):
@@ -406,7 +407,8 @@ def pull_level_kernel(
             weight = part * texel[3]
             if weight > 0.0:
                 total += weight
-                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)
+                value = wp.vec3(wp.min(texel[0], most), wp.min(texel[1], most), wp.min(texel[2], most))
+                mean += (weight / total) * (value - mean)
     levels_out[offset + i * width + j] = wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
 
 
@@ -525,19 +527,20 @@ def seed_fill(radiance: wp.array, confidence: wp.array, levels_out: wp.array, *,
     )
 
 
-def push_pull(levels_out: wp.array, height: int, width: int) -> None:
+def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = math.inf) -> None:
     """Build the coarser levels of a seeded fill pyramid and complete them, all but level 0.
 
     Args:
         levels_out: As ``seed_fill`` left it; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
+        most: Radiance above which a texel counts as this much: what is unseen must not get a share of a lamp beside it.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     device = levels_out.device
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
     for fine, coarse in itertools.pairwise(levels):
-        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
     for coarse, fine in itertools.pairwise(reversed(levels[1:])):
         launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 import struct
 import threading
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from av.video.reformatter import ColorRange, Colorspace
 
+from warp_ar import sources
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.sources import (
     FRAMES_AHEAD,
@@ -209,7 +211,9 @@ def test_exposures_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
         ('{"000.png": 1}', "did you mean '0000.png'"),
         ('{"0000.png": -1}', "positive"),
         ('{"0000.png": "fast"}', "positive"),
-        ("[1]", "object"),
+        ("1", "object"),
+        ("[]", "list"),
+        ("[0.01, 0]", "positive"),
         ("{", "cannot be read"),
     ],
 )
@@ -507,6 +511,9 @@ class FakeCapture:
     def get(self, key: int) -> float:
         return self.fps
 
+    def getBackendName(self) -> str:
+        return "V4L2"
+
     def set(self, key: int, value: float) -> bool:
         self.fps = value
         return True
@@ -636,3 +643,110 @@ def test_folder_is_decoded_ahead(tmp_path: pathlib.Path) -> None:
             (tmp_path / f"{index:04d}.png").unlink()
         # Asked for one at a time: what was still to be read is gone, what was read ahead is not.
         assert next(frames).index == 1
+
+
+# ---- alternating exposures ----
+
+
+def test_exposures_in_turn(tmp_path: pathlib.Path) -> None:
+    write_folder(tmp_path, 5)
+    (tmp_path / "exposures.json").write_text("[0.01, 0.08]")
+    with open_source(tmp_path) as source:
+        assert source.exposures == (0.08, 0.01)
+        assert [frame.exposure_time for frame in source] == [0.01, 0.08, 0.01, 0.08, 0.01]
+    with open_source(tmp_path, exposures=(0.5,), loop=True) as source:  # instead of the sidecar's
+        frames = iter(source)
+        assert [next(frames).exposure_time for _ in range(7)] == [0.5] * 7
+    (tmp_path / "exposures.json").write_text("[0.01, 0.08, 0.04]")
+    with open_source(tmp_path, loop=True) as source:  # a new pass begins anew
+        frames = iter(source)
+        assert [next(frames).exposure_time for _ in range(7)] == [0.01, 0.08, 0.04, 0.01, 0.08, 0.01, 0.08]
+
+
+@pytest.mark.parametrize("exposures", [(0.01, 0.0), (-1.0,), (math.nan, 1.0)])
+def test_impossible_exposures(tmp_path: pathlib.Path, exposures: tuple[float, ...]) -> None:
+    with pytest.raises(UsageError, match="expected positive numbers of seconds"):
+        open_source(tmp_path, exposures=exposures)
+
+
+class Exposed(FakeCapture):
+    """A camera before a still scene that takes on an exposure ``late`` frames after it was asked."""
+
+    def __init__(self, late: int, *, backend: str = "V4L2", obeys: bool = True, room: float = 1.0) -> None:
+        super().__init__(10**6)
+        self.late, self.backend, self.obeys, self.room = late, backend, obeys, room
+        self.asked = [8e-3] * (late + 1)
+        self.scene = np.linspace(0.02, 1.3, 64 * 48).reshape(48, 64, 1) * np.ones(3)
+
+    def getBackendName(self) -> str:
+        return self.backend
+
+    def set(self, key: int, value: float) -> bool:
+        if key == cv2.CAP_PROP_EXPOSURE:
+            if not self.obeys:
+                return False
+            self.asked[-1] = 2.0**value if self.backend == "DSHOW" else value / 1e4
+        return True
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        time.sleep(0.002)
+        self.given += 1
+        self.asked.append(self.asked[-1])
+        now = self.asked.pop(0)
+        linear = np.clip(self.room * self.scene * now / 8e-3, 0, 1)
+        return True, np.rint(255 * np.clip(1.055 * linear ** (1 / 2.4) - 0.055, 0, 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("late", "backend"), [(0, "V4L2"), (2, "DSHOW"), (6, "V4L2")])
+def test_device_alternates_and_knows_what_it_shows(late: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However late the camera follows, no picture is taken for one of another exposure."""
+    monkeypatch.setattr("warp_ar.sources.BRACKET_SECONDS", 0.02)
+    capture = Exposed(late, backend=backend)
+    with CaptureDevice(0, exposures=(1e-3, 8e-3), opener=lambda _: capture) as source:
+        assert source.exposures == (8e-3, 1e-3)
+        seen = []
+        for frame in source:
+            assert frame.exposure_time is not None
+            brightness = float(frame.image.mean())
+            assert (brightness > 120) == (frame.exposure_time == 8e-3), (frame.index, brightness)
+            seen.append(frame.exposure_time)
+            if seen.count(1e-3) == 3:
+                break
+    assert seen[0] == 8e-3
+
+
+def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lamp that is switched off while the exposure changes is not taken for an exposure forever."""
+    monkeypatch.setattr("warp_ar.sources.BRACKET_SECONDS", 0.02)
+    capture = Exposed(1)
+    with CaptureDevice(0, exposures=(8e-3, 2e-3), opener=lambda _: capture) as source:
+        frames = iter(source)
+        while next(frames).exposure_time != 2e-3:
+            pass
+        capture.room = 0.24
+        seen = [next(frames).exposure_time for _ in range(40)]
+    assert {8e-3, 2e-3} <= set(seen)
+
+
+@pytest.mark.parametrize("stuck", [True, False])
+def test_device_whose_exposure_cannot_be_set(stuck: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("warp_ar.sources.BRACKET_SECONDS", 0.02)
+    if stuck:  # it says yes, and nothing happens
+        capture = Exposed(0)
+        monkeypatch.setattr(capture, "set", lambda key, value: True)
+        with CaptureDevice(0, exposures=(8e-3, 1e-3), opener=lambda _: capture) as source:
+            assert "does not follow its exposure" in take_until_error(source)[1]
+        return
+    with pytest.raises(SourceError, match="does not let its exposure be set"):
+        CaptureDevice(0, exposures=(8e-3, 1e-3), opener=lambda _: Exposed(0, obeys=False))
+    with pytest.raises(UsageError, match=r"1\.8 times"):
+        CaptureDevice(0, exposures=(8e-3, 7e-3), opener=lambda _: Exposed(0))
+
+
+def test_a_slow_reader_gets_the_rare_exposure() -> None:
+    newest = sources._Newest()
+    for stamp, exposure in ((0.0, 8.0), (1.0, 8.0), (2.0, 1.0), (3.0, 8.0), (4.0, 8.0)):
+        newest.put(np.zeros((1, 1, 3), np.uint8), stamp, exposure)
+    taken = [newest.take()[1:] for _ in range(2)]  # type: ignore[index]
+    assert taken == [(2.0, 1.0), (4.0, 8.0)]
+    assert newest.dropped == 3

@@ -407,6 +407,7 @@ class AutoPipeline:
         device: str = "auto",
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
+        exposures: Sequence[float] = (),
         bands: int | None = None,
         costs: Costs | None = None,
         folder: Path | None = None,
@@ -420,6 +421,7 @@ class AutoPipeline:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             size: Width and height of the frames; None means the scene's.
             outputs: What results shall hold.
+            exposures: As for ``Pipeline``.
             bands: Bands of rows per CPU pass; None means one per core.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
@@ -432,7 +434,13 @@ class AutoPipeline:
         if not budget_ms > 0.0:
             raise UsageError(f"a budget of {budget_ms} ms is none; expected a number above 0")
         self.budget_ms = budget_ms
-        self._arguments: dict[str, Any] = {"device": device, "size": size, "outputs": outputs, "bands": bands}
+        self._arguments: dict[str, Any] = {
+            "device": device,
+            "size": size,
+            "outputs": outputs,
+            "exposures": tuple(exposures),
+            "bands": bands,
+        }
         self._given, self._folder, self._clock = scene, folder or cache_folder(), clock
         self._errors = load_errors()
         self._builder = ThreadPoolExecutor(1, "warp_ar-build")
@@ -501,12 +509,21 @@ class AutoPipeline:
         """Named arrays of the pipeline that lit the last frame."""
         return self._now.arrays
 
-    def __call__(self, image: Any, *, time_seconds: float | None = None, pose: Pose | None = None) -> Result:
+    def __call__(
+        self,
+        image: Any,
+        *,
+        time_seconds: float | None = None,
+        pose: Pose | None = None,
+        exposure_time: float | None = None,
+    ) -> Result:
         """Light one frame; arguments, result and errors are those of ``Pipeline``."""
         self._swap()
-        result = self._now(image, time_seconds=time_seconds, pose=pose)
+        result = self._now(image, time_seconds=time_seconds, pose=pose, exposure_time=exposure_time)
         found = pose if pose is not None else result.pose
         self._frames += 1
+        if not result.shown:
+            return result
         if self._now.plan.needs("pose") and found is None:
             return result
         if self._controller is None:

@@ -11,7 +11,7 @@ from warp_ar.stages import STAGES
 from warp_ar.stages.base import LeftOut, Request, Stage, Wiring
 
 # What the pipeline itself provides for every frame.
-INPUTS = ("frame", "pose", "lights", "objects", "exposure", "clock")
+INPUTS = ("frame", "pose", "lights", "objects", "exposure", "clock", "short_frames")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from types import TracebackType
 from typing import Any, cast
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ar.bracket import ShortFrames, bracket_ratios, brightened, find_exposure
 from warp_ar.device import exclusive, resolve_device
 from warp_ar.errors import UsageError
 from warp_ar.frame_block import FrameBlock
@@ -55,6 +56,8 @@ class Result:
     """Milliseconds of every stage of the plan, and whether it was skipped."""
     download: Future[npt.NDArray[np.uint8]] | None = None
     """The lit frame on its way to the host, where it was sent ahead."""
+    shown: bool = True
+    """False: the frame has another exposure than the shown ones; it only told of the light, the picture is the last."""
 
     @functools.cached_property
     def image(self) -> npt.NDArray[np.uint8]:
@@ -102,6 +105,7 @@ class Pipeline:
         quality: str | Quality = DEFAULT_PRESET,
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
+        exposures: Sequence[float] = (),
         bands: int | None = None,
         profile: bool = False,
     ) -> None:
@@ -113,6 +117,8 @@ class Pipeline:
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            exposures: Exposure times in seconds between which the frames alternate. Frames of the longest are lit and
+                shown; the others tell what clips in it.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
 
@@ -125,17 +131,24 @@ class Pipeline:
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
         self.quality = resolve_quality(quality)
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs))
+        self._longest = max(exposures, default=1.0)
+        ratios = bracket_ratios(exposures)
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
         self._last_time = 0.0
+        self._lit_time = 0.0
         self._index = 0
+        self._shown: Any = None
         self._has_light = False
         self._arrays = Arrays()
+        self._short: ShortFrames | None = None
         with exclusive(self.device):
             with wp.ScopedDevice(self.device):
                 self._add_inputs()
             self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+            if self.plan.needs("short_frames"):
+                self._short = ShortFrames(self.plan.request, self._arrays, self.device)
 
     def __enter__(self) -> Pipeline:
         return self
@@ -170,14 +183,15 @@ class Pipeline:
         self._frame = wp.zeros((height, width), dtype=wp.vec3ub, device=device)
         self._transfers = None if device.is_cpu else Transfers((height, width), device)
         add = self._arrays.add
-        for name in ("pose", "lights", "objects", "exposure", "clock"):
+        for name in ("pose", "lights", "objects", "exposure", "clock", "short_frames"):
             add(name, None)
         add("frame", self._frame)
         add("params", self._block.device_array("params"))
         add("light_array", self._block.device_array("lights"))
         add("ray_scene", self._host_scene.ray_scene)
         add("probes", wp.array(self._probe_values(), dtype=Probe, device=device))
-        add("decode", wp.array(decode_table(self.camera.transfer), dtype=wp.vec3, device=device))
+        self._decode = decode_table(self.camera.transfer)
+        add("decode", wp.array(self._decode, dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=device))
         add("rays", wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device))
         self._object_rows = (0, height)
@@ -231,12 +245,15 @@ class Pipeline:
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
-        self._start_time, self._last_time = other._start_time, other._last_time
+        self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
+        self._shown = other._shown
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         with exclusive(self.device):
             self._take_light(other)
             self._scheduler.continue_from(other._scheduler)
+        if self._short is not None and other._short is not None:
+            self._short.resume(other._short)
 
     def _take_light(self, other: Pipeline) -> None:
         kept = [name for name in LIGHT_ARRAYS if name in self._arrays and name in other._arrays]
@@ -263,7 +280,12 @@ class Pipeline:
         return values
 
     def submit(
-        self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None, pose: Pose | None = None
+        self,
+        image: npt.NDArray[np.uint8] | Any,
+        *,
+        time_seconds: float | None = None,
+        pose: Pose | None = None,
+        exposure_time: float | None = None,
     ) -> Result:
         """Light one frame without waiting for it: on CUDA its picture is sent ahead, and waited for when it is read.
 
@@ -271,7 +293,7 @@ class Pipeline:
         run side by side. The device's own arrays of a result still hold only until the next frame. Arguments as those
         of a call.
         """
-        result = self(image, time_seconds=time_seconds, pose=pose)
+        result = self(image, time_seconds=time_seconds, pose=pose, exposure_time=exposure_time)
         if self._transfers is None or not isinstance(result.image_array, wp.array):
             _ = result.image  # kept: the next frame writes the same array
             return result
@@ -279,7 +301,12 @@ class Pipeline:
             return dataclasses.replace(result, download=self._transfers.download(result.image_array))
 
     def __call__(
-        self, image: npt.NDArray[np.uint8] | Any, *, time_seconds: float | None = None, pose: Pose | None = None
+        self,
+        image: npt.NDArray[np.uint8] | Any,
+        *,
+        time_seconds: float | None = None,
+        pose: Pose | None = None,
+        exposure_time: float | None = None,
     ) -> Result:
         """Light one frame.
 
@@ -288,6 +315,7 @@ class Pipeline:
                 pipeline's device, which is used without a copy to the host unless the marker must be found.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
             pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
+            exposure_time: Seconds; None means the longest of the pipeline's exposures.
 
         Raises:
             UsageError: The image has another size or type.
@@ -295,7 +323,10 @@ class Pipeline:
         host_image = self._accept(image)
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:
-            self._start_time = self._last_time = now
+            self._start_time = self._last_time = self._lit_time = now
+        exposure = find_exposure(exposure_time, self._longest, self.plan.request.exposures)
+        if exposure > 0:
+            return self._take_short(image, host_image, exposure, now, pose)
         timings: dict[str, StageTiming] = {}
         state: TrackState | None = None
         if self._tracker is not None and pose is None:
@@ -306,16 +337,49 @@ class Pipeline:
         lost = self._tracker is not None and pose is None
         if not lost:
             with exclusive(self.device):
+                if self._short is not None and self._short.refresh(now):
+                    self._has_light = False
                 self._set_frame_values(pose, now)
                 self._upload(image, host_image)
                 timings.update(self._scheduler.run())
             self._has_light = True
-        self._last_time = now
+        self._last_time = self._lit_time = now
         self._index += 1
         # A lost marker says nothing about where things are: the frame passes as it came, the last light is kept.
         lit = image if lost or "image" not in self._arrays else self._arrays["image"]
         light = self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
+        self._shown = lit
         return Result(lit, light, pose, state, timings)
+
+    def _take_short(
+        self,
+        image: Any,
+        host_image: npt.NDArray[np.uint8] | None,
+        exposure: int,
+        now: float,
+        pose: Pose | None,
+    ) -> Result:
+        """Let a frame of another exposure tell of the light; the picture stays."""
+        timings: dict[str, StageTiming] = {}
+        state: TrackState | None = None
+        bright: Any = image
+        if self._shown is None or (self._tracker is not None and pose is None):
+            picture = image.numpy() if host_image is None else host_image
+            bright = brightened(picture, self._decode, self.plan.request.exposures[exposure])
+        if self._tracker is not None and pose is None:
+            start = time.perf_counter()
+            track = self._tracker.track(bright, now)
+            timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
+            pose, state = track.pose, track.state
+        if self._short is not None and pose is not None:
+            start = time.perf_counter()
+            with exclusive(self.device):
+                self._short.take(image, exposure, pose, self._block.host("params"), now)
+            timings["unwrap"] = StageTiming((time.perf_counter() - start) * 1e3, False)
+        self._last_time = now
+        shown = bright if self._shown is None else self._shown
+        light = self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
+        return Result(shown, light, pose, state, timings, shown=False)
 
     def _accept(self, image: Any) -> npt.NDArray[np.uint8] | None:
         width, height = self.size
@@ -365,7 +429,7 @@ class Pipeline:
                 params["shadow_rect"] = self._host_scene.shadow_rect(pose, self.camera)
                 self._shadow_rows = (int(params["shadow_rect"][0][0]), int(params["shadow_rect"][0][1]))
         params["time"] = now - (self._start_time or 0.0)
-        params["time_step"] = max(now - self._last_time, 0.0)
+        params["time_step"] = max(now - self._lit_time, 0.0)
         params["frame_index"] = self._index
         params["environment_reset"] = int(not self._has_light)
         self._block.upload()

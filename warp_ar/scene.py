@@ -124,6 +124,8 @@ class SourceSpec:
     """Name of a generated source."""
     fps: float | None = None
     """Frames per second; the source's own if left out."""
+    exposures: tuple[float, ...] | None = None
+    """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -665,6 +667,9 @@ def _read_source(table: _Table) -> SourceSpec:
         camera=table.integer("camera", low=0, high=1023) if "camera" in table else None,
         synthetic=table.text("synthetic", right="the name of a generated source") if "synthetic" in table else None,
         fps=table.number("fps", low=1e-3, high=1e5, unit="frames per second") if "fps" in table else None,
+        exposures=table.vector("exposures", sizes=range(2, 9), low=1e-6, high=1e3, unit="seconds")
+        if "exposures" in table
+        else None,
     )
 
 

@@ -69,18 +69,29 @@ class Session:
             if spec is None:
                 raise UsageError(f"scene {self.scene.name!r} names no source; give one with --source")
             chosen = _where(spec)
-        fps = self.scene.source.fps if self.scene.source is not None and source is None else None
-        self.source: Source = open_source(chosen, fps=fps, loop=loop)
+        own = self.scene.source if source is None else None
+        fps, exposures = (own.fps, own.exposures or ()) if own is not None else (None, ())
+        self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
         try:
             self.pipeline: Pipeline | AutoPipeline
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
                 self.pipeline = AutoPipeline(
-                    self.scene, budget_ms=budget, device=device, size=self.source.size, outputs=outputs
+                    self.scene,
+                    budget_ms=budget,
+                    device=device,
+                    size=self.source.size,
+                    outputs=outputs,
+                    exposures=self.source.exposures,
                 )
             else:
                 self.pipeline = Pipeline(
-                    self.scene, device=device, quality=quality, size=self.source.size, outputs=outputs
+                    self.scene,
+                    device=device,
+                    quality=quality,
+                    size=self.source.size,
+                    outputs=outputs,
+                    exposures=self.source.exposures,
                 )
         except BaseException:
             self.source.close()
@@ -103,13 +114,14 @@ class Session:
         pipeline = self.pipeline
         if pipeline.device.is_cpu or self.source.live or "environment" in pipeline.plan.request.outputs:
             for frame in self.source:
-                yield frame, pipeline(frame.image, time_seconds=frame.time)
+                yield frame, pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out, so that reading a picture does not hold up the next frame.
         ready: list[tuple[Frame, Result]] = []
         try:
             for frame in self.source:
-                ready.append((frame, pipeline.submit(frame.image, time_seconds=frame.time)))
+                result = pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                ready.append((frame, result))
                 if len(ready) > 1:
                     yield ready.pop(0)
         except WarpArError:

@@ -7,6 +7,10 @@ one frame, the newest, because a late frame is worth less than none; what it ski
 Pictures of other kinds are brought to 8-bit RGB: grey is repeated, alpha is dropped without blending (a camera's colour
 does not depend on it), 16-bit values v become round(v / 257), so that 65535 is 255. An orientation that an image or a
 video carries is applied.
+
+Frames may alternate between exposures, of which only one is shown: the others tell what clips in it. A folder says so
+in its sidecar, ``exposures.json``; any recording by a list of times that its frames have in turn; a capture device is
+asked for them, and each of its pictures is measured, because devices follow some frames late.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ import contextlib
 import dataclasses
 import difflib
 import functools
+import itertools
 import json
 import math
 import pathlib
@@ -24,7 +29,7 @@ import threading
 import time
 import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -54,13 +59,25 @@ IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".
 """What `FrameFolder` takes for a frame; other files in a folder are ignored."""
 
 SIDECAR = "exposures.json"
-"""Optional file in a frame folder: ``{"0000.png": 0.008, ...}``, seconds of exposure by file name."""
+"""Optional file in a frame folder, seconds of exposure: ``{"0000.png": 0.008, ...}`` by file name, or ``[0.016,
+0.001]``, which frames have in turn."""
 
 DEFAULT_FPS = 30.0
 """Rate of a folder of frames, or of a device that does not tell, in frames per second."""
 
 FRAMES_AHEAD = 4
 """How many frames a recorded source decodes before they are asked for."""
+
+BRACKET_SECONDS = 0.4
+"""How often a capture device is asked for its other exposures, during which the picture stands still."""
+SETTLE_FRAMES = 5
+"""Frames after which a device is expected to have taken on its first exposure."""
+MOST_WAIT = 12
+"""Frames within which a device must have taken on another."""
+MOST_MISSES = 3
+"""Times in a row that it may fail to."""
+LEAST_RATIO = 1.8
+"""Of neighbouring exposures of a device: nearer ones cannot be told apart by what they show."""
 
 HD_HEIGHT = 720
 """Rows from which a video that names no colour matrix is BT.709; below, BT.601: what players do, and encoders
@@ -105,6 +122,9 @@ class Source(ABC):
     description: str
     """One line for people."""
 
+    exposures: tuple[float, ...] = ()
+    """All exposure times of its frames in seconds, longest first; empty where it does not tell."""
+
     @property
     def dropped(self) -> int:
         """Frames that were skipped because a newer one had come; 0 unless live."""
@@ -127,7 +147,9 @@ class Source(ABC):
         self.close()
 
 
-def open_source(spec: str | int | pathlib.Path, *, fps: float | None = None, loop: bool = False) -> Source:
+def open_source(
+    spec: str | int | pathlib.Path, *, fps: float | None = None, loop: bool = False, exposures: Sequence[float] = ()
+) -> Source:
     """Open whatever ``spec`` names.
 
     Args:
@@ -136,23 +158,26 @@ def open_source(spec: str | int | pathlib.Path, *, fps: float | None = None, loo
         fps: Frames per second: the rate of a folder (default 30), a new rate for a video's frames, or what is asked of
             a device.
         loop: Start again at the end, with index and time going on. Without effect on live sources.
+        exposures: Exposure times in seconds that frames have in turn: those of a recording, or to be asked of a device.
 
     Raises:
         SourceError: There is no such source, or it cannot be read.
-        UsageError: ``fps`` is not a positive number, or there is no generated source of that name.
+        UsageError: ``fps`` is not a positive number, ``exposures`` are no times, or there is no generated source of
+            that name.
     """
     _check_fps(fps)
+    _check_exposures(exposures)
     text = str(spec)
     if isinstance(spec, int) or (text.isdecimal() and not pathlib.Path(text).exists()):
-        return CaptureDevice(int(spec) if isinstance(spec, int) else int(text), fps=fps)
+        return CaptureDevice(int(spec) if isinstance(spec, int) else int(text), fps=fps, exposures=exposures)
     if text.startswith("synthetic:"):
         return Synthetic(text.removeprefix("synthetic:"), fps=fps or DEFAULT_FPS, loop=loop)
     if "://" in text:
-        return CaptureDevice(text, fps=fps)
+        return CaptureDevice(text, fps=fps, exposures=exposures)
     path = _existing(pathlib.Path(spec))
     if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
-        return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop)
-    return VideoFile(path, fps=fps, loop=loop)
+        return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop, exposures=exposures)
+    return VideoFile(path, fps=fps, loop=loop, exposures=exposures)
 
 
 # ----------------------------------------------------------------------------------------------------- recorded sources
@@ -163,7 +188,10 @@ class _RecordedSource(Source):
 
     live = False
 
-    def __init__(self, *, loop: bool) -> None:
+    def __init__(self, *, loop: bool, exposures: Sequence[float] = ()) -> None:
+        _check_exposures(exposures)
+        self._cycle = tuple(map(float, exposures))
+        self.exposures = _distinct(self._cycle)
         self._loop = loop
         self._closed = False
         self._running: weakref.WeakSet[Generator[Frame, None, None]] = weakref.WeakSet()
@@ -190,7 +218,8 @@ class _RecordedSource(Source):
             with contextlib.closing(self._decode()) as frames:
                 for frame in frames:
                     last = start + frame.time
-                    yield dataclasses.replace(frame, index=index, time=last)
+                    exposure = self._cycle[frame.index % len(self._cycle)] if self._cycle else frame.exposure_time
+                    yield dataclasses.replace(frame, index=index, time=last, exposure_time=exposure)
                     index += 1
             if not self._loop:
                 return
@@ -221,13 +250,21 @@ class FrameFolder(_RecordedSource):
         path: The folder or image.
         fps: Frames per second; frame n is shown at n / fps.
         loop: Start again at the end.
+        exposures: Exposure times in seconds that images have in turn, instead of what ``exposures.json`` says.
 
     Raises:
         SourceError: The path does not exist, holds no image, its first image or its ``exposures.json`` cannot be used.
     """
 
-    def __init__(self, path: str | pathlib.Path, *, fps: float = DEFAULT_FPS, loop: bool = False) -> None:
-        super().__init__(loop=loop)
+    def __init__(
+        self,
+        path: str | pathlib.Path,
+        *,
+        fps: float = DEFAULT_FPS,
+        loop: bool = False,
+        exposures: Sequence[float] = (),
+    ) -> None:
+        super().__init__(loop=loop, exposures=exposures)
         _check_fps(fps)
         path = _existing(pathlib.Path(path))
         folder = path if path.is_dir() else path.parent
@@ -237,7 +274,12 @@ class FrameFolder(_RecordedSource):
             self._paths = [path / name for name in sorted(images, key=_natural_key)]
         if not self._paths:
             raise SourceError(f"{path} holds no images; put frames there as {', '.join(sorted(IMAGE_SUFFIXES))}")
-        self._exposures = _read_exposures(folder)
+        told = _read_exposures(folder)
+        self._exposures = told if isinstance(told, dict) else {}
+        if isinstance(told, tuple):
+            self._cycle = self._cycle or told
+        shown = [self._exposures[path.name] for path in self._paths if path.name in self._exposures]
+        self.exposures = _distinct(self._cycle or shown)
         height, width, _ = _read_image(self._paths[0]).shape
         self.size, self.fps, self.length = (width, height), fps, len(self._paths)
         self.description = f"{path} ({self.length} images, {width}x{height})"
@@ -259,13 +301,21 @@ class VideoFile(_RecordedSource):
         path: The file.
         fps: Show frame n at n / fps instead of at its own time.
         loop: Start again at the end.
+        exposures: Exposure times in seconds that frames have in turn.
 
     Raises:
         SourceError: The file does not exist, is no video, or its first frame cannot be decoded.
     """
 
-    def __init__(self, path: str | pathlib.Path, *, fps: float | None = None, loop: bool = False) -> None:
-        super().__init__(loop=loop)
+    def __init__(
+        self,
+        path: str | pathlib.Path,
+        *,
+        fps: float | None = None,
+        loop: bool = False,
+        exposures: Sequence[float] = (),
+    ) -> None:
+        super().__init__(loop=loop, exposures=exposures)
         _check_fps(fps)
         self._path = _existing(pathlib.Path(path))
         self._retimed = fps is not None
@@ -456,22 +506,25 @@ class Synthetic(_RecordedSource):
 
 
 class _Newest:
-    """A slot for one picture and its time: putting replaces what was not taken, and counts it as dropped."""
+    """Slots for one picture, its time and its exposure each: putting replaces what was not taken, and counts that.
+
+    Every exposure has a slot of its own: a reader that is slower than the camera must not miss the rare short one.
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._item: tuple[Image, float] | None = None
+        self._items: dict[float | None, tuple[Image, float]] = {}
         self._error: SourceError | None = None
         self._closed = False
         self.dropped = 0
 
-    def put(self, image: Image, time: float) -> bool:
+    def put(self, image: Image, time: float, exposure: float | None = None) -> bool:
         """Offer a picture; False if the slot is closed."""
         with self._changed:
             if self._closed:
                 return False
-            self.dropped += self._item is not None
-            self._item = (image, time)
+            self.dropped += self._items.pop(exposure, None) is not None
+            self._items[exposure] = (image, time)
             self._changed.notify_all()
             return True
 
@@ -482,14 +535,16 @@ class _Newest:
                 self._closed, self._error = True, error
             self._changed.notify_all()
 
-    def take(self) -> tuple[Image, float] | None:
-        """Wait for a picture; None at the end."""
+    def take(self) -> tuple[Image, float, float | None] | None:
+        """Wait for a picture, of several the oldest; None at the end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._item is not None or self._closed)
-            item, self._item = self._item, None
-            if item is None and self._error is not None:
+            self._changed.wait_for(lambda: bool(self._items) or self._closed)
+            if self._items:
+                exposure = next(iter(self._items))
+                return (*self._items.pop(exposure), exposure)
+            if self._error is not None:
                 raise self._error
-            return item
+            return None
 
 
 class _LiveSource(Source):
@@ -508,10 +563,10 @@ class _LiveSource(Source):
     def __iter__(self) -> Iterator[Frame]:
         """The newest frame each time, waiting for one that has not been seen; ends when the source is closed."""
         while (item := self._newest.take()) is not None:
-            image, stamp = item
+            image, stamp, exposure = item
             if self._index == 0:
                 self._start = stamp
-            frame = Frame(self._index, stamp - self._start, image)
+            frame = Frame(self._index, stamp - self._start, image, exposure)
             self._index += 1
             yield frame
 
@@ -559,8 +614,93 @@ class _Capture(Protocol):
     def isOpened(self) -> bool: ...
     def read(self) -> tuple[bool, npt.NDArray[Any] | None]: ...
     def get(self, key: int, /) -> float: ...
+    def getBackendName(self) -> str: ...
     def set(self, key: int, value: float, /) -> bool: ...
     def release(self) -> None: ...
+
+
+class _Bracketing:
+    """Asks a device for one exposure after another, and knows which of them a picture was taken with.
+
+    A device takes some frames to follow. How bright a picture is, against the last one of the longest exposure, says
+    whether it has: over the pixels that are well exposed there, the ratio of linear values is that of the times.
+    """
+
+    def __init__(self, capture: _Capture, exposures: tuple[float, ...], name: str) -> None:
+        self._capture, self.exposures, self._name = capture, exposures, name
+        backend = capture.getBackendName()
+        self._logarithmic = backend in ("DSHOW", "MSMF")
+        capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 0.25 if self._logarithmic else 1.0)
+        self._reference: npt.NDArray[np.float32] | None = None
+        self._asked, self._waited, self._settled = 0, 0, False
+        self._misses, self._since = 0, 0.0
+        self._ask(0)
+
+    def _ask(self, index: int) -> None:
+        """Ask for an exposure: drivers of Windows take the logarithm of seconds, others ten-thousandths of one."""
+        seconds = self.exposures[index]
+        value = math.log2(seconds) if self._logarithmic else 1e4 * seconds
+        if not self._capture.set(cv2.CAP_PROP_EXPOSURE, value):
+            raise SourceError(
+                f"{self._name} does not let its exposure be set to {seconds:g} s; leave exposures out of [source]"
+            )
+        self._asked, self._waited, self._settled = index, 0, False
+
+    def label(self, image: Image, now: float) -> float | None:
+        """Exposure of a picture in seconds; None while the device is between two.
+
+        Raises:
+            SourceError: The device does not follow.
+        """
+        sparse = _DECODE[image[::8, ::8]]
+        if not self._settled:
+            self._waited += 1
+            if self._reference is None:
+                self._settled = self._waited > SETTLE_FRAMES
+            else:
+                self._settled = self._shows(sparse)
+            if not self._settled:
+                if self._reference is not None and self._waited >= MOST_WAIT:
+                    self._give_up(now)
+                return None
+        seconds = self.exposures[self._asked]
+        if self._asked == 0:
+            if self._reference is None:
+                self._since = now
+            self._reference = sparse
+            if now - self._since >= BRACKET_SECONDS:
+                self._ask(1)
+        else:
+            self._misses, self._since = 0, now
+            self._ask((self._asked + 1) % len(self.exposures))
+        return seconds
+
+    def _give_up(self, now: float) -> None:
+        """The device is late, or the room's light has changed meanwhile: begin anew with the longest exposure."""
+        self._misses += self._asked != 0
+        if self._misses >= MOST_MISSES:
+            raise SourceError(
+                f"{self._name} does not follow its exposure: asked for {self.exposures[self._asked]:g} s, the picture "
+                "is no darker; leave exposures out of [source]"
+            )
+        self._ask(0)
+        self._since, self._reference = now, None
+
+    def _shows(self, sparse: npt.NDArray[np.float32]) -> bool:
+        """Whether a picture is as bright as the exposure that was asked for makes it, rather than another."""
+        assert self._reference is not None
+        well = (self._reference > 0.05) & (self._reference < 0.9)
+        if well.sum() < 30:
+            return self._waited > SETTLE_FRAMES  # too dark a room to tell
+        ratio = float(sparse[well].sum() / self._reference[well].sum())
+        if ratio <= 0.0:
+            return self._asked == len(self.exposures) - 1
+        steps = [abs(math.log(ratio * self.exposures[0] / seconds)) for seconds in self.exposures]
+        return int(np.argmin(steps)) == self._asked
+
+
+_DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
+"""About what any camera's codes mean in linear light: ratios of some powers of two need no better."""
 
 
 class CaptureDevice(_LiveSource):
@@ -570,11 +710,13 @@ class CaptureDevice(_LiveSource):
         device: Index of the device, or the URL of a stream.
         fps: Rate to ask the device for, in frames per second.
         grace: Seconds without a frame after which the device counts as unplugged.
+        exposures: Exposure times in seconds between which to alternate: mostly the longest, the others now and then.
         opener: Makes the capture; another one serves tests and unusual backends.
 
     Raises:
-        SourceError: The device cannot be opened or gives no frame; while iterating, it has been unplugged or changed
-            its size.
+        SourceError: The device cannot be opened, gives no frame or does not let its exposure be set; while iterating,
+            it has been unplugged, changed its size or does not follow its exposure.
+        UsageError: ``exposures`` are too near each other to be told apart.
     """
 
     def __init__(
@@ -583,12 +725,21 @@ class CaptureDevice(_LiveSource):
         *,
         fps: float | None = None,
         grace: float = 2.0,
+        exposures: Sequence[float] = (),
         opener: Callable[[Any], _Capture] = cv2.VideoCapture,
     ) -> None:
         super().__init__()
         _check_fps(fps)
         self._name = f"capture device {device}" if isinstance(device, int) else str(device)
         self._grace = grace
+        _check_exposures(exposures)
+        self.exposures = _distinct(exposures)
+        if any(longer < LEAST_RATIO * shorter for longer, shorter in itertools.pairwise(self.exposures)):
+            raise UsageError(
+                f"exposures {', '.join(f'{e:g}' for e in self.exposures)} of {self._name}: expected each to be "
+                f"{LEAST_RATIO:g} times the next or more"
+            )
+        self._bracketing: _Bracketing | None = None
         self._stop = threading.Event()
         self._capture = opener(device)
         try:
@@ -599,6 +750,8 @@ class CaptureDevice(_LiveSource):
             first = self._read()
             if first is None:
                 raise SourceError(f"{self._name} opened but gave no frame; is another program using it?")
+            if len(self.exposures) > 1:
+                self._bracketing = _Bracketing(self._capture, self.exposures, self._name)
         except BaseException:
             self._capture.release()
             raise
@@ -606,7 +759,8 @@ class CaptureDevice(_LiveSource):
         told = self._capture.get(cv2.CAP_PROP_FPS)
         self.fps = told if math.isfinite(told) and told > 0 else fps or DEFAULT_FPS
         self.description = f"{self._name} ({self.size[0]}x{self.size[1]}, {self.fps:g} fps)"
-        self._newest.put(first, time.monotonic())
+        if self._bracketing is None:
+            self._newest.put(first, time.monotonic())
         self._thread = threading.Thread(target=self._run, name="warp-ar-capture", daemon=True)
         self._thread.start()
 
@@ -632,13 +786,18 @@ class CaptureDevice(_LiveSource):
                         error = SourceError(f"{self._name} gave no frame for {self._grace:g} s; was it unplugged?")
                     break
                 _check_size(image, self.size, self._name, None)
+                now, exposure = time.monotonic(), None
+                if self._bracketing is not None:
+                    exposure = self._bracketing.label(image, now)
+                    if exposure is None:
+                        continue
             except SourceError as problem:
                 error = problem
                 break
             except cv2.error as problem:
                 error = SourceError(f"{self._name}: {_reason(problem)}")
                 break
-            self._newest.put(image, time.monotonic())
+            self._newest.put(image, now, exposure)
         self._newest.close(error)
 
     def close(self) -> None:
@@ -698,8 +857,18 @@ def _check_fps(fps: float | None) -> None:
         raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
 
 
-def _read_exposures(folder: pathlib.Path) -> dict[str, float]:
-    """Exposure in seconds by file name, from the folder's sidecar; empty where there is none."""
+def _check_exposures(exposures: Sequence[float]) -> None:
+    if not all(math.isfinite(seconds) and seconds > 0 for seconds in exposures):
+        raise UsageError(f"exposures {', '.join(map(str, exposures))}: expected positive numbers of seconds")
+
+
+def _distinct(exposures: Iterable[float]) -> tuple[float, ...]:
+    """Every exposure once, longest first."""
+    return tuple(sorted(set(map(float, exposures)), reverse=True))
+
+
+def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:
+    """Exposures in seconds by file name or in turn, from the folder's sidecar; empty where there is none."""
     path = folder / SIDECAR
     if not path.exists():
         return {}
@@ -707,16 +876,21 @@ def _read_exposures(folder: pathlib.Path) -> dict[str, float]:
         table = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise SourceError(f"{path} cannot be read: {_reason(error)}") from error
-    if not isinstance(table, dict):
-        raise SourceError(f'{path} must hold an object such as {{"0000.png": 0.008}}, seconds by file name')
+    if not isinstance(table, dict | list) or not table:
+        raise SourceError(
+            f'{path} must hold an object such as {{"0000.png": 0.008}}, seconds by file name, or a list such as '
+            "[0.016, 0.001], seconds that frames have in turn"
+        )
     names = _names(folder)
-    for name, seconds in table.items():
-        if name not in names:
+    for name, seconds in table.items() if isinstance(table, dict) else enumerate(table):
+        if isinstance(name, str) and name not in names:
             hint = _nearest(name, names)
             advice = f"did you mean {hint!r}?" if hint else "it must name files beside it"
             raise SourceError(f"{path} names {name!r}, which is not there; {advice}")
         if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds < math.inf:
             raise SourceError(f"{path}: {name!r} is {seconds!r}; it must be a positive number of seconds")
+    if isinstance(table, list):
+        return tuple(map(float, table))
     return {name: float(seconds) for name, seconds in table.items()}
 
 

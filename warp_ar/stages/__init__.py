@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Stage
+from warp_ar.stages.bracket import Bracket
 from warp_ar.stages.composite import Composite
 from warp_ar.stages.declip import Declip
 from warp_ar.stages.diffuse import Diffuse
@@ -23,6 +24,7 @@ from warp_ar.stages.visibility import Visibility
 
 STAGES: tuple[type[Stage], ...] = (
     Unwrap,
+    Bracket,
     Accumulate,
     Fill,
     Recover,

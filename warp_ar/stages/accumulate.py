@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import environment
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.bracket import UNWRAPPED, merges
 from warp_ar.stages.unwrap import NO_PROBE
 
 
@@ -25,8 +26,9 @@ class Accumulate(Stage):
         """Needs a mirror ball."""
         if not request.scene.probes:
             return LeftOut(NO_PROBE)
+        seen = "merged" if merges(request) else "probe"
         return Wiring(
-            ("probe_radiance", "probe_confidence", "probe_clipped", "clock"),
+            (*(f"{seen}_{part}" for part in UNWRAPPED), "clock"),
             ("environment_radiance", "environment_confidence", "environment_clipped"),
         )
 
@@ -44,11 +46,12 @@ class Accumulate(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Change first, then the mean."""
         height = self.request.quality.environment_height
+        radiance, confidence, clipped = (arrays[name] for name in self.wiring.reads[:3])
 
         def measure(rows: Rows | None) -> None:
             environment.measure_change(
-                arrays["probe_radiance"],
-                arrays["probe_confidence"],
+                radiance,
+                confidence,
                 arrays["environment_radiance"],
                 arrays["environment_confidence"],
                 arrays["accumulate_change"],
@@ -57,9 +60,9 @@ class Accumulate(Stage):
 
         def accumulate(rows: Rows | None) -> None:
             environment.accumulate_environment(
-                arrays["probe_radiance"],
-                arrays["probe_confidence"],
-                arrays["probe_clipped"],
+                radiance,
+                confidence,
+                clipped,
                 arrays["accumulate_change"],
                 arrays["params"],
                 arrays["environment_radiance"],

@@ -30,6 +30,8 @@ class Request:
     """Width and height of the frames in pixels."""
     outputs: tuple[str, ...] = ("image",)
     """Names of the resources that the caller wants: ``image``, ``environment``, ``pose``."""
+    exposures: tuple[float, ...] = ()
+    """Exposures between which frames alternate, as ratios to the longest, which comes first; empty: only one."""
 
 
 @dataclasses.dataclass(frozen=True)

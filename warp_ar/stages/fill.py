@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,6 +10,7 @@ import warp as wp
 
 from warp_ar.kernels import environment
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.bracket import merges
 from warp_ar.stages.recover import recovers
 from warp_ar.stages.unwrap import NO_PROBE
 
@@ -44,6 +46,10 @@ class Fill(Stage):
         self._arrays = arrays
         self._on_cpu = device.is_cpu
         height = self.request.quality.environment_height
+        # What one exposure gives is no more than this. Of merged ones, lamps are spread into the unseen no further.
+        most = math.inf
+        if merges(self.request):
+            most = 1.0 / max(min(min(probe.reflectance) for probe in self.request.scene.probes), 1e-3)
 
         def seed(rows: Rows | None) -> None:
             environment.seed_fill(
@@ -51,7 +57,7 @@ class Fill(Stage):
             )
 
         def push_pull(rows: Rows | None) -> None:
-            environment.push_pull(arrays["fill_levels"], height, 2 * height)
+            environment.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
 
         def finish(rows: Rows | None) -> None:
             environment.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.auto_quality import AUTO
+from warp_ar.bracket import bracket_ratios
 from warp_ar.device import exclusive
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result, resolve_quality
@@ -90,6 +91,7 @@ class _Target:
     quality: Quality
     size: tuple[int, int]
     outputs: tuple[str, ...]
+    exposures: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -129,6 +131,7 @@ class _Slot:
             quality=target.quality,
             size=target.size,
             outputs=target.outputs,
+            exposures=target.exposures,
             profile=True,
         )
         pipeline.warm_up()
@@ -137,6 +140,7 @@ class _Slot:
     def _fits(self, pipeline: Pipeline, target: _Target) -> bool:
         request = pipeline.plan.request
         same = (request.quality, pipeline.size, request.outputs) == (target.quality, target.size, target.outputs)
+        same = same and request.exposures == bracket_ratios(target.exposures)
         return same and pipeline.update(target.scene)
 
     def follow(self, target: _Target, *, wait: bool = False) -> Pipeline | None:
@@ -362,7 +366,8 @@ class Host:
             return open_source(self._given_source, loop=True)
         if scene.source is None:
             raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
-        return open_source(_where(scene.source), fps=scene.source.fps, loop=True)
+        spec = scene.source
+        return open_source(_where(spec), fps=spec.fps, loop=True, exposures=spec.exposures or ())
 
     def _open_scene(self, name: str) -> None:
         if name not in bundled_scenes():
@@ -475,13 +480,16 @@ class Host:
     def _run_source(self, source: Source) -> None:
         due, previous = time.monotonic(), 0.0
         start: float | None = None
+        still: Frame | None = None
         for frame in source:
+            if still is None or frame.exposure_time in (None, *source.exposures[:1]):
+                still = frame  # a held picture is one of those that are shown
             if start is None:
                 start = self._base - frame.time  # the pipeline's clock never runs back
             if not source.live:
                 due = self._pace(due, max(frame.time - previous, 0.0))
                 previous = frame.time
-            if not (self._light_frame(frame, frame.time + start) and self._hold(frame, frame.time + start)):
+            if not (self._light_frame(frame, frame.time + start) and self._hold(still, frame.time + start)):
                 return
             if self._frames is not None and self._id >= self._frames:
                 self._stopped = True
@@ -521,7 +529,8 @@ class Host:
         scene = dataclasses.replace(self._wanted.shown_scene(), camera=self._feed.camera or self._wanted.scene.camera)
         # The page draws handles where things are: that takes the pose, even where no stage does.
         outputs = ("image", "pose") if self._wanted.scene.objects or self._wanted.scene.lights else ("image",)
-        return _Target(scene, self._wanted.shown_quality(), self._feed.source.size, outputs)
+        source = self._feed.source
+        return _Target(scene, self._wanted.shown_quality(), source.size, outputs, source.exposures)
 
     def _follow(self) -> Pipeline | None:
         """The pipeline for the next frame; what cannot be built is undone and told."""
@@ -564,7 +573,7 @@ class Host:
         pushed = [(when, stamp) for picture, when, stamp in tuple(self._pushed) if picture is frame.image]
         taken, stamp = pushed[0] if pushed else (time.monotonic(), None)
         start = time.perf_counter()
-        result = pipeline(frame.image, time_seconds=now)
+        result = pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time)
         image = result.image
         light_ms = (time.perf_counter() - start) * 1e3
         self._base = now + 1.0 / PLAY_RATE
@@ -601,7 +610,7 @@ class Host:
         pipeline = self._second.pipeline
         if pipeline is None or pipeline.size != (frame.image.shape[1], frame.image.shape[0]):
             return None
-        return pipeline(frame.image, time_seconds=now).image
+        return pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time).image
 
     def _look_at_light(self, pipeline: Pipeline) -> None:
         now = time.monotonic()

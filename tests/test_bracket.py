@@ -1,0 +1,376 @@
+"""Alternating exposures: true light from what each of them shows unclipped, and a picture that does not flicker."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+
+import imageio.v3
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.reference import bracket as reference
+from tests.reference import latlong as latlong_reference
+from tests.reference import probe as probe_reference
+from warp_ar.bracket import bracket_ratios, brightened, find_exposure
+from warp_ar.errors import SceneError
+from warp_ar.kernels import bracket
+from warp_ar.kernels.color import decode_table
+from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS
+from warp_ar.scene import (
+    Camera,
+    Marker,
+    MirrorMaterial,
+    Object,
+    Probe,
+    Proxy,
+    Scene,
+    SourceSpec,
+    dumps_scene,
+    loads_scene,
+)
+from warp_ar.session import Session
+from warp_ar.sources import Synthetic
+from warp_ar.tracking import Pose
+
+TWIN = 2e-6
+"""Float32 weights and means: a dozen roundings."""
+ROOM = 0.01
+"""Irradiance of the rendered room, relative: codes of 8 bits, and lamps spread over texels of 2.8 degrees; measured
+0.0052."""
+ROOM_TRACKED = 0.03
+"""The same with poses that put the ball a third of a pixel off; measured 0.020."""
+CLIPPED_LOSES = 0.7
+"""What the longest exposure alone loses there at the least; measured 0.86."""
+RATIOS = (1.0, 1.0 / 16.0, 1.0 / 256.0)
+CENTER, RADIUS, REFLECTANCE = (-0.1, 0.03, 0.035), 0.035, (0.85, 0.8, 0.9)
+SIZE = (320, 240)
+
+
+def merge(ratios, radiance, confidence, clipped, *, trust=None, rows=None, reach=bracket.REACH):
+    """All three outputs of the launchers."""
+    count, height, width, _ = radiance.shape
+    values = np.zeros(count, np.dtype(bracket.BracketExposure.numpy_dtype()))
+    values["ratio"], values["trust"] = ratios, np.ones(count) if trust is None else trust
+    exposures = wp.array(values, dtype=bracket.BracketExposure)
+    radiance, clipped = (wp.array(np.float32(x), dtype=wp.vec3) for x in (radiance, clipped))
+    confidence = wp.array(np.float32(confidence), dtype=wp.float32)
+    spread = wp.zeros(clipped.shape, dtype=wp.vec3)
+    out = [wp.full((height, width), -1.0, dtype=kind) for kind in (wp.float32,)]
+    light, share = (wp.full((height, width), wp.vec3(-1.0), dtype=wp.vec3) for _ in range(2))
+    for band in rows or [None]:
+        bracket.spread_clipping(confidence, clipped, spread, reach=reach, rows=band)
+    for band in rows or [None]:
+        bracket.merge_exposures(
+            exposures, radiance, confidence, clipped, spread, light, out[0], share, reach=reach, rows=band
+        )
+    return light.numpy(), out[0].numpy(), share.numpy()
+
+
+def expose(light, ratios=RATIOS):
+    """What every exposure would tell of a map: radiance in its own values, and the share at clipping."""
+    exact = np.stack([light * ratio for ratio in ratios])
+    return np.minimum(exact, 1.0), (exact >= 1.0).astype(float)
+
+
+def test_equal_exposures_stay_equal(device):
+    """A room that no exposure clips: every one says the same, and so does their mean."""
+    ratios = (1.0, 0.25, 0.0625)  # powers of two, exact
+    light = np.full((8, 16, 3), 0.625)
+    values, clipped = expose(light, ratios)
+    rng = np.random.default_rng(1)
+    merged, confidence, share = merge(ratios, values, rng.uniform(0.1, 1.0, (3, 8, 16)), clipped)
+    assert (merged == np.float32(0.625)).all()
+    assert (share == 0).all()
+    assert (confidence > 0).all()
+
+
+def test_what_clips_comes_from_a_shorter_exposure(device):
+    light = np.full((16, 32, 3), 0.2)
+    light[5, 9] = (7.0, 100.0, 0.9)
+    light[5, 31] = 3.0  # its neighbour lies beyond the seam
+    values, clipped = expose(light)
+    merged, _, share = merge(RATIOS, values, np.ones((3, 16, 32)), clipped)
+    assert np.allclose(merged, light, rtol=1e-6)
+    assert (share == 0).all()
+
+
+def test_around_a_lamp_one_exposure_has_the_say(device):
+    """The short exposure shows the lamp a texel beside the place where the long one clips: its energy is kept."""
+    light = np.full((32, 64, 3), 0.1)
+    beside = light.copy()
+    light[16, 30:32], beside[16, 31:33] = 60.0, 60.0
+    values, clipped = expose(light)
+    moved, moved_clipped = expose(beside)
+    values[1:], clipped[1:] = moved[1:], moved_clipped[1:]
+    merged, _, _ = merge(RATIOS, values, np.ones((3, 32, 64)), clipped, reach=np.pi / 32)
+    assert merged[16].sum() == pytest.approx(light[16].sum(), rel=0.02)  # but for the bound of 1 where it clips
+    alone, _, _ = merge(RATIOS, values, np.ones((3, 32, 64)), clipped, reach=0.0)
+    assert alone[16].sum() < 0.7 * light[16].sum()  # without its surroundings half of the lamp would be lost
+
+
+def test_a_lamp_that_was_just_switched_on_is_bounded_from_below(device):
+    light = np.full((8, 16, 3), 0.2)
+    values, clipped = expose(light)
+    values[0, 4, 8], clipped[0, 4, 8] = 1.0, 1.0
+    merged, _, _ = merge(RATIOS, values, np.ones((3, 8, 16)), clipped)
+    assert (merged[4, 8] == 1.0).all()
+
+
+def test_where_all_clip_the_shortest_stands_and_says_so(device):
+    light = np.full((8, 16, 3), 1e4)
+    values, clipped = expose(light)
+    merged, _, share = merge(RATIOS, values, np.ones((3, 8, 16)), clipped)
+    assert np.allclose(merged, 256.0)
+    assert (share == 1).all()
+    merged, _, share = merge(RATIOS, values, np.ones((3, 8, 16)), clipped, trust=[1, 1, 0])
+    assert np.allclose(merged, 16.0)  # no frame of the shortest lately
+
+
+def bad_maps(rng):
+    """Every kind of value that unwrapping could ever give."""
+    radiance = rng.uniform(0, 1, (3, 12, 24, 3))
+    confidence = rng.uniform(0, 1, (3, 12, 24))
+    clipped = np.where(rng.uniform(size=(3, 12, 24, 3)) < 0.05, rng.uniform(size=(3, 12, 24, 3)), 0.0)
+    radiance[0, 2, 3], radiance[1, 4, 5], radiance[2, 6, 7] = np.nan, np.inf, -1.0
+    radiance[:, 11, 23], radiance[:, 0, 0] = 1e6, 0.0
+    confidence[0, 8, 9], confidence[:, 10, 11], confidence[1, 1, 1] = np.nan, 0.0, np.nan
+    clipped[1, 3, 3] = np.nan
+    return radiance, confidence, clipped
+
+
+def test_twin(device):
+    radiance, confidence, clipped = bad_maps(np.random.default_rng(2))
+    merged, certainty, share = merge(RATIOS, radiance, confidence, clipped)
+    assert np.isfinite(merged).all()
+    assert (merged >= 0).all()
+    spread = reference.spread_clipping(confidence, clipped, bracket.REACH)
+    expected = reference.merge_exposures(RATIOS, radiance, confidence, clipped, spread, bracket.REACH)
+    assert np.allclose(merged, expected[0], rtol=TWIN, atol=TWIN)
+    assert np.allclose(certainty, expected[1], rtol=TWIN)
+    assert np.allclose(share, expected[2], rtol=TWIN)
+
+
+def test_bands_give_the_same_bits(device):
+    maps = bad_maps(np.random.default_rng(3))
+    for one, other in zip(merge(RATIOS, *maps), merge(RATIOS, *maps, rows=[(0, 5), (5, 6), (6, 12)]), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+# ---- a room with lamps far above clipping ----
+
+
+def room_light(d):
+    """A dim room, a window, and three lamps of 30 to 240 times what the long exposure can show."""
+    light = 0.15 + 0.1 * d[..., 2:] * np.array([1.0, 0.8, 0.6])
+    light = light + 2.5 * (np.abs(d - np.array([0.8, -0.1, 0.6])).max(-1, keepdims=True) < 0.25)
+    for toward, cosine, power in (((0.5, -0.5, 0.7), 0.99, 30.0), ((-0.6, -0.3, 0.74), 0.995, 120.0)):
+        toward = np.array(toward) / np.linalg.norm(toward)
+        light = light + power * (d @ toward > cosine)[..., None] * np.array([1.0, 0.9, 0.7])
+    sun = np.array([0.1, -0.6, 0.8]) / np.linalg.norm([0.1, -0.6, 0.8])
+    return light + 240.0 * (d @ sun > 0.998)[..., None]
+
+
+def view(index):
+    """A camera that moves a little from frame to frame."""
+    angle = 0.02 * index
+    position = np.array(CENTER) + np.array([0.45 * np.sin(angle), -0.45 * np.cos(angle), 0.3])
+    return probe_reference.View(position, np.array(CENTER), size=SIZE, focal=520.0)
+
+
+def make_scene(**changes):
+    camera = view(0)
+    scene = Scene(
+        camera=Camera(*SIZE, camera.focal, camera.focal, *camera.principal),
+        marker=Marker(size=0.08),
+        probes=(Probe(CENTER, RADIUS, REFLECTANCE),),
+        proxies=(Proxy("plane", size=(1.0, 1.0)),),
+        objects=(Object("sphere", radius=0.02, at=(0.02, 0.0, 0.02), material=MirrorMaterial((0.9, 0.9, 0.9))),),
+    )
+    return dataclasses.replace(scene, **changes)
+
+
+def pose_of(camera):
+    rotation = camera.rotation.T
+    return Pose(rotation, -rotation @ camera.position)
+
+
+def frames(count=9):
+    """(picture, pose as tracking would give it, exposure) of a bracket that goes round; the pose errs a little."""
+    rng = np.random.default_rng(4)
+    pictures = []
+    for index in range(count):
+        camera, ratio = view(index), RATIOS[index % len(RATIOS)]
+        linear = probe_reference.render(camera, [(CENTER, RADIUS, REFLECTANCE)], room_light, lambda d: 0.1 + 0 * d)
+        linear = np.clip(linear * ratio, 0, 1)
+        codes = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) * 255
+        noisy = codes + rng.uniform(-0.5, 0.5, codes.shape)
+        moved = pose_of(camera)
+        shift = rng.normal(0, 0.33 / 520.0 * 0.54, 2)  # a third of a pixel at the ball
+        pose = Pose(moved.rotation, moved.translation + np.array([*shift, 0.0]))
+        pictures.append((np.clip(np.rint(noisy), 0, 255).astype(np.uint8), pose, 0.02 * ratio))
+    return pictures
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return frames()
+
+
+def irradiance(light):
+    """On 200 directions all around."""
+    height, width = light.shape[:2]
+    rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
+    toward = latlong_reference.directions(height, width, rows, columns).reshape(-1, 3)
+    normals = np.random.default_rng(0).normal(size=(200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    weight = latlong_reference.solid_angles(height, width).reshape(-1, 1)
+    return np.maximum(normals @ toward.T, 0.0) @ (weight * light.reshape(-1, 3))
+
+
+def true_irradiance():
+    height = 1024
+    rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(2 * height) + 0.5, indexing="ij")
+    light = room_light(latlong_reference.directions(height, 2 * height, rows, columns))
+    return irradiance(light)
+
+
+def captured(clip, device, exposures, quality, lit=3):
+    """The environment after the clip has been played ``lit`` times."""
+    with Pipeline(make_scene(), device=device, quality=quality, outputs=("environment",), exposures=exposures) as pipe:
+        for index, (image, pose, seconds) in enumerate(clip * lit):
+            result = pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)
+        return np.array(result.environment, np.float64)
+
+
+def test_lamps_far_above_clipping_give_their_whole_light(clip, device):
+    truth = true_irradiance()
+    exposures = [seconds for _, _, seconds in clip]
+    quality = PRESETS["medium"]
+    exact = [(image, pose_of(view(index)), seconds) for index, (image, _, seconds) in enumerate(clip)]
+
+    def error(light):
+        return np.linalg.norm(irradiance(light) - truth) / np.linalg.norm(truth)
+
+    assert error(captured(exact, device, exposures, quality)) < ROOM
+    assert error(captured(clip, device, exposures, quality)) < ROOM_TRACKED
+    assert error(captured(exact[:1], device, (), quality.with_rungs(recover="clipped"))) > CLIPPED_LOSES
+
+
+# ---- what is shown ----
+
+
+def test_only_the_longest_exposure_is_shown(clip, device):
+    exposures = [seconds for _, _, seconds in clip]
+    for quality in ("low", "paper"):
+        with Pipeline(make_scene(), device=device, quality=quality, exposures=exposures) as pipe:
+            shown = None
+            for index, (image, pose, seconds) in enumerate(clip):
+                result = pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)
+                assert result.shown == (index % 3 == 0)
+                if result.shown:
+                    shown = result.image.copy()
+                np.testing.assert_array_equal(result.image, shown)
+            plan = {stage.name for stage, _ in pipe.plan.stages}
+            assert ("bracket" in plan) == (quality == "low")
+
+
+def test_a_stream_that_begins_with_a_short_exposure_is_not_dark(clip, device):
+    with Pipeline(make_scene(), device=device, quality="low", exposures=(0.02, 0.02 / 16)) as pipe:
+        image, pose, seconds = clip[1]
+        first = pipe(image, pose=pose, exposure_time=seconds)
+        assert not first.shown
+        assert abs(first.image.mean() - clip[0][0].mean()) < 8  # codes; coarse steps of a sixteenth of the light
+
+
+def test_old_frames_of_other_exposures_are_forgotten(clip, device):
+    """After some seconds without a short frame the light is what the long one shows."""
+    exposures = [seconds for _, _, seconds in clip]
+    with Pipeline(make_scene(), device=device, quality="low", outputs=("environment",), exposures=exposures) as pipe:
+        for index, (image, pose, seconds) in enumerate(clip):
+            pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)
+        before = pipe.arrays["merged_radiance"].numpy().max()
+        image, pose, _ = clip[0]
+        pipe(image, time_seconds=60.0, pose=pose)
+        assert before > 100.0
+        assert pipe.arrays["merged_radiance"].numpy().max() < 1.5  # 1 over the ball's reflectance
+
+
+def test_quality_may_change_between_two_frames(clip, device):
+    exposures = [seconds for _, _, seconds in clip]
+    with (
+        Pipeline(make_scene(), device=device, quality="low", exposures=exposures) as first,
+        Pipeline(make_scene(), device=device, quality="low", exposures=exposures) as second,
+    ):
+        for index, (image, pose, seconds) in enumerate(clip[:5]):
+            shown = first(image, time_seconds=index / 30, pose=pose, exposure_time=seconds).image
+        second.continue_from(first)
+        image, pose, seconds = clip[5]
+        np.testing.assert_array_equal(second(image, time_seconds=5 / 30, pose=pose, exposure_time=seconds).image, shown)
+        image, pose, seconds = clip[6]
+        second(image, time_seconds=6 / 30, pose=pose, exposure_time=seconds)
+        assert second.arrays["merged_radiance"].numpy().max() > 100.0
+
+
+def test_a_folder_of_alternating_exposures(tmp_path, device):
+    """By way of the sidecar: marker found in every frame, every second picture repeats the one before."""
+    table = decode_table("srgb")[:, 0]
+    with Synthetic("card", size=SIZE) as card:
+        matrix = card.camera_matrix
+        for frame, ratio in zip(card, itertools.cycle((1.0, 1 / 16)), strict=False):
+            if frame.index == 6:
+                break
+            dark = np.searchsorted(0.5 * (table[1:] + table[:-1]), table[frame.image] * ratio)
+            imageio.v3.imwrite(tmp_path / f"{frame.index:04d}.png", dark.astype(np.uint8))
+    (tmp_path / "exposures.json").write_text(json.dumps([0.016, 0.001]))
+    camera = Camera(*SIZE, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    scene = make_scene(camera=camera)
+    with Session(scene, source=tmp_path, device=device, quality="low") as session:
+        pairs = [(frame, result, np.array(result.image)) for frame, result in session]
+    assert all(result.pose is not None and result.state.value == "tracked" for _, result, _ in pairs)
+    assert [result.shown for _, result, _ in pairs] == [True, False] * 3
+    for (_, _, long), (_, _, short) in zip(pairs[::2], pairs[1::2], strict=True):
+        np.testing.assert_array_equal(long, short)
+
+
+# ---- which exposures make a bracket ----
+
+
+@pytest.mark.parametrize(
+    ("exposures", "ratios"),
+    [
+        ([], ()),
+        ([0.02], ()),
+        ([0.01, 0.08, 0.02, 0.0805], (1.0, 0.02 / 0.0805, 0.01 / 0.0805)),  # a camera wavers
+        ([0.02, 0.018, 0.016, 0.014, 0.012], ()),  # adapts to the light
+        ([2.0**-k for k in range(9)], ()),
+    ],
+)
+def test_brackets_are_told_from_adaption(exposures, ratios):
+    assert bracket_ratios(exposures) == pytest.approx(ratios)
+
+
+def test_frames_are_told_apart_by_ratio():
+    ratios = (1.0, 0.25, 0.01)
+    assert [find_exposure(s, 0.04, ratios) for s in (None, 0.04, 0.03, 0.012, 0.009, 0.0005)] == [0, 0, 0, 1, 1, 2]
+    assert find_exposure(0.01, 0.04, ()) == 0
+
+
+def test_brightening_undoes_a_shorter_exposure():
+    table = decode_table("srgb")
+    codes = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    assert (brightened(codes, table, 1.0) == codes).all()
+    bright = brightened(codes, table, 0.25)
+    assert (np.diff(bright[0, :, 0].astype(int)) >= 0).all()
+    wanted = np.minimum(table[codes[0, :, 0], 0] * 4, 1.0)
+    assert np.abs(table[bright[0, :, 0], 0] - wanted).max() < 0.005  # half a code, linear
+
+
+def test_scene_names_exposures():
+    text = dumps_scene(make_scene(source=SourceSpec(camera=0, exposures=(0.01, 0.001))))
+    assert loads_scene(text).source.exposures == (0.01, 0.001)
+    with pytest.raises(SceneError, match="exposures"):
+        loads_scene(text.replace("exposures = [0.01, 0.001]", "exposures = [0.01, -1]"))

@@ -1,0 +1,159 @@
+"""Frames of other exposures than the one that is shown: what they say of the room's light, and nothing else of them.
+
+A source that alternates between exposures gives pictures that must not be shown in turn: they would flicker. The
+longest exposure is the reference: its frames are lit and shown, and all radiance is in its camera values. From the
+others the ball is unwrapped; stage ``bracket`` merges what they say.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.kernels.bracket import BracketExposure
+from warp_ar.kernels.structs import FrameParams
+from warp_ar.stages.base import Arrays, Request, Wiring
+from warp_ar.stages.bracket import UNWRAPPED
+from warp_ar.stages.unwrap import Unwrap
+from warp_ar.tracking import Pose
+
+LEAST_STEP = 1.4
+"""Least ratio of neighbouring exposures: less than that brings little."""
+WAVERING = 1.1
+"""Ratio within which exposures are one."""
+MOST_EXPOSURES = 8
+"""More than this is a camera that adapts to the light, not one that alternates."""
+KEPT_SECONDS = 3.0
+"""How long a frame of another exposure is believed: the light may have changed, and no newer one says so."""
+
+
+def bracket_ratios(exposures: Sequence[float]) -> tuple[float, ...]:
+    """Exposure times of a source as ratios to the longest: 1 first, then ever shorter ones; empty if no bracket.
+
+    A camera that adapts to the light gives many times, near one another: no bracket either.
+    """
+    times: list[float] = []
+    for time in sorted(exposures, reverse=True):
+        if not times or time * WAVERING < times[-1]:
+            times.append(time)
+    apart = all(longer >= LEAST_STEP * shorter for longer, shorter in itertools.pairwise(times))
+    if not 2 <= len(times) <= MOST_EXPOSURES or not apart:
+        return ()
+    return tuple(time / times[0] for time in times)
+
+
+class ShortFrames:
+    """Takes frames of every exposure but the reference's."""
+
+    def __init__(self, request: Request, arrays: Arrays, device: Any) -> None:
+        """Allocate and build.
+
+        Args:
+            request: What the plan was made for; its stages hold ``bracket``.
+            arrays: Of the pipeline.
+            device: Warp device.
+        """
+        self._ratios = request.exposures
+        self._arrays = arrays
+        self._own = Arrays()
+        self._taken = [-math.inf] * len(self._ratios)
+        self._told: tuple[bool, ...] | None = None
+        self._merged = 1
+        wiring = Unwrap.wire(request)
+        assert isinstance(wiring, Wiring)
+        stage = Unwrap(request, wiring)
+        for name in ("probes", "ray_scene", "decode", "rays"):
+            self._own.add(name, arrays[name])
+        with wp.ScopedDevice(device):
+            self._own.add("frame", wp.zeros(arrays["frame"].shape, dtype=wp.vec3ub))
+            self._own.add("params", wp.zeros(1, dtype=FrameParams))
+            for name, spec in stage.arrays().items():
+                self._own.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
+            self._passes = stage.build(self._own, device)
+
+    def take(self, image: Any, index: int, pose: Pose, params: npt.NDArray[Any], now: float) -> None:
+        """Unwrap one frame.
+
+        Args:
+            image: As a pipeline takes it.
+            index: Which exposure.
+            pose: ``camera_from_world``.
+            params: The pipeline's own, of which only the pose is another.
+            now: Seconds.
+        """
+        values = params.copy()
+        inverse = pose.inverse()
+        values["camera_position"], values["world_from_camera"] = inverse.translation, inverse.rotation
+        self._own["params"].assign(values)
+        if isinstance(image, wp.array):
+            wp.copy(self._own["frame"], image)
+        else:
+            self._own["frame"].assign(image)
+        for step in self._passes:
+            step.launch(None)
+        for part in UNWRAPPED:
+            wp.copy(self._arrays[f"bracket_{part}"][index], self._own[f"probe_{part}"])
+        self._taken[index] = now
+        self._arrays.touch("short_frames")
+
+    def refresh(self, now: float) -> bool:
+        """Say which exposures are to be believed, before the reference's frame of time ``now``.
+
+        Returns:
+            Whether one has come in that was not there before: what was accumulated until then had clipped without it,
+            and is no mean to start from.
+        """
+        told = tuple(index == 0 or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken))
+        if told == self._told:
+            return False
+        self._told = told
+        before, self._merged = self._merged, sum(told)
+        values = np.zeros(len(told), np.dtype(BracketExposure.numpy_dtype()))
+        values["ratio"], values["trust"] = self._ratios, told
+        self._arrays["bracket_exposures"].assign(values)
+        self._arrays.touch("short_frames")
+        return self._merged > before
+
+    def resume(self, other: ShortFrames) -> None:
+        """Go on from what another pipeline was given; its arrays have been copied where they fit."""
+        if self._ratios == other._ratios:
+            self._taken, self._merged = list(other._taken), other._merged
+
+
+def find_exposure(exposure_time: float | None, longest: float, ratios: Sequence[float]) -> int:
+    """Which of the exposures a frame has: the nearest by ratio; the reference, 0, if it does not tell.
+
+    Args:
+        exposure_time: Seconds.
+        longest: The reference's, seconds.
+        ratios: From ``bracket_ratios``.
+    """
+    if exposure_time is None or not ratios:
+        return 0
+    ratio = exposure_time / longest
+    return min(range(len(ratios)), key=lambda index: abs(math.log(ratios[index] / ratio)))
+
+
+def brightened(image: npt.NDArray[np.uint8], decode: npt.NDArray[Any], ratio: float) -> npt.NDArray[np.uint8]:
+    """The picture as the reference's exposure would show it, but for its noise: for tracking, and to look at.
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        decode: Linear value of each code, (256, 3), not falling.
+        ratio: Its exposure time over the reference's.
+    """
+    table = np.empty_like(decode, np.uint8)
+    for channel in range(3):
+        values = decode[:, channel].astype(np.float64)
+        half = 0.5 * (values[1:] + values[:-1])
+        table[:, channel] = np.searchsorted(half, np.minimum(values / ratio, 1.0))
+    result = np.empty_like(image)
+    for channel in range(3):
+        result[..., channel] = table[image[..., channel], channel]
+    return result
