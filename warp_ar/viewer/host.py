@@ -626,7 +626,7 @@ class Host:
 
     def _watch_cost(self, pipeline: Pipeline, image: Image, result: Result, light_ms: float) -> None:
         """Learn what the preset costs; under a budget, turn the knobs that it asks for."""
-        if result.pose is None and pipeline.plan.needs("pose"):
+        if not result.shown or (result.pose is None and pipeline.plan.needs("pose")):
             return
         self._since_swap += 1
         wanted = self._wanted
