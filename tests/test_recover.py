@@ -418,6 +418,32 @@ def test_a_card_that_clips_is_a_lower_bound(device, scene):
     assert totals["shading"] > totals["white_card"]
 
 
+# Surfaces are of the reflectance that is assumed; of 52 parts of the sky none is seen alone.
+WIDE_SKY_TOLERANCE = 0.15
+
+
+@pytest.mark.parametrize("colour", [(2.5, 2.5, 2.5), (0.9, 2.5, 4.0)])
+def test_a_sky_that_clips_is_not_shrunk_to_what_the_card_proves(device, scene, colour):
+    """Relative deviations must not draw the light down: the card clips from 1.2 on, and ink tells how far beyond."""
+    d, area = reference.cell_directions(ROWS, COLUMNS)
+    radiance = np.where(d[:, 2:] > 0.0, np.array(colour), 0.1)
+    estimate, values = Room(device, scene, table=0.35, box=0.35).estimate(radiance)
+    assert estimate.lower_bound == tuple(value * scene.marker.white > 1.0 for value in colour)
+    excess = estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
+    found, truth = area @ excess, area @ np.maximum(radiance - 1.0, 0.0)
+    assert found == pytest.approx(truth, rel=WIDE_SKY_TOLERANCE)
+
+
+def test_errors_are_shared_by_what_is_near():
+    """A point alone on a table has an error of its own; a hundred within a centimetre share one."""
+    apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    together = np.array([0.2, 0.3, 0.0]) + 1e-4 * np.arange(100)[:, None] * [1.0, 0.0, 0.0]
+    plane = np.full(103, int(recovery.Kind.PLANE))
+    shared = recovery.shared_errors(np.concatenate([apart, together]), np.zeros(103, int), plane)
+    assert shared[:3] == pytest.approx(2.0)
+    assert (shared[3:] > 80.0).all()
+
+
 def test_nothing_clipped_nothing_added(device, scene):
     radiance, _, _ = lit_room()
     estimate, _ = Room(device, scene).estimate(radiance)

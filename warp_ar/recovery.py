@@ -28,6 +28,9 @@ lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the 
 moved to neighbouring cells and distances while that helps, and kept if the cost falls by more than ``EVIDENCE``. A
 lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D.
 
+Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
+without it, the more parts and equations there are, the more all of them would shrink together.
+
 **Solution.** Iteratively reweighted least squares with Cauchy weights; each quadratic problem with non-negative
 unknowns is solved by an active set that starts from the last solution. Some 400 equations and 60 unknowns. Equal input
 gives equal output.
@@ -110,16 +113,22 @@ class Kind(enum.IntEnum):
     """One face of a box proxy."""
 
 
+GRID: Final = 0.06
+"""Metres between points on planes."""
 _ONE_THREAD: Final = 1 << 17
 """Multiplications below which OpenBLAS, MKL and Accelerate use one thread."""
 _NOISE: Final = np.array([0.02, 0.04, 0.12, 0.04])
 """Relative standard deviation of one equation, by kind."""
-_SHARED: Final = np.array([4.0, 8.0, 6.0, 6.0])
-"""Equations that share one error (texture and transport vary slowly), by kind."""
+_SHARED: Final = np.array([4.0, 8.0, 2.0, 3.0])
+"""Equations that share one error of transport that the model leaves out, by kind, however far apart."""
+_TEXTURE: Final = np.array([0.0, 0.0, 0.03, 0.03])
+"""Metres within which texture varies little, by kind: points that are closer share its error as well."""
 _REFLECTANCE: Final = np.array([0.85, 0.04, 0.35, 0.35])
 """Expected reflectance, by kind; the scene knows the card's."""
 _REFLECTANCE_SPREAD: Final = np.array([0.005, 0.4, 0.6, 0.6])
 """Standard deviation of its logarithm."""
+_HUE_SPREAD: Final = np.array([0.005, 0.1, 0.4, 0.4])
+"""Standard deviation of its logarithm about that in another channel: paper is white and ink grey."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +228,7 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
         rotation, at = rotation_matrix(proxy.rotate), np.array(proxy.at)
         if proxy.shape == "plane":
             half = 0.5 * np.array(proxy.size)
-            places = [np.stack(np.meshgrid(*2 * [np.arange(-0.45, 0.451, 0.06)]), -1).reshape(-1, 2)]
+            places = [np.stack(np.meshgrid(*2 * [np.arange(-0.45, 0.451, GRID)]), -1).reshape(-1, 2)]
             turn = np.arange(24) * np.pi / 12
             for probe in scene.probes:
                 middle = (rotation.T @ (np.array(probe.center) - at))[:2]
@@ -255,6 +264,25 @@ def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
             local = (points - np.array(proxy.at)) @ rotation_matrix(proxy.rotate)
             inside |= (np.abs(local) < 0.5 * np.array(proxy.size) + 0.005).all(axis=1)
     return inside
+
+
+def shared_errors(positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]) -> Array:
+    """Number of equations that share the error of each.
+
+    Args:
+        positions: Of the points, metres, (n, 3).
+        surface: That each lies on, (n,).
+        kind: ``Kind`` of that surface, (n,).
+    """
+    shared = _SHARED[kind]
+    for number in np.unique(surface):
+        own = np.flatnonzero(surface == number)
+        reach = _TEXTURE[kind[own[0]]]
+        if reach > 0.0:
+            at = positions[own].astype(float)
+            apart = np.linalg.norm(at[:, None] - at, axis=2)
+            shared[own] = np.maximum(shared[own], np.exp(-apart / reach).sum(axis=1))
+    return shared
 
 
 # ---- regions ---------------------------------------------------------------------------------------------------------
@@ -340,6 +368,13 @@ def sums_over_cells(transfer: NDArray[np.float32], values: Array) -> Array:
     small = values.astype(np.float32)
     blocks = [transfer[start : start + step] @ small for start in range(0, len(transfer), step)]
     return np.concatenate([np.zeros((0, values.shape[1])), *blocks])
+
+
+def solve_columns(matrix: Array, columns: Array) -> Array:
+    """Solution of a linear system for every column, in blocks as in ``small_product``."""
+    step = max(1, _ONE_THREAD // 4 // max(len(columns), 1))
+    blocks = [np.linalg.solve(matrix, columns[:, start : start + step]) for start in range(0, columns.shape[1], step)]
+    return np.concatenate([np.zeros((len(columns), 0)), *blocks], axis=1)
 
 
 # ---- the least-squares problem ---------------------------------------------------------------------------------------
@@ -441,6 +476,7 @@ class _Problem:
         self.surface = surfaces.surface[seen]
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
+        self.shared = shared_errors(surfaces.points["position"][seen], self.surface, self.kind)
         through_balls = mirrored[seen]
         self.transfer = transfer[seen]
         # What clips in a cell lies off its middle, for which transfer was traced.
@@ -523,8 +559,16 @@ class _Problem:
         """Unknowns of a problem with one peak less, and that peak at zero."""
         return np.insert(z, self.first_mean - 1, 0.0)
 
-    def fit(self, c: int, z: Array, iterations: int, centre: Array | None = None) -> _Fit:
-        """Solve for one channel from a start; ``centre`` draws parts and peaks to itself instead of to means."""
+    def fit(self, c: int, z: Array, iterations: int, centre: Array | None = None, other: Array | None = None) -> _Fit:
+        """Solve for one channel from a start.
+
+        Args:
+            c: Channel.
+            z: Unknowns to start from.
+            iterations: Of reweighting.
+            centre: Draws parts and peaks to itself instead of to means.
+            other: Unknowns of a channel that is known better: surfaces are of about that reflectance.
+        """
         parts, mean_at, u_at = self.parts, self.first_mean, self.first_surface
         count = len(self.kinds)
         usable = np.bincount(self.surface[self.exact[:, c]], minlength=count) >= 4
@@ -544,6 +588,8 @@ class _Problem:
 
         prior_u = np.where(self.kinds == Kind.CARD, 1.0 / self.white, 1.0 / _REFLECTANCE[self.kinds])
         spread_u = _REFLECTANCE_SPREAD[self.kinds]
+        if other is not None:
+            prior_u, spread_u = other[-count:], _HUE_SPREAD[self.kinds]
         z = z.copy()
         if not z[u_at:].any():
             ratio = matrix[:, :mean_at] @ z[:mean_at] - target
@@ -565,7 +611,7 @@ class _Problem:
             prior[row, u_at + a], prior[row, u_at + b] = 1.0, -1.0
 
         one_sided = ~exact
-        sigma, shared = np.hypot(_NOISE[kind], MIRROR_TRUST * self.mirrored_share[rows]), _SHARED[kind]
+        sigma, shared = np.hypot(_NOISE[kind], MIRROR_TRUST * self.mirrored_share[rows]), self.shared[rows]
         deviation = np.ones(len(prior))
         hessian = np.zeros((len(z), len(z)))
         weights = np.zeros(len(rows))
@@ -595,6 +641,17 @@ class _Problem:
             weighted = weights[:, None] * matrix
             hessian += small_product(matrix, weighted)
             gradient += weighted.T @ target
+            # Deviations are relative: what they are relative to must not shrink for their sake.
+            squared = weights * (matrix @ z - target) ** 2
+            gradient[u_at:] += np.bincount(surface, squared, minlength=count) / u
+            if centre is None:
+                off = (scaled @ z) ** 2
+                within = np.where(self.is_surface | (about <= LEAST), 0.0, off[:parts])
+                gradient[mean_at : u_at - 1] += np.bincount(
+                    self.component, within, minlength=self.components
+                ) / np.maximum(z[mean_at : u_at - 1], LEAST)
+                wide = self.expected * z[u_at - 1] > LEAST
+                gradient[u_at - 1] += (off[mean_at : u_at - 1] * wide).sum() / max(z[u_at - 1], LEAST)
             z = solve_nonnegative(hessian, gradient, z)
         u = np.maximum(z[u_at:], 1e-3)
         z[u_at:] = u
@@ -613,7 +670,7 @@ class _Problem:
         pull = weighted.T @ (fit.target - fit.matrix @ fit.z)
         overlap = fit.matrix[:, free].T @ weighted
         own = (added * weighted).sum(axis=0)
-        own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
+        own -= (overlap * solve_columns(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
         return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0), np.float64)
 
     def power_columns(self, peaks: Sequence[_Peak]) -> Array:
@@ -790,7 +847,14 @@ class Recovery:
         self._frames += 1
 
         bright = problem.first_mean
-        first = [problem.fit(c, problem.start(means[c]), ITERATIONS).z for c in range(3)]
+        # Where the card does not tell, reflectances in a channel in which it does are worth more than guesses.
+        known = min(range(3), key=lambda c: (bounds[c], c != best))
+        told = problem.fit(known, problem.start(means[known]), ITERATIONS).z
+        others = [told if bounds[c] and c != known else None for c in range(3)]
+        first = [
+            told if c == known else problem.fit(c, problem.start(means[c]), ITERATIONS, other=others[c]).z
+            for c in range(3)
+        ]
         solution = np.stack([z[:bright] for z in first], -1)
         if bright:
             solid = np.bincount(
@@ -799,9 +863,13 @@ class Recovery:
                 minlength=problem.parts,
             )
             total = np.concatenate([solid, np.ones(len(problem.peaks))]) @ solution + 1e-9
-            shared = (solution / total).mean(axis=1)
+            shared = solution.sum(axis=1) / total.sum()
             solution = np.stack(
-                [problem.fit(c, first[c], WARM_ITERATIONS, centre=shared * total[c]).z[:bright] for c in range(3)], -1
+                [
+                    problem.fit(c, first[c], WARM_ITERATIONS, centre=shared * total[c], other=others[c]).z[:bright]
+                    for c in range(3)
+                ],
+                -1,
             )
         # A lamp that gives nothing in any channel has gone out, or never was.
         powers = solution[problem.parts :]
