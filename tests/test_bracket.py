@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.error_model import check_error
 from tests.reference import bracket as reference
 from tests.reference import latlong as latlong_reference
 from tests.reference import probe as probe_reference
@@ -152,6 +153,8 @@ def test_twin(device):
     assert np.allclose(merged, expected[0], rtol=TWIN, atol=TWIN)
     assert np.allclose(certainty, expected[1], rtol=TWIN)
     assert np.allclose(share, expected[2], rtol=TWIN)
+    for got, want in zip((merged, certainty, share), expected, strict=True):
+        check_error("bracket", got, want)
 
 
 def test_bands_give_the_same_bits(device):

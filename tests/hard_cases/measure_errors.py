@@ -20,6 +20,7 @@ TWINS = (
     "tests/test_environment.py::test_accumulation_matches_twin",
     "tests/test_environment.py::test_fill_matches_twin",
     "tests/test_environment.py::test_irradiance_is_that_of_a_facing_surface",
+    "tests/test_bracket.py::test_twin",
     "tests/test_recover.py::test_transfer_agrees_with_its_twin",
     "tests/test_irradiance.py::test_projection_is_the_twin_s",
     "tests/test_irradiance.py::test_the_reference_is_the_twin_s",
