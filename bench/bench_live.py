@@ -1,14 +1,22 @@
-"""The live page on the bundled desk: what pictures cost to pack, frames per second served and shown, latency, memory.
+"""The live page on the bundled desk: frames a second served and shown, latency, growth, hostile clients, and profiles.
 
-Server and viewers share this machine. ``WARP_AR_BENCH_SECONDS`` sets how long each case runs (default 10; 600 for ten
-minutes without growth); the browser's cases need playwright and Chromium and are left out, saying so, without them.
+Server and viewers share this machine. Parts, which ``WARP_AR_BENCH`` picks, separated by commas:
+
+- ``serve``: one light client, three, one beside a client that reads nothing, one beside one that sends bad messages;
+- ``clip`` and ``camera``: Chromium shows the clip, then its own fake camera. A time code in the picture tells on the
+  screen which frame it is, and so how long ago the source gave it. Needs playwright and Chromium;
+- ``profile``: where the program's time goes in the cases of one light client, clip and camera. Needs py-spy.
+
+``WARP_AR_BENCH_SECONDS`` is how long each case runs (default 10; 600 for ten minutes without growth). All of it takes
+8 cases of that and 15 seconds more each.
 """
 
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
-import fractions
+import dataclasses
 import json
 import os
 import random
@@ -26,113 +34,194 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
-import av
 import cv2
 import numpy as np
 
-from bench.common import measure, report
-from warp_ar.scene import load_scene
+from bench.bench_transport import descendants
+from bench.common import report
+from warp_ar.scene import SourceSpec, dumps_scene, load_scene
+from warp_ar.sinks import VideoSink
 from warp_ar.sources import open_source
-from warp_ar.viewer.server import encode_jpeg
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))
-WARM_SECONDS = 4.0
-FUZZ_MESSAGES = 10_000  # at most
+WARM_SECONDS = 5.0
+PARTS = ("serve", "clip", "camera", "profile")
+PROFILE_SECONDS = 8
+START_SECONDS = 120.0
+FUZZ_MESSAGES = 10_000
+BITS, CELL = 7, 12  # the time code: the frame's number as squares along the bottom edge
+FRAMES = 96  # of the clip that are played in a loop
+
+TARGETS = {
+    "serve, 1 light client": "20 fps",
+    "clip": "10 fps shown, 250 ms",
+    "camera": "10 fps shown, 400 ms",
+}
 
 
-class X264:
-    """H.264 as a live encoder would make it: no frame held back."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self._codec: Any = av.CodecContext.create("libx264", "w")
-        self._codec.width, self._codec.height, self._codec.pix_fmt = width, height, "yuv420p"
-        self._codec.time_base, self._codec.thread_count = fractions.Fraction(1, 30), 1
-        self._codec.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "23"}
-        self._count = 0
-
-    def __call__(self, image: np.ndarray) -> int:
-        """Bytes of one frame."""
-        frame = av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="yuv420p")
-        frame.pts = self._count
-        self._count += 1
-        return sum(packet.size for packet in self._codec.encode(frame))
+def mark(image: np.ndarray, number: int) -> np.ndarray:
+    """The picture with its number as a time code."""
+    image = image.copy()
+    for bit in range(BITS):
+        image[-CELL:, bit * CELL : (bit + 1) * CELL] = 255 * (number >> bit & 1)
+    return image
 
 
-def transport() -> None:
-    """JPEG against H.264: milliseconds to pack a frame, and its bytes."""
-    with open_source(load_scene("desk").source.path) as source:  # type: ignore[union-attr, arg-type]
-        images = [frame.image for frame, _ in zip(source, range(48), strict=False)]
-    height, width = images[0].shape[:2]
-    turns = {"jpeg": 0, "h264": 0}
-    sizes: dict[str, list[int]] = {"jpeg": [], "h264": []}
-    x264 = X264(width, height)
-    packers = {"jpeg": lambda image: len(encode_jpeg(image)), "h264": x264}
+def write_coded_desk(folder: Path) -> tuple[Path, Path]:
+    """The bundled desk with time codes: a scene file, and its clip as Chromium's fake camera plays it."""
+    scene = load_scene("desk")
+    assert scene.source is not None
+    assert scene.source.path is not None
+    with (
+        open_source(scene.source.path) as source,
+        VideoSink(folder / "coded.mp4", fps=source.fps) as video,
+        (folder / "camera.mjpeg").open("wb") as camera,
+    ):
+        for frame, number in zip(source, range(FRAMES), strict=False):
+            image = mark(frame.image, number)
+            video.write(image)
+            camera.write(cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+    coded = dataclasses.replace(scene, source=SourceSpec(path=folder / "coded.mp4"), name="desk")
+    (folder / "desk.toml").write_text(dumps_scene(coded))
+    return folder / "desk.toml", folder / "camera.mjpeg"
 
-    def pack(name: str) -> None:
-        sizes[name].append(packers[name](images[turns[name] % len(images)]))
-        turns[name] += 1
 
-    times = measure({name: (lambda name=name: pack(name)) for name in packers}, "cpu", runs=96)  # type: ignore[misc]
-    for name in packers:
-        report(f"pack {width}x{height} {name}", times[name], "cpu", bytes=statistics.median(sizes[name]))
+# ---------------------------------------------------------------------------------------------------------- the server
+
+
+@dataclasses.dataclass
+class Served:
+    """A server of its own."""
+
+    url: str
+    pid: int
+
+    def resident_mb(self) -> float:
+        """Its resident memory; not a number where the system does not tell."""
+        try:
+            pages = int(Path(f"/proc/{self.pid}/statm").read_text().split()[1])
+        except OSError:
+            return float("nan")
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def cpu_seconds(self) -> float:
+        """Processor time that it has taken."""
+        return _cpu_seconds(self.pid)
+
+
+def _cpu_seconds(pid: int) -> float:
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 @contextlib.contextmanager
-def served(device: str, *options: str) -> Iterator[tuple[str, int]]:
-    """Address and process id of a server of its own."""
-    command = [
-        sys.executable,
-        "-m",
-        "warp_ar.live",
-        "desk",
-        "--device",
-        device,
-        "--port",
-        "0",
-        "--no-browser",
-        *options,
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        found = re.search(r"http://\S+", process.stdout.readline())
-        assert found, "the server did not start"
+def served(device: str, scene: str = "desk") -> Iterator[Served]:
+    """Start a server; end it whatever happens."""
+    command = [sys.executable, "-m", "warp_ar.live", scene, "--device", device, "--port", "0", "--no-browser"]
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+    ):
         try:
-            yield found[0], process.pid
+            assert process.stdout is not None
+            found = re.search(r"http://\S+", process.stdout.readline())
+            if found is None:
+                errors.seek(0)
+                raise RuntimeError(f"the server did not start: {errors.read()}")
+            yield Served(found[0], process.pid)
         finally:
             process.send_signal(signal.SIGINT)
-
-
-def resident_mb(pid: int) -> float | None:
-    """Resident memory of a process in MB; None where the system does not tell."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except OSError:
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
-async def view(url: str, seconds: float, *, show: bool = True) -> list[float]:
-    """Milliseconds between frames at a light viewer, warm-up left out; one that shows nothing never acknowledges."""
-    gaps: list[float] = []
-    start = last = time.monotonic()
-    async with aiohttp.ClientSession() as session, session.ws_connect(f"{url}live", max_msg_size=1 << 24) as socket:
-        while time.monotonic() - start < seconds:
             try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+@dataclasses.dataclass
+class Growth:
+    """Memory and latency over a case: the last third's median less the first's."""
+
+    server: Served
+    memory: list[float] = dataclasses.field(default_factory=list)
+    latency: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+    """When, and milliseconds."""
+    cpu: float = 0.0
+    start: float = 0.0
+
+    def begin(self) -> None:
+        """From here on it counts."""
+        self.memory.clear()
+        self.latency.clear()
+        self.cpu, self.start = self.server.cpu_seconds(), time.monotonic()
+
+    def sample(self) -> None:
+        """Look at the memory; to be called at even intervals."""
+        self.memory.append(self.server.resident_mb())
+
+    def figures(self, frames: int) -> dict[str, Any]:
+        """What the report says."""
+        cpu = self.server.cpu_seconds() - self.cpu
+        figures: dict[str, Any] = {
+            "fps": round(frames / (time.monotonic() - self.start), 2),
+            "server_cpu_ms_per_frame": round(1e3 * cpu / max(frames, 1), 1),
+        }
+        third = len(self.memory) // 3
+        if third:
+            grown = statistics.median(self.memory[-third:]) - statistics.median(self.memory[:third])
+            figures |= {"memory_mb": round(self.memory[-1]), "grown_mb": round(grown, 1)}
+        third = len(self.latency) // 3
+        if third:
+            delays = [delay for _, delay in self.latency]
+            drift = statistics.median(delays[-third:]) - statistics.median(delays[:third])
+            figures["latency_grown_ms"] = round(drift, 1)
+        return figures
+
+
+# -------------------------------------------------------------------------------------------------------- light clients
+
+
+async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bool = False) -> dict[str, Any]:
+    """A light client: takes pictures and shows none. One that does not read only keeps its connection open."""
+    delays: list[float] = []
+    frames, begun = 0, False
+    start = time.monotonic()
+    async with (
+        aiohttp.ClientSession() as session,
+        session.ws_connect(f"{growth.server.url}live", max_msg_size=1 << 24) as socket,
+    ):
+        while time.monotonic() - start < WARM_SECONDS + seconds:
+            if not reads:
+                await asyncio.sleep(0.1)
+                continue
+            with contextlib.suppress(TimeoutError):
                 message = await asyncio.wait_for(socket.receive(), 1.0)
-            except TimeoutError:
-                continue
-            if message.type is not aiohttp.WSMsgType.BINARY:
-                continue
-            (length,) = struct.unpack_from("<I", message.data)
-            header = json.loads(message.data[4 : 4 + length])
-            if header["type"] != "frame" or not show:
-                continue
-            await socket.send_str(json.dumps({"type": "ack", "id": header["id"]}))
-            now = time.monotonic()
-            if now - start > WARM_SECONDS:
-                gaps.append((now - last) * 1e3)
-            last = now
-    return gaps
+                if message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE, aiohttp.WSMsgType.ERROR):
+                    raise RuntimeError(f"the server dropped a good client: {message}")
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    continue
+                (length,) = struct.unpack_from("<I", message.data)
+                header = json.loads(message.data[4 : 4 + length])
+                if header["type"] != "frame":
+                    continue
+                await socket.send_str(json.dumps({"type": "ack", "id": header["id"]}))
+                now = time.monotonic()
+                if now - start < WARM_SECONDS:
+                    continue
+                if not begun:
+                    begun = True
+                    if counts:
+                        growth.begin()
+                frames += 1
+                # Both processes read the same clock.
+                delays.append(1e3 * now - header["taken"])
+                if counts:
+                    growth.latency.append((now, delays[-1]))
+                    if frames % 20 == 0:
+                        growth.sample()
+    return {"delays": delays, **(growth.figures(frames) if counts else {"fps": round(frames / seconds, 2)})}
 
 
 async def fuzz(url: str, stop: asyncio.Event) -> int:
@@ -154,37 +243,92 @@ async def fuzz(url: str, stop: asyncio.Event) -> int:
     return count
 
 
-async def serving(device: str, case: str, url: str, pid: int) -> None:
-    before = resident_mb(pid)
-    if case == "1 viewer":
-        results = [await view(url, WARM_SECONDS + SECONDS)]
-    elif case == "3 viewers":
-        results = list(await asyncio.gather(*(view(url, WARM_SECONDS + SECONDS) for _ in range(3))))
-    elif case == "and one that reads nothing":
-        duration = WARM_SECONDS + SECONDS
-        results = (await asyncio.gather(view(url, duration), view(url, duration, show=False)))[:1]
-    else:
+async def serving(device: str, case: str, server: Served) -> None:
+    """One of the cases without a browser."""
+    growth = Growth(server)
+    first = view(growth, SECONDS, counts=True)
+    extra: dict[str, Any] = {}
+    if case == "3 light clients":
+        results = await asyncio.gather(first, *(view(growth, SECONDS) for _ in range(2)))
+        extra["each_fps"] = [result["fps"] for result in results]
+    elif case == "1 beside one that reads nothing":
+        results = await asyncio.gather(first, view(growth, SECONDS, reads=False))
+    elif case == "1 beside a hostile one":
         stop = asyncio.Event()
-        hostile = asyncio.create_task(fuzz(url, stop))
-        results = [await view(url, WARM_SECONDS + SECONDS)]
+        hostile = asyncio.create_task(fuzz(server.url, stop))
+        results = [await first]
         stop.set()
-        case = f"and one that sends {await hostile} bad messages"
-    for gaps in results:
-        after = resident_mb(pid)
-        grown = None if before is None or after is None else round(after - before, 1)
-        fps = round(1e3 * len(gaps) / max(sum(gaps), 1e-9), 2)
-        report(f"serve desk, {case}", gaps, device, fps=fps, grown_mb=grown)
+        extra["bad_messages"] = await hostile
+    else:
+        results = [await first]
+    figures = results[0]
+    delays = figures.pop("delays")
+    _report(f"serve, {case}", delays, device, **figures, **extra)
 
 
-def write_camera(path: Path) -> None:
-    """The desk's clip as Chromium's fake camera plays it."""
-    with open_source(load_scene("desk").source.path) as source, path.open("wb") as file:  # type: ignore[union-attr, arg-type]
-        for frame in source:
-            file.write(cv2.imencode(".jpg", frame.image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+def _report(case: str, delays: list[float], device: str, **figures: Any) -> None:
+    if not delays:
+        print(json.dumps({"case": case, "failed": "no frame came"}), flush=True)
+        return
+    wanted = {"asked": TARGETS[case]} if case in TARGETS else {}
+    report(case, delays, device, **wanted, of="milliseconds from source to client", **figures)
 
 
-def browsing(device: str) -> None:
-    """Frames shown and latency from source to screen, in Chromium on the same machine."""
+# ---------------------------------------------------------------------------------------------------------- the browser
+
+# Which frame is on the canvas, or in the camera's picture, and when.
+WATCH = f"""() => {{
+  const strip = document.createElement("canvas").getContext("2d", {{ willReadFrequently: true }});
+  strip.canvas.width = {BITS * CELL}; strip.canvas.height = 1;
+  const read = (picture, height) => {{
+    strip.drawImage(picture, 0, height - {CELL // 2}, {BITS * CELL}, 1, 0, 0, {BITS * CELL}, 1);
+    const data = strip.getImageData(0, 0, {BITS * CELL}, 1).data;
+    let code = 0;
+    for (let bit = 0; bit < {BITS}; bit++) if (data[4 * (bit * {CELL} + {CELL // 2})] > 128) code |= 1 << bit;
+    return code;
+  }};
+  window.bench = {{ shown: [], taken: [] }};
+  const canvas = document.getElementById("canvas"), video = document.getElementById("video");
+  warpAr.view.addEventListener("shown", ({{ detail }}) => {{
+    const code = read(canvas, canvas.height);
+    requestAnimationFrame(() => bench.shown.push([code, detail.id, detail.taken, performance.timeOrigin + performance.now(), detail.state]));
+  }});
+  const next = (now, about) => {{
+    bench.taken.push([read(video, video.videoHeight), performance.timeOrigin + (about.captureTime ?? now)]);
+    video.requestVideoFrameCallback(next);
+  }};
+  video.requestVideoFrameCallback(next);
+}}"""  # noqa: E501
+
+
+def clip_delays(shown: list[list[Any]], wall: float) -> list[float]:
+    """Milliseconds from source to screen of the clip's frames.
+
+    Args:
+        shown: Code on the screen, the header's id and time of the source (the server's monotonic clock), time of the
+            screen (wall clock), state of the marker.
+        wall: The wall clock less the monotonic one.
+    """
+    # The frame that a header speaks of, and the one on the screen, which a faulty page might confuse.
+    return [at - (taken + wall) for code, id, taken, at, _ in shown if code == (id - 1) % FRAMES]
+
+
+def camera_delays(shown: list[list[Any]], taken: list[list[float]]) -> list[float]:
+    """Milliseconds from the camera to the screen: the code on the screen, and when the camera last gave that code."""
+    times: dict[int, list[float]] = collections.defaultdict(list)
+    for code, at in taken:
+        times[int(code)].append(at)
+    delays = []
+    for code, _, _, at, _ in shown:
+        before = [time for time in times[int(code)] if time <= at]
+        if before:
+            delays.append(at - before[-1])
+    return delays
+
+
+@contextlib.contextmanager
+def browsing(camera: Path, server: Served) -> Iterator[Any]:
+    """The page in Chromium, whose camera plays a file; None without playwright and Chromium."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     try:
         from playwright.sync_api import sync_playwright
@@ -192,43 +336,139 @@ def browsing(device: str) -> None:
         chromium = None
     if chromium is None:
         print(json.dumps({"case": "browser", "left_out": "needs playwright and Chromium"}))
+        yield None
         return
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver, served(device) as (url, pid):
-        path = Path(folder) / "camera.mjpeg"
-        write_camera(path)
-        fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+    fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+    with sync_playwright() as driver:
         browser = driver.chromium.launch(
-            executable_path=chromium, args=["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={path}"]
+            executable_path=chromium, args=["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={camera}"]
         )
-        context = browser.new_context(permissions=["camera"])
-        page = context.new_page()
-        page.goto(url)
-        for case in ("clip", "camera"):
-            if case == "camera":
-                page.click("#use-camera")
-            page.wait_for_timeout(1e3 * WARM_SECONDS)
-            before, count, start = resident_mb(pid), page.evaluate("warpAr.view.stats.shown"), time.monotonic()
-            latencies = []
-            while time.monotonic() - start < SECONDS:
-                page.wait_for_timeout(250)
-                latencies.append(page.evaluate("warpAr.view.stats.latency") or 0.0)
-            fps = (page.evaluate("warpAr.view.stats.shown") - count) / (time.monotonic() - start)
-            after = resident_mb(pid)
-            third = len(latencies) // 3
-            report(
-                f"browser {case}, latency",
-                latencies,
-                device,
-                fps=round(fps, 2),
-                latency_drift=round(statistics.median(latencies[-third:]) - statistics.median(latencies[:third]), 1),
-                grown_mb=None if before is None or after is None else round(after - before, 1),
-            )
+        page = browser.new_context(permissions=["camera"]).new_page()
+        page.goto(server.url)
+        deadline = time.monotonic() + START_SECONDS
+        while not page.evaluate("!!window.warpAr && warpAr.view.stats.shown > 5"):
+            if time.monotonic() > deadline:
+                raise RuntimeError("the page shows nothing")
+            page.wait_for_timeout(100)
+        yield page
         browser.close()
 
 
+def showing(device: str, case: str, page: Any, server: Served) -> None:
+    """Clip or camera in Chromium."""
+    if case == "camera":
+        page.click("#use-camera")
+    page.wait_for_timeout(1e3 * WARM_SECONDS)
+    page.evaluate(WATCH)
+    page.wait_for_timeout(1e3)
+    growth = Growth(server)
+    children = lambda: sum(map(_cpu_seconds, descendants(os.getpid()))) - server.cpu_seconds()  # noqa: E731
+    page.evaluate("bench.shown.length = 0")
+    growth.begin()
+    browser_cpu = children()
+    while time.monotonic() - growth.start < SECONDS:
+        page.wait_for_timeout(500)
+        growth.sample()
+    shown, taken = page.evaluate("[bench.shown, bench.taken]")
+    browser_cpu = children() - browser_cpu
+    wall = 1e3 * (time.time() - time.monotonic())
+    delays = clip_delays(shown, wall) if case == "clip" else camera_delays(shown, taken)
+    growth.latency = [(0.0, delay) for delay in delays]
+    _report(
+        case,
+        delays,
+        device,
+        **growth.figures(len(shown)),
+        browser_cpu_ms_per_frame=round(1e3 * browser_cpu / max(len(shown), 1), 1),
+        tracked=round(sum(frame[4] == "tracked" for frame in shown) / max(len(shown), 1), 3),
+        unread_codes=len(shown) - len(delays),
+        page_says_ms=round(page.evaluate("warpAr.view.stats.latency") or 0.0, 1),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------- profiles
+
+# Innermost of these in a stack says what it was doing.
+WORK = {
+    "Tracker.track": "track the marker",
+    "Scheduler.run": "kernels",
+    "_drain": "kernels",
+    "encode_jpeg": "pack JPEG",
+    "Host.push": "unpack the camera's JPEG",
+    "Host._estimate": "estimate the focal length",
+    "Pipeline._set_frame_values": "poses and rectangles",
+    "Pipeline._upload": "copies",
+    "Result.image": "copies",
+    "Server._message": "headers and messages",
+    "Server._receive": "headers and messages",
+    "Server._send": "headers and messages",
+    "Server._tick": "state and light",
+    "Host._look_at_light": "state and light",
+    "_RecordedSource.__iter__": "decode the clip",
+    "_Slot._build": "build pipelines",
+    "BaseEventLoop._run_once": "event loop",
+}
+# Threads that wait in C, which py-spy takes for running.
+IDLE = ("_worker", "EpollSelector.select", "Condition.wait")
+
+
+def profile(case: str, server: Served) -> None:
+    """Where the program's processor time goes, by py-spy: shares of the samples in which a thread was running."""
+    spy = shutil.which("py-spy", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
+    if spy is None:
+        print(json.dumps({"case": f"profile, {case}", "left_out": "needs py-spy"}))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stacks.txt"
+        command = [spy, "record", "--pid", str(server.pid), "--duration", str(PROFILE_SECONDS), "--rate", "60"]
+        done = subprocess.run([*command, "--format", "raw", "--output", str(path)], capture_output=True, text=True)
+        if done.returncode or not path.is_file():
+            print(json.dumps({"case": f"profile, {case}", "left_out": done.stderr.strip()[-200:]}))
+            return
+        shares: collections.Counter[str] = collections.Counter()
+        for line in path.read_text().splitlines():
+            stack, _, count = line.rpartition(" ")
+            names = [entry.partition(" (")[0].strip() for entry in stack.split(";")]
+            if names[-1] in IDLE:
+                continue
+            shares[next((WORK[name] for name in reversed(names) if name in WORK), names[-1])] += int(count)
+    total = sum(shares.values()) or 1
+    cores = total / (PROFILE_SECONDS * 60)
+    table = {name: f"{100 * count / total:.1f} %" for name, count in shares.most_common(12)}
+    print(json.dumps({"case": f"profile, {case}", "cores_busy": round(cores, 2), **table}), flush=True)
+
+
+def _profiled_view(server: Served) -> None:
+    async def both() -> None:
+        looking = asyncio.create_task(view(Growth(server), PROFILE_SECONDS + 2.0))
+        await asyncio.sleep(WARM_SECONDS)
+        await asyncio.get_running_loop().run_in_executor(None, profile, "1 light client", server)
+        await looking
+
+    asyncio.run(both())
+
+
 def main(device: str) -> None:
-    transport()
-    for case in ("1 viewer", "3 viewers", "and one that reads nothing", "hostile"):
-        with served(device) as (url, pid):
-            asyncio.run(serving(device, case, url, pid))
-    browsing(device)
+    parts = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(","))) or set(PARTS)
+    cases = ["1 light client", "3 light clients", "1 beside one that reads nothing", "1 beside a hostile one"]
+    runs = len(cases) * ("serve" in parts) + ("clip" in parts) + ("camera" in parts)
+    profiles = ("profile" in parts) * (1 + ("clip" in parts) + ("camera" in parts))
+    took = runs * (SECONDS + 15) + profiles * (PROFILE_SECONDS + 10)
+    print(json.dumps({"parts": sorted(parts), "takes_minutes": round(took / 60, 1)}), flush=True)
+    if "serve" in parts:
+        for case in cases:
+            with served(device) as server:
+                asyncio.run(serving(device, case, server))
+    if "profile" in parts:
+        with served(device) as server:
+            _profiled_view(server)
+    shown = [case for case in ("clip", "camera") if case in parts]
+    if not shown:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        scene, camera = write_coded_desk(Path(folder))
+        with served(device, str(scene)) as server, browsing(camera, server) as page:
+            for case in shown if page is not None else []:
+                showing(device, case, page, server)
+                if "profile" in parts:
+                    profile(f"{case} in Chromium", server)

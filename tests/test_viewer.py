@@ -592,16 +592,19 @@ def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> No
             host.edit(protocol.UseCamera(*SIZE), "you")
         count = 0
         while not any(lit.stamp is not None for lit in running.frames):
-            host.push(encode_jpeg(frames[count % 30]), 1000.0 + count, "me")
+            host.push(protocol.Picture(count, 1000.0 + count, encode_jpeg(frames[count % 30])), "me")
             count += 1
             time.sleep(0.05)
             assert count < PATIENCE / 0.05
         lit = next(lit for lit in running.frames if lit.stamp is not None)
+        told = [message for message in running.messages if message["type"] == "taken"]
+        assert int(lit.stamp - 1000.0) in {message["id"] for message in told}, "the page never hears that it may go on"
+        assert all(message["wait"] >= 0.0 for message in told)
         sent = frames[int(lit.stamp - 1000.0) % 30]
         assert np.abs(lit.frame.astype(int) - sent).mean() < JPEG_ERROR, "the stamp belongs to another frame"
-        host.push(jpeg(), 5.0, "me")  # of another size: left aside
+        host.push(protocol.Picture(1, 5.0, jpeg()), "me")  # of another size: left aside
         with pytest.raises(ProtocolError, match="decoded"):
-            host.push(b"\xff\xd8 nothing", 5.0, "me")
+            host.push(protocol.Picture(2, 5.0, b"\xff\xd8 nothing"), "me")
         start = len(running.frames)
         host.leave_camera("you")
         assert host.camera_size("me") == SIZE

@@ -49,8 +49,12 @@ _COST_FRAMES: Final = 30
 _SETTLED: Final = 10
 _MEASURING_REST: Final = 0.15
 """Seconds that the frames rest, one from the next, while rungs are timed: what runs beside them spoils the times."""
+_CAMERA_LEAD_MS: Final = 40.0
+"""How long a picture of a browser's camera is about to be packed, sent and unpacked."""
 _STILL_SECONDS: Final = 0.25
 """How often a held frame is looked at again, where nothing was edited."""
+_LOOK_SECONDS: Final = 0.2
+"""How often it is looked at meanwhile: finding the marker once more takes several milliseconds."""
 _ESTIMATE_SECONDS: Final = 30.0
 """How long a browser's camera is watched before its guessed focal length is left as it is."""
 
@@ -92,6 +96,18 @@ class _Target:
     size: tuple[int, int]
     outputs: tuple[str, ...]
     exposures: tuple[float, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pushed:
+    """A picture of a browser's camera on its way to being lit."""
+
+    image: Image
+    id: int
+    taken: float
+    """When it came, seconds of ``time.monotonic``."""
+    stamp: float
+    """When it was taken, milliseconds of the browser's own clock."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -249,7 +265,9 @@ class Host:
         self._recorded = 0
         self._folder = tempfile.TemporaryDirectory(prefix="warp_ar_live_")
         self._times: collections.deque[float] = collections.deque(maxlen=60)
-        self._pushed: collections.deque[tuple[Image, float, float]] = collections.deque(maxlen=4)
+        self._pushed: collections.deque[_Pushed] = collections.deque(maxlen=4)
+        self._looked = 0.0
+        self._busy_ms = 0.0
         self._followed: Any = None
         self._light: npt.NDArray[np.float32] | None = None
         self._light_time = 0.0
@@ -426,14 +444,17 @@ class Host:
         feed = self._next or self._feed
         return feed.source.size if feed.is_browser and feed.owner is owner else None
 
-    def push(self, jpeg: bytes, stamp: float, owner: object) -> None:
+    def push(self, taken: protocol.Picture, owner: object) -> None:
         """Take a picture of a browser's camera; blocks while it is decoded.
+
+        The page hears of it again, as ``taken``, when it is its turn to be lit: sooner, another would only take its
+        place.
 
         Raises:
             ProtocolError: It cannot be decoded.
         """
         try:
-            picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
+            picture = cv2.imdecode(np.frombuffer(taken.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
         except cv2.error as error:
             raise protocol.ProtocolError("picture cannot be decoded") from error
         if picture is None:
@@ -443,14 +464,15 @@ class Host:
             return  # switched off meanwhile
         assert isinstance(feed.source, QueueSource)
         now = time.monotonic()
-        self._pushed.append((picture, now, stamp))
+        self._pushed.append(_Pushed(picture, taken.id, now, taken.taken))
         feed.source.push(picture, now)
         self._estimate(picture, now)
 
     def _estimate(self, picture: Image, now: float) -> None:
         estimator = self._estimator
-        if estimator is None:
+        if estimator is None or now < self._looked + _LOOK_SECONDS:
             return
+        self._looked = now
         found = estimator.estimate() if estimator.look(picture) else None
         if found is not None:
             self._estimator = None
@@ -565,13 +587,18 @@ class Host:
         """Light one frame and hand it out; False to leave the source."""
         if self._leaving():
             return False
+        pushed = next((item for item in tuple(self._pushed) if item.image is frame.image), None)
+        if pushed is not None:
+            # The next one shall come when this one is done, not sooner, and not have waited by then.
+            wait = max(self._busy_ms - _CAMERA_LEAD_MS, 0.0)
+            self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
+        begin = time.perf_counter()
         pipeline = self._follow()
         height, width = frame.image.shape[:2]
         if pipeline is None or pipeline.size != (width, height):
             time.sleep(0.01)  # a pipeline for this camera is being built
             return True
-        pushed = [(when, stamp) for picture, when, stamp in tuple(self._pushed) if picture is frame.image]
-        taken, stamp = pushed[0] if pushed else (time.monotonic(), None)
+        taken, stamp = (pushed.taken, pushed.stamp) if pushed is not None else (time.monotonic(), None)
         start = time.perf_counter()
         result = pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time)
         image = result.image
@@ -599,6 +626,7 @@ class Host:
         )
         self._record(image)
         self._publish(self.latest)
+        self._busy_ms = (time.perf_counter() - begin) * 1e3
         if self._dial.measuring:
             with self._lock:
                 self._lock.wait_for(self._leaving, timeout=_MEASURING_REST)

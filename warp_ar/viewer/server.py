@@ -409,20 +409,18 @@ class Server:
                 raise protocol.ProtocolError("picture too large")
             return
         picture = protocol.parse_picture(data, size)
+        # The page waits for "taken"; whoever does not has pictures left out.
         if viewer.picture is None or viewer.picture.done():
             viewer.picture = asyncio.create_task(self._push(viewer, picture))
-        else:  # the page waits for "taken"; whoever does not has pictures left out
-            viewer.tell(json.dumps({"type": "taken", "id": picture.id}))
 
     async def _push(self, viewer: _Viewer, picture: protocol.Picture) -> None:
         try:
             loop = asyncio.get_running_loop()
-            await loop.run_in_executor(self._hands, self.host.push, picture.jpeg, picture.taken, viewer)
+            await loop.run_in_executor(self._hands, self.host.push, picture, viewer)
         except protocol.ProtocolError as error:
             await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
         except WarpArError as error:
             viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
-        viewer.tell(json.dumps({"type": "taken", "id": picture.id}))
 
     @staticmethod
     async def _drop(viewer: _Viewer, code: int, reason: str) -> None:

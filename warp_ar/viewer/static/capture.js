@@ -1,23 +1,28 @@
-// This browser's camera: pictures of it go to the server as fast as the server takes them, one at a time, the newest.
+// This browser's camera: pictures of it go to the server as fast as it lights them, the newest each time. The server says
+// when it has begun with one, and how long it expects to be busy: the next is taken just in time for it.
 
 const LONG_SIDE = 640;
 const QUALITY = 0.85;
+const PATIENCE = 1000;
 
 export class Capture extends EventTarget {
   #connection;
   #video;
   #canvas = document.createElement("canvas");
   #stream = null;
-  #waiting = 0;
   #id = 0;
+  /** When the next picture may be taken, on performance.now(). */
+  #from = 0;
 
   constructor(connection, video) {
     super();
     this.#connection = connection;
     this.#video = video;
-    connection.addEventListener("taken", () => (this.#waiting = Math.max(0, this.#waiting - 1)));
+    connection.addEventListener("taken", ({ detail }) => {
+      if (detail.id === this.#id) this.#from = performance.now() + detail.wait;
+    });
     connection.addEventListener("open", () => {
-      this.#waiting = 0;
+      this.#from = 0;
       if (this.#stream) this.#announce();
     });
   }
@@ -65,7 +70,7 @@ export class Capture extends EventTarget {
   }
 
   async #take(stamp) {
-    if (this.#waiting >= 2 || this.#connection.backlog > 0 || !this.#connection.ready) return;
+    if (performance.now() < this.#from || this.#connection.backlog > 0 || !this.#connection.ready) return;
     const { width, height } = this.#canvas;
     this.#canvas.getContext("2d", { alpha: false }).drawImage(this.#video, 0, 0, width, height);
     const blob = await new Promise((done) => this.#canvas.toBlob(done, "image/jpeg", QUALITY));
@@ -75,7 +80,8 @@ export class Capture extends EventTarget {
     view.setFloat64(0, stamp, true);
     view.setUint32(8, (this.#id = (this.#id + 1) >>> 0), true);
     message.set(new Uint8Array(await blob.arrayBuffer()), 12);
-    this.#waiting += 1;
+    // Should the answer be lost, the picture goes on all the same.
+    this.#from = performance.now() + PATIENCE;
     this.#connection.sendBinary(message);
   }
 }
