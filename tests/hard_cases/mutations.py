@@ -1,9 +1,10 @@
 """Would the suite notice? For every row of the atlas one deliberate break, and the test that must turn red.
 
-    python -m tests.hard_cases.mutations [ROW ...]
+    python -m tests.hard_cases.mutations [ROW ...] [--jobs N]
 
 copies the checkout to a temporary folder, and there, one after another: runs the row's test, which must pass; breaks
 the code by replacing one piece of text; runs the test again, which must fail; mends it. The checkout stays as it is.
+Prints a table of the answers at the end.
 """
 
 from __future__ import annotations
@@ -12,10 +13,13 @@ import argparse
 import dataclasses
 import os
 import pathlib
+import queue
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
+from collections.abc import Sequence
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 COPIED = ("kernels", "scenes", "tests", "warp_ar", "pyproject.toml")
@@ -65,6 +69,15 @@ MUTATIONS = (
         "tests/test_probe.py::test_partly_outside_the_frame",
     ),
     Mutation(
+        3,
+        "surfaces beyond the frame are read at its border",
+        "kernels/recover.py",
+        "clear = at[2] > 0.0 and i >= 0 and j >= 0 and i < frame.shape[0] and j < frame.shape[1]",
+        "i = wp.clamp(i, 0, frame.shape[0] - 1)\n                    j = wp.clamp(j, 0, frame.shape[1] - 1)\n"
+        "                    clear = at[2] > 0.0",
+        "tests/test_recover.py::test_observation_reads_surfaces_and_nothing_else",
+    ),
+    Mutation(
         4,
         "half a texel's shift in every look-up of a packed level",
         "kernels/pyramid.py",
@@ -95,6 +108,14 @@ MUTATIONS = (
         "    if value > 0.0:  # false for NaN\n        return wp.min(value, MAX_RADIANCE)\n    return 0.0\n",
         "    return value\n",
         f"{HARD}test_row06_garbage.py::test_any_map_gives_finite_light",
+    ),
+    Mutation(
+        6,
+        "averages take in what stands beside an object",
+        "kernels/object_light.py",
+        "if hit_object[i + a, j + b] == found and wp.dot",
+        "if wp.dot",
+        "tests/test_object_light.py::test_averages_stop_at_the_edges_of_objects",
     ),
     Mutation(
         7,
@@ -153,6 +174,31 @@ MUTATIONS = (
         f"{HARD}test_rows13_14_rays.py::test_the_20480_triangle_sphere_never_leaks",
     ),
     Mutation(
+        13,
+        "what a proxy hides is looked up in the picture",
+        "kernels/reflect.py",
+        "        if occluded_by_proxies(scene, params.camera_position, from_camera, 1.0 - HIDDEN_MARGIN):\n"
+        "            return nowhere\n",
+        "",
+        "tests/test_reflect.py::test_what_a_proxy_hides_is_not_in_the_picture",
+    ),
+    Mutation(
+        13,
+        "faces turned away are looked up in the picture",
+        "kernels/reflect.py",
+        "        if wp.dot(from_camera, geometric_normal) >= 0.0:\n            return nowhere\n",
+        "",
+        "tests/test_reflect.py::test_a_face_turned_away_is_not_in_the_picture",
+    ),
+    Mutation(
+        14,
+        "a fixed offset of ten micrometres where surfaces look at the room",
+        "kernels/recover.py",
+        "    return offset_origin(point.position, point.normal, direction, error)\n",
+        "    return point.position + 1.0e-5 * point.normal\n",
+        f"{HARD}test_rows13_14_rays.py::test_surfaces_receive_the_same_light_at_any_scale_and_place",
+    ),
+    Mutation(
         14,
         "a fixed offset of a tenth of a millimetre",
         "kernels/visibility.py",
@@ -182,7 +228,23 @@ MUTATIONS = (
         "kernels/launch.py",
         "inputs=[start, *inputs]",
         "inputs=[start + (1 if start else 0), *inputs]",
-        f"{HARD}test_row17_same_answer.py::test_run_to_run_and_in_any_bands",
+        f"{HARD}test_row17_same_answer.py::test_run_to_run_and_in_any_bands[cpu-visibility-default]",
+    ),
+    Mutation(
+        18,
+        "objects read a part of a list as if it were drawn",
+        "warp_ar/stages/object_light.py",
+        'inputs += [arrays.get("room_samples"), ',
+        'inputs += [arrays.get("room_samples_texels"), ',
+        f"{HARD}test_row18_energy.py::test_what_surrounds_a_white_object_is_white",
+    ),
+    Mutation(
+        18,
+        "objects that take light from the desk give none back",
+        "kernels/room_shadow.py",
+        "change += weight * (light - radiance)",
+        "change -= weight * radiance",
+        f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
     ),
     Mutation(
         18,
@@ -193,6 +255,9 @@ MUTATIONS = (
         f"{HARD}test_row18_energy.py::test_a_constant_room_under_any_mask",
     ),
 )
+
+
+CAUGHT = "caught"
 
 
 def passes(folder: pathlib.Path, test: str) -> bool:
@@ -206,7 +271,7 @@ def passes(folder: pathlib.Path, test: str) -> bool:
 
 
 def try_mutation(folder: pathlib.Path, mutation: Mutation) -> str:
-    """``caught``, or what is wrong with the mutation or its test."""
+    """``CAUGHT``, or what is wrong with the mutation or its test."""
     file = folder / mutation.file
     text = file.read_text()
     if text.count(mutation.old) != 1:
@@ -215,32 +280,70 @@ def try_mutation(folder: pathlib.Path, mutation: Mutation) -> str:
         return "RED WITHOUT IT"
     file.write_text(text.replace(mutation.old, mutation.new))
     try:
-        return "MISSED" if passes(folder, mutation.test) else "caught"
+        return "MISSED" if passes(folder, mutation.test) else CAUGHT
     finally:
         file.write_text(text)
+
+
+def copy_checkout(folder: pathlib.Path) -> None:
+    """All that tests need."""
+    folder.mkdir()
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, folder / name)
+
+
+def try_all(mutations: Sequence[Mutation], jobs: int) -> list[str]:
+    """Answers in the order of the mutations; every worker breaks a copy of its own."""
+    answers = [""] * len(mutations)
+    waiting: queue.SimpleQueue[int] = queue.SimpleQueue()
+    for index in range(len(mutations)):
+        waiting.put(index)
+
+    def work(folder: pathlib.Path) -> None:
+        copy_checkout(folder)
+        while True:
+            try:
+                index = waiting.get_nowait()
+            except queue.Empty:
+                return
+            try:
+                answers[index] = try_mutation(folder, mutations[index])
+            except RuntimeError as error:
+                answers[index] = f"ERROR: {error}"
+            print(f"{sum(map(bool, answers))}/{len(mutations)}  {answers[index]}: {mutations[index].what}", flush=True)
+
+    with tempfile.TemporaryDirectory() as place:
+        threads = [
+            threading.Thread(target=work, args=(pathlib.Path(place) / str(number),))
+            for number in range(min(jobs, len(mutations)))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    return answers
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Break the code on purpose and see the tests turn red.")
     parser.add_argument("rows", nargs="*", type=int, metavar="ROW", help="rows of the atlas; all if left out")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="breaks to try at once (default: 1)")
     options = parser.parse_args()
+    if unknown := set(options.rows) - {mutation.row for mutation in MUTATIONS}:
+        parser.error(f"the atlas has no row {min(unknown)}; expected 1 to {max(m.row for m in MUTATIONS)}")
     chosen = [mutation for mutation in MUTATIONS if not options.rows or mutation.row in options.rows]
-    missed = 0
-    with tempfile.TemporaryDirectory() as place:
-        folder = pathlib.Path(place) / "copy"
-        folder.mkdir()
-        for name in COPIED:
-            source = ROOT / name
-            if source.is_dir():
-                ignore = shutil.ignore_patterns("__pycache__")
-                shutil.copytree(source, folder / name, symlinks=True, ignore=ignore)
-            else:
-                shutil.copy(source, folder / name)
-        for mutation in chosen:
-            answer = try_mutation(folder, mutation)
-            missed += answer != "caught"
-            print(f"{mutation.row:>3}  {answer:<7}  {mutation.what}  [{mutation.test}]", flush=True)
-    return 1 if missed else 0
+    answers = try_all(chosen, options.jobs)
+    print("\n| row | break | test | answer |\n| --- | --- | --- | --- |")
+    for mutation, answer in zip(chosen, answers, strict=True):
+        test = mutation.test.removeprefix("tests/").removeprefix("hard_cases/")
+        print(f"| {mutation.row} | {mutation.what} | {test} | {answer.splitlines()[0]} |")
+    caught = answers.count(CAUGHT)
+    print(f"\n{caught} of {len(chosen)} caught")
+    return 0 if caught == len(chosen) else 1
 
 
 if __name__ == "__main__":

@@ -3,8 +3,9 @@
     python -m pytest -q --junitxml=report.xml
     python -m tests.hard_cases.table REPORT.xml [...] [--note "when and on what"]
 
-A report of a machine with a CUDA device holds the tests of both devices: their names say which (``[cuda:0-...]``). A
-column that no report fills keeps what stands there. A cell says how many of a stage's rungs passed.
+Reports may be one for each test file: they add up. A report of a machine with a CUDA device holds the tests of both
+devices: their names say which (``[cuda:0-...]``). A column that no report fills keeps what stands there. A cell says
+how many of a stage's rungs passed, and in how many tests.
 """
 
 from __future__ import annotations
@@ -20,23 +21,26 @@ from tests.hard_cases import atlas
 FILE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "hard-cases.md"
 BEGIN, END = "<!-- table -->", "<!-- /table -->"
 
+ON_HOST = (atlas.TRACK, atlas.SOURCE)
+"""What never runs on a GPU."""
+
 Results = dict[tuple[int, str, str], list[bool]]
 
 
 def read_reports(paths: list[pathlib.Path]) -> dict[str, Results]:
-    """Outcome of every test, by device and cell; skipped tests say nothing."""
-    found: dict[str, Results] = {"CPU": collections.defaultdict(list), "CUDA": collections.defaultdict(list)}
+    """Outcome of every test, by device and cell; skipped tests say nothing, tests run twice what they said last."""
+    outcomes: dict[tuple[str, str], tuple[bool, list[str]]] = {}
     for path in paths:
         for case in ElementTree.parse(path).iter("testcase"):
-            if case.find("skipped") is not None:
-                continue
-            name = case.get("name", "")
-            device = "CUDA" if "cuda" in name else "CPU"
-            good = case.find("failure") is None and case.find("error") is None
-            for entry in case.iter("property"):
-                if entry.get("name") == "atlas":
-                    row, stage, rung = entry.get("value", "").split("/")
-                    found[device][int(row), stage, rung].append(good)
+            if case.find("skipped") is None:
+                good = case.find("failure") is None and case.find("error") is None
+                cells = [entry.get("value", "") for entry in case.iter("property") if entry.get("name") == "atlas"]
+                outcomes[case.get("classname", ""), case.get("name", "")] = good, cells
+    found: dict[str, Results] = {"CPU": collections.defaultdict(list), "CUDA": collections.defaultdict(list)}
+    for (_, name), (good, cells) in outcomes.items():
+        for cell in cells:
+            row, stage, rung = cell.split("/")
+            found["CUDA" if "cuda" in name else "CPU"][int(row), stage, rung].append(good)
     return found
 
 
@@ -65,6 +69,8 @@ def make_table(results: dict[str, Results], before: str) -> str:
                 (cell_text(results[device], row, stage) or kept[index].strip())
                 for index, device in enumerate(("CPU", "CUDA"))
             ]
+            if stage in ON_HOST:
+                columns[1] = "on the host"
             lines.append(f"| {row} | {stage} | {' '.join(atlas.rungs_of(stage))} | {' | '.join(columns)} |")
     return "\n".join(lines)
 
@@ -80,7 +86,9 @@ def main() -> None:
     table = make_table(read_reports(options.reports), match.group(1))
     notes = [line for line in match.group(1).splitlines() if line.startswith("- ")]
     if options.note:
-        notes.append(f"- {options.note}")
+        # A note says first what it is about ("CPU: ..."), and takes the place of the one before it.
+        about = options.note.split(":")[0]
+        notes = [line for line in notes if not line.startswith(f"- {about}:")] + [f"- {options.note}"]
     body = "\n".join([*notes, "", table] if notes else ["", table])
     FILE.write_text(text.replace(match.group(0), f"{BEGIN}\n{body}\n{END}"))
 

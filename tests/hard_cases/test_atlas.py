@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 
-from tests.hard_cases import atlas, measure_errors
+from tests.hard_cases import atlas, measure_errors, table
 from tests.hard_cases.rig import RUNGS, SIZE, make_quality, make_scene
 from warp_ar import explain
 from warp_ar.graph import make_plan
@@ -76,3 +76,23 @@ def test_tests_that_stand_elsewhere_exist() -> None:
         assert f"def {function}(" in (ROOT / "tests" / file).read_text(), (
             f"{name} is named in the atlas and does not exist"
         )
+
+
+REPORT = """<testsuites><testsuite><testcase classname="a" name="test_one[{device}-nearest]"><properties>
+<property name="atlas" value="1/unwrap/nearest"/></properties>{inner}</testcase></testsuite></testsuites>"""
+
+
+def test_the_table_adds_reports_up(tmp_path: pathlib.Path) -> None:
+    """One report a file, both devices in one; a test that was run again counts once."""
+    paths = []
+    for number, (device, inner) in enumerate((("cpu", ""), ("cuda:0", "<failure/>"), ("cuda:0", ""), ("cpu", ""))):
+        paths.append(tmp_path / f"r_{number}.xml")
+        paths[-1].write_text(REPORT.format(device=device, inner=inner).replace('"a"', f'"a{number % 2}"'))
+    found = table.read_reports(paths)
+    # The failure in the second report counts until the same test passes in a later one: here it never does.
+    assert found["CUDA"][1, "unwrap", "nearest"] == [False, True]
+    assert found["CPU"][1, "unwrap", "nearest"] == [True, True]
+    made = table.make_table(found, "")
+    assert "| 1 | unwrap | nearest bilinear area | 1/3 (2 tests) | FAILED: nearest |" in made
+    assert "| 15 | track | default |  | on the host |" in made
+    assert table.make_table({"CPU": {}, "CUDA": {}}, made).splitlines()[2] == made.splitlines()[2], "kept"

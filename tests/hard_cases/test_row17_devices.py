@@ -46,6 +46,7 @@ BOUNDS = {
     "object_light": Bound(2e-3, "one of 32 rays may fall on the other side of an edge", 0.05),
     "shade": Bound(5e-4, "powers, and edges of silhouettes and shadows", 0.02),
     "composite": Bound(0.0, "thresholds are exact; a code may move where radiance lies within an ulp of one", 0.001),
+    "declip": Bound(1e-4, "sums of sums over ten levels, and a power"),
     "expose": Bound(0.0, "as composite", 0.001),
 }
 DEFAULT = Bound(1e-3, "a stage that states no bound of its own", 0.02)
@@ -103,7 +104,7 @@ def test_the_comparison_itself(stage):
 
 @pytest.mark.atlas(row=17, stage="pipeline")
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
-def test_pictures_of_both_devices():
+def test_pictures_of_cpu_and_cuda():
     """Whole frames, errors of all stages together: hardly a pixel is off by more than one code."""
     with Rig("cpu") as cpu, Rig(CUDA[0]) as cuda:
         for name in ("noise", "ramp", "one saturated pixel"):
