@@ -38,7 +38,7 @@ from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meet
 
 wp.set_module_options({"enable_backward": False})
 
-RUNGS = ("nearest", "bilinear", "area")
+RUNGS = ("bilinear", "area")
 
 RIM_START = 2.5
 """Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
@@ -356,27 +356,20 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
                         ramp = wp.clamp(wp.min(at[2] - rim_start, inside) / rim_width, 0.0, 1.0)
                         if inside >= 0.0 and ramp > 0.0:
                             weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
-                            value = wp.vec3(0.0, 0.0, 0.0)
-                            saturated = wp.vec3(0.0, 0.0, 0.0)
-                            if wp.static(rung == "nearest"):
-                                code = frame[wp.int32(wp.round(at[1])), wp.int32(wp.round(at[0]))]
-                                value = decode(table, code)
-                                saturated = is_clipped(code)
-                            else:
-                                i = wp.int32(at[1])
-                                j = wp.int32(at[0])
-                                fy = at[1] - wp.float32(i)
-                                fx = at[0] - wp.float32(j)
-                                i1 = wp.min(i + 1, frame.shape[0] - 1)
-                                j1 = wp.min(j + 1, frame.shape[1] - 1)
-                                p00 = frame[i, j]
-                                p01 = frame[i, j1]
-                                p10 = frame[i1, j]
-                                p11 = frame[i1, j1]
-                                top = mix(decode(table, p00), decode(table, p01), fx)
-                                value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
-                                top = mix(is_clipped(p00), is_clipped(p01), fx)
-                                saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
+                            i = wp.int32(at[1])
+                            j = wp.int32(at[0])
+                            fy = at[1] - wp.float32(i)
+                            fx = at[0] - wp.float32(j)
+                            i1 = wp.min(i + 1, frame.shape[0] - 1)
+                            j1 = wp.min(j + 1, frame.shape[1] - 1)
+                            p00 = frame[i, j]
+                            p01 = frame[i, j1]
+                            p10 = frame[i1, j]
+                            p11 = frame[i1, j1]
+                            top = mix(decode(table, p00), decode(table, p01), fx)
+                            value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
+                            top = mix(is_clipped(p00), is_clipped(p01), fx)
+                            saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
                             total += weight
                             mean = mix(mean, value, weight / total)
                             mean_clipped = mix(mean_clipped, saturated, weight / total)
@@ -433,7 +426,7 @@ def gather_probe(
         radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
         confidence_out: ``wp.float32`` (h, w) in 0..1.
         clipped_out: ``wp.vec3`` (h, w): share of the footprint that is at clipping, per channel.
-        rung: ``nearest`` or ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
+        rung: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
             up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
         rim_width: Pixels over which confidence then rises.

@@ -33,13 +33,13 @@ COSTS = Costs(
     20.0,
     {
         "diffuse": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
-        "specular": {"box_mip": -4.0, "energy_mip": 0.0, "fis8": 5.0, "fis32": 20.0},
+        "specular": {"box_mip": -4.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
         "room_shadow": {"none": -8.0, "coarse": 0.0, "fine": 30.0},
     },
 )
 ERRORS = {
     "diffuse": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
-    "specular": {"box_mip": 0.04, "energy_mip": 0.01, "fis8": 0.02, "fis32": 0.0},
+    "specular": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
     "room_shadow": {"none": 0.06, "coarse": 0.03, "fine": 0.0},
 }
 

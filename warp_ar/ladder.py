@@ -39,7 +39,13 @@ class Knob:
     stages: tuple[str, ...]
     """Stages whose work it changes."""
 
+    @property
+    def converges(self) -> bool:
+        """Whether its rungs approximate one thing, which the last of them gives; others are models of their own."""
+        return self.name in _CONVERGING
 
+
+_CONVERGING = ("environment_height", "edge_samples", "light_shadow", "unwrap", "diffuse", "specular", "room_shadow")
 _LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples")
 KNOBS: tuple[Knob, ...] = (
     Knob("environment_height", ("32", "64", "128", "256"), _LIGHT),
@@ -48,6 +54,82 @@ KNOBS: tuple[Knob, ...] = (
     *(Knob(stage.name, tuple(stage.rungs), (stage.name,)) for stage in STAGES if len(stage.rungs) > 1),
 )
 """All there are."""
+WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "environment_height": ("rows of the map that holds the room's light", {}),
+    "edge_samples": ("samples per pixel along the outlines of virtual objects", {}),
+    "light_shadow": (
+        "shadows of virtual lights",
+        {"hard": "as if every lamp were a point (the paper)", "soft": "as wide as the lamp"},
+    ),
+    "unwrap": (
+        "reading the light off the mirror ball, judged with a map of 32 rows",
+        {
+            "bilinear": "one sample between pixels (the paper)",
+            "area": "the mean over what a texel covers",
+        },
+    ),
+    "recover": (
+        "light that clips in the ball",
+        {
+            "clipped": "as the camera saw it (the paper)",
+            "white_card": "scaled until it lights the white card as brightly as the frame shows",
+            "shading": "shared among lamps as shading and shadows in the frame tell",
+        },
+    ),
+    "diffuse": (
+        "light that matt surfaces receive",
+        {
+            "top_mip": "a 4x8 map (the paper)",
+            "sh2": "spherical harmonics of order 2",
+            "sh4": "of order 4",
+            "clusters": "200 clusters of the room, summed for every direction",
+            "brute_force": "every texel for every direction",
+        },
+    ),
+    "specular": (
+        "light that glossy surfaces reflect",
+        {
+            "box_mip": "a pyramid of means (the paper)",
+            "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
+            "fis32": "32 importance samples per texel",
+            "fis128": "128 importance samples per texel",
+            "brute_force": "every texel for every direction and width",
+        },
+    ),
+    "relight": (
+        "virtual light on the real desk",
+        {
+            "flat": "on a grey desk",
+            "paper": "blended by the frame's brightness (the paper)",
+            "relief": "the paper's blend, relief told from paint",
+            "reflectance": "on the reflectance that frame and room light give",
+        },
+    ),
+    "room_shadow": (
+        "shadows of virtual things in the room's light, and the light that they reflect onto the desk",
+        {
+            "none": "none (the paper)",
+            "coarse": "16 rays per estimate, every second pixel",
+            "bounce": "64 rays, every second pixel, and reflected light",
+            "fine": "the same at every pixel",
+            "brute_force": "every texel of the room at every pixel",
+        },
+    ),
+    "shade": (
+        "what virtual objects reflect",
+        {"environment": "the room (the paper)", "one_bounce": "the room, the desk and each other"},
+    ),
+    "expose": (
+        "clipped pixels at a shorter exposure",
+        {
+            "plain": "scaled",
+            "box": "scaled less where surroundings clip too (the paper)",
+            "glow": "from the glow around them",
+            "ball": "from the glow and the ball's view of the same lamp",
+        },
+    ),
+}
+"""What every knob and every rung is, for tables."""
 NUMBERS = ("environment_height", "edge_samples")
 """Knobs that are numbers of ``Quality``, not rungs."""
 
@@ -99,7 +181,7 @@ class Price:
     rung: str
     milliseconds: float
     error: float
-    """Mean FLIP above that of the knob's best rung."""
+    """FLIP, as the price list defines it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +242,7 @@ def choose_for_error(front: Sequence[Choice], error: float) -> Choice:
 
 
 def load_errors() -> dict[str, dict[str, float]]:
-    """Mean excess error of every rung of every knob, from the price list that comes with the package."""
+    """Error of every rung of every knob, from the price list that comes with the package."""
     text = importlib.resources.files("warp_ar").joinpath(PRICE_LIST).read_text(encoding="utf-8")
     return read_errors(json.loads(text))
 

@@ -105,3 +105,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
     }
 )
 DEFAULT_PRESET = "medium"
+BUDGETS: Mapping[str, float] = MappingProxyType({"low": 25.0, "medium": 50.0, "high": 250.0})
+"""Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included, within which a
+preset errs least by the price list; docs/prices.md says more, ``python -m bench.write_prices`` applies it. ``paper`` is
+the paper's method, ``reference`` the last rungs that end within a lifetime: neither has a budget."""

@@ -3,10 +3,14 @@
 Every knob of a scene (see ``ladder``) is turned through its rungs, all others staying on ``BASE``. Per rung it notes
 
 - how far what the stage writes is from what the knob's last rung writes: relative RMSE, worst texel, energy drift;
-- how far the picture is from the truth (a path tracer's: bundled scenes come with one frame of it) or else from the
+- how far the picture is from the truth (a path tracer's: bundled scenes come with one frame of it), and from the
   picture at the knob's last rung: FLIP, summed over the picture and divided by the pixels that anything virtual
   changes, so that errors of different knobs are on one scale;
-- the median milliseconds per frame of the knob's own stages, and of those that run only for this rung.
+- the mean milliseconds per frame of the knob's own stages, and of those that run only for this rung.
+
+**A rung's error.** Where the rungs approximate one thing that the last of them gives (``converges``), it is the
+distance from the last: nearer to the truth than the exact light would be is luck, for something else is wrong then.
+Where rungs are models of their own, the distance from the truth, less that of the best.
 
 Then presets, and the best choices for the paper's time and for the paper's error, are run as a whole, frame by frame in
 turn. Those choices are made from the committed price list, not from the errors of the case that they are scored on, and
@@ -78,6 +82,10 @@ WARM_UP = 3
 DEFAULT_FRAMES = 12
 TIMED = 5
 """Last frames that are run at a rung, the first of them not timed; those before only bring the light."""
+LAMP_RADIUS = 0.02
+"""Metres, of ``sized_lamp``: a light bulb."""
+SIZED = ", sized lamp"
+"""At the end of such a case's name."""
 REPEAT_BELOW = 2000.0
 """Milliseconds: a frame that took less is run again where it was the only one, for it loaded the kernels."""
 TRIES = 6
@@ -109,6 +117,8 @@ _LIGHT_ONLY = {
 }
 """Rungs of what only shows the light, for frames that nobody looks at."""
 
+_FAIR = {"unwrap": {"environment_height": "32"}}
+"""Other rungs at which a knob is turned: footprints on the ball matter where texels are coarse."""
 _OUTPUT = {
     "unwrap": "probe_radiance",
     "recover": "environment",
@@ -135,7 +145,12 @@ class Case:
     truth: Mapping[int, Image]
     """What the camera would have seen, by frame; empty where that is not known."""
     regions: Mapping[int, Mask] = dataclasses.field(default_factory=dict)
-    """Pixels that anything virtual, or the exposure, changes, where the truth says so."""
+    """Pixels that anything virtual changes, or that clip, where the truth says so."""
+
+    @property
+    def darker(self) -> bool:
+        """Whether what matters is what clips: at another exposure all else is scaled, and errs by rounding alone."""
+        return is_darker(self.scene)
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -150,7 +165,7 @@ class Outcome:
     quality: Quality
     images: Mapping[int, Image]
     stages: Mapping[str, float]
-    """Median milliseconds of every stage over the frames in which it ran, the marker's tracking left out."""
+    """Mean milliseconds of every stage over the frames in which it ran, the marker's tracking left out."""
     output: npt.NDArray[Any] | None
     """What the knob's stage had written at the end."""
 
@@ -175,8 +190,10 @@ class Row:
     """Mean FLIP of the picture per changed pixel."""
     against: str
     """``truth`` or ``last rung``."""
-    excess: float = 0.0
-    """``flip`` above that of the knob's best rung."""
+    apart: float = 0.0
+    """The same against the picture at the last rung."""
+    error: float = 0.0
+    """What counts: ``apart`` where the knob converges or no truth is known, else ``flip`` above the best rung's."""
     dominated: bool = False
     """Another rung costs no more and errs no more."""
 
@@ -277,13 +294,18 @@ def load_case(
 def _complete(scene: Scene, camera: Image, truth: Image) -> tuple[Image, Mask]:
     """The truth's whole picture, and the region in which it says anything that the frame does not."""
     scale = scene.exposure.scale
-    darker = not isinstance(scale, str) and scale < 1.0
     if truth.shape[2] == 3:
-        return truth, clipped_region(camera) if darker else changed_region(camera, truth)
+        return truth, clipped_region(camera) if is_darker(scene) else changed_region(camera, truth)
     # Where the truth is transparent nothing changes but the exposure, and nothing clips.
     rest = camera if isinstance(scale, str) else scale_codes(camera, scale, scene.camera.transfer)
     region = truth[..., 3] > 0
     return np.where(region[..., None], truth[..., :3], rest), region
+
+
+def is_darker(scene: Scene) -> bool:
+    """Whether a scene asks for a shorter exposure and nothing else that the frame does not show."""
+    scale = scene.exposure.scale
+    return not isinstance(scale, str) and scale < 1.0 and not scene.objects and not scene.lights
 
 
 def scale_codes(image: Image, scale: float, transfer: str | Path) -> Image:
@@ -322,6 +344,13 @@ def open_scene(name: str, count: int, times: int = 1) -> Case:
     return load_case(name, scene, count, {number: read_image(found[0])}, times, max(0, number + 1 - count))
 
 
+def sized_lamp(case: Case) -> Case:
+    """The case with lamps that have a size, whose shadows are soft; what they truly look like is not known."""
+    lights = tuple(dataclasses.replace(light, radius=LAMP_RADIUS) for light in case.scene.lights)
+    scene = dataclasses.replace(case.scene, lights=lights)
+    return dataclasses.replace(case, name=case.name + SIZED, scene=scene, truth={}, regions={})
+
+
 def truth_folders(truth: Path) -> list[Path]:
     """Cases under a folder, or the folder itself if it is one."""
     return [truth] if (truth / "case.json").is_file() else sorted(path for path in truth.iterdir() if path.is_dir())
@@ -332,6 +361,8 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
     names = options.scenes or ([] if options.truth is not None else ["desk"])
     for name in bundled_scenes() if names == ["all"] else names:
         yield open_scene(name, options.frames, options.shrink)
+    if names == ["all"]:
+        yield sized_lamp(open_scene("desk", options.frames, options.shrink))
     if options.truth is None:
         return
     found = False
@@ -411,7 +442,8 @@ def run(
             pipeline.scheduler.forget()
             note(pipeline(case.frames[-1].image, time_seconds=case.frames[-1].time + 1e-3, pose=case.poses[-1]))
     times.pop(TRACK, None)
-    return Outcome(quality, images, {name: statistics.median(own or [0.0]) for name, own in times.items()}, output)
+    # The mean, not the median: what a stage does now and then costs as well.
+    return Outcome(quality, images, {name: statistics.fmean(own or [0.0]) for name, own in times.items()}, output)
 
 
 def _open(case: Case, quality: Quality, device: str, clock: Clock) -> Pipeline:
@@ -501,11 +533,23 @@ def resample(latlong: npt.NDArray[Any], shape: tuple[int, int]) -> npt.NDArray[n
 
 def picture_error(case: Case, reference: Mapping[int, Image], images: Mapping[int, Image]) -> float:
     """Sum of FLIP over the picture divided by the pixels that anything virtual changes, mean over compared frames."""
-    errors = []
-    for index, picture in reference.items():
-        region = region_of(case, index, picture)
-        errors.append(float(flip_map(picture, images[index]).sum()) / max(int(region.sum()), 1))
-    return statistics.fmean(errors)
+    return statistics.fmean(
+        _flip_per_pixel(case, picture, images[index], region_of(case, index, picture))
+        for index, picture in reference.items()
+    )
+
+
+def _apart(case: Case, reference: Mapping[int, Image], last: Mapping[int, Image], images: Mapping[int, Image]) -> float:
+    """FLIP between two rungs' pictures, divided as ``picture_error`` divides."""
+    return statistics.fmean(
+        _flip_per_pixel(case, last[index], images[index], region_of(case, index, picture))
+        for index, picture in reference.items()
+    )
+
+
+def _flip_per_pixel(case: Case, a: Image, b: Image, region: Mask) -> float:
+    errors = flip_map(a, b)
+    return float((errors * region if case.darker else errors).sum()) / max(int(region.sum()), 1)
 
 
 def region_of(case: Case, index: int, reference: Image) -> Mask:
@@ -525,7 +569,7 @@ def sweep(
     """Every rung of one knob, or those named: its row, and its last picture."""
     outcomes: dict[str, Outcome] = {}
     for rung in rungs or knob.rungs:
-        turned = turn(base, {knob.name: rung})
+        turned = turn(base, {**_FAIR.get(knob.name, {}), knob.name: rung})
         timed = 1 if rung == "brute_force" else TIMED
         outcomes[rung] = run(case, turned, device, knob, between=light_only(turned), timed=timed, clock=clock)
     last = list(outcomes.values())[-1]
@@ -544,10 +588,13 @@ def sweep(
                 _stage_error(outcome, last),
                 picture_error(case, reference, outcome.images),
                 "truth" if case.truth else "last rung",
+                _apart(case, reference, last.images, outcome.images),
             )
         )
     best = min(row.flip for row in rows)
-    rows = [dataclasses.replace(row, excess=row.flip - best, dominated=_is_dominated(row, rows)) for row in rows]
+    own_scale = knob.converges or not case.truth
+    rows = [dataclasses.replace(row, error=row.apart if own_scale else row.flip - best) for row in rows]
+    rows = [dataclasses.replace(row, dominated=_is_dominated(row, rows)) for row in rows]
     return rows, {rung: outcome.images[case.shown[-1]] for rung, outcome in outcomes.items()}
 
 
@@ -559,7 +606,7 @@ def _is_dominated(row: Row, rows: Sequence[Row]) -> bool:
 
     def better(a: Row, b: Row) -> bool:
         cheaper = a.milliseconds < (1.0 - COST_NOISE) * b.milliseconds
-        nearer = a.flip < b.flip - FLIP_NOISE
+        nearer = a.error < b.error - FLIP_NOISE
         mine, yours = (x.stage_error.relative_rmse if x.stage_error else 0.0 for x in (a, b))
         return cheaper or nearer or mine < (1.0 - RMSE_NOISE) * yours
 
@@ -611,6 +658,10 @@ def measure_case(
         own, shown = sweep(case, knob, device, rungs=rungs, clock=clock)
         rows += own
         pictures.update({(knob.name, rung): image for rung, image in shown.items()})
+    if case.name.endswith(SIZED):
+        last = pictures[knobs[-1].name, rows[-1].rung]
+        region = region_of(case, case.shown[-1], last)
+        return CaseReport(case, {case.shown[-1]: last}, tuple(rows), pictures, (), region)
     advance("presets")
     qualities = {name: PRESETS[name] for name in RUNS}
     best = None
@@ -652,7 +703,7 @@ def listed_errors(rows: Sequence[Row]) -> Mapping[str, Mapping[str, float]]:
     listed = load_errors()
     if any(any(own.values()) for own in listed.values()):
         return listed
-    return {knob: {row.rung: row.excess for row in own} for knob, own in itertools.groupby(rows, lambda row: row.knob)}
+    return {knob: {row.rung: row.error for row in own} for knob, own in itertools.groupby(rows, lambda row: row.knob)}
 
 
 def _find_same_time(case: Case, front: Sequence[Choice], base_ms: float, device: str, clock: Clock) -> Quality:
@@ -783,7 +834,7 @@ def make_figures(
 def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
     """Errors of every rung, and the rungs that another beats in every case.
 
-    ``errors`` is FLIP per changed pixel above that of the knob's best rung, mean over the cases in which the knob
+    ``errors`` is FLIP per changed pixel as a rung's error counts (see above), mean over the cases in which the knob
     matters. ``stage_errors`` is the relative RMSE of what the stage writes against its last rung, mean likewise.
     Both depend on the device only by rounding; costs do not, so they are not kept here.
     """
@@ -796,9 +847,9 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
             continue
         measured = {row.rung for row in rows}
         by_rung = {rung: [row for row in rows if row.rung == rung] for rung in knob.rungs if rung in measured}
-        flips = {rung: statistics.fmean(row.flip for row in own) for rung, own in by_rung.items()}
-        best = min(flips.values())
-        errors[knob.name] = {rung: round(flip - best, 5) for rung, flip in flips.items()}
+        means = {rung: statistics.fmean(row.error for row in own) for rung, own in by_rung.items()}
+        best = min(means.values())
+        errors[knob.name] = {rung: round(mean - best, 5) for rung, mean in means.items()}
         arrays = {
             rung: [row.stage_error.relative_rmse for row in own if row.stage_error is not None]
             for rung, own in by_rung.items()
@@ -816,6 +867,11 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
         },
         "errors": errors,
         "stage_errors": stage_errors,
+        "wholes": {
+            report.case.name: {whole.label: round(whole.flip, 4) for whole in report.wholes if whole.label in RUNS}
+            for report in reports
+            if report.wholes
+        },
         "dominated": {knob: rungs for knob, rungs in dominated.items() if rungs},
     }
 
@@ -841,7 +897,7 @@ def print_report(report: CaseReport, console: Console) -> None:
     table = Table(title=f"{report.case.name}: every rung, FLIP against {against}")
     for column in ("knob", "rung"):
         table.add_column(column)
-    for column in ("ms", "rel. RMSE", "worst", "drift", "FLIP", "above best"):
+    for column in ("ms", "rel. RMSE", "worst", "drift", "FLIP", "error"):
         table.add_column(column, justify="right")
     table.add_column("")
     for _, group in itertools.groupby(report.rows, lambda row: row.knob):
@@ -858,7 +914,7 @@ def print_report(report: CaseReport, console: Console) -> None:
                 f"{row.milliseconds:.3f}",
                 *numbers,
                 f"{row.flip:.4f}",
-                f"{row.excess:.4f}",
+                f"{row.error:.4f}",
                 "dominated" if row.dominated else "",
                 style="dim" if row.dominated else "",
             )
@@ -952,6 +1008,8 @@ def tradeoff(options: argparse.Namespace) -> int:
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), console=console) as progress:
         for case in open_cases(options):
             knobs = chosen_knobs(case, options.stage)
+            if case.name.endswith(SIZED):
+                knobs = tuple(knob for knob in knobs if knob.name == "light_shadow")
             if not knobs:
                 console.print(f"{case.name}: nothing to turn", highlight=False)
                 continue

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.ladder import KNOBS, WORDS
 from warp_ar.metrics import flip_map
 
 if TYPE_CHECKING:
@@ -21,56 +22,73 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.uint8]
 Box = tuple[slice, slice]
 
-PHOTO_QUALITY = 90
-"""Of JPEG, for photographs."""
-CROP_SIDE = 300
-"""Crops are scaled to about this many pixels across."""
+QUALITY = 82
+"""Of WebP, for all pictures."""
+CROP_WIDTH = 360
+"""Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
 CROP_ASPECT = 4.0 / 3.0
 """Width over height of a crop."""
-PLOT = (560, 300)
+PLOT = (560, 320)
 """Width and height of a chart."""
-MARGIN = (58, 18, 18, 44)
+SMALL_PLOT = (400, 280)
+"""Of one among many."""
+MARGIN = (64, 22, 40, 46)
 """Left, right, top, bottom of a chart's plotting area."""
+SHOWN = ("paper", "ours in the paper's time", "medium", "high")
+"""Wholes whose pictures are shown."""
+REAL_TIME = 1e3 / 30.0
+"""Milliseconds of a frame at 30 frames per second."""
 
 _STYLE = """
-:root{--page:#fbfbf9;--ink:#1b1c1e;--soft:#62656b;--line:#dcdcd6;--card:#fff;--mark:#2f6fdf;--other:#9a9c9f;--warm:#c2571a}
-@media(prefers-color-scheme:dark){:root{--page:#141517;--ink:#ececea;--soft:#a0a3a8;--line:#303236;--card:#1c1e21;
+:root{color-scheme:light dark;--page:#fbfbf9;--ink:#1b1c1e;--soft:#5c5f65;--line:#dcdcd6;--card:#fff;--mark:#2f6fdf;
+--other:#9a9c9f;--warm:#c2571a}
+@media(prefers-color-scheme:dark){:root{--page:#141517;--ink:#ececea;--soft:#a9acb1;--line:#303236;--card:#1c1e21;
 --mark:#7aa7ff;--other:#74777c;--warm:#f09a5e}}
-*{box-sizing:border-box}body{margin:0;background:var(--page);color:var(--ink);
+*{box-sizing:border-box}html{scroll-behavior:smooth}body{margin:0;background:var(--page);color:var(--ink);
 font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",Arial,sans-serif}
 main{max-width:1180px;margin:0 auto;padding:40px 24px 80px}h1{font-size:34px;line-height:1.15;margin:0 0 8px}
 h2{font-size:24px;margin:64px 0 4px;padding-top:20px;border-top:1px solid var(--line)}
-h3{font-size:17px;margin:36px 0 8px}
-p{max-width:72ch;margin:6px 0 14px}.soft{color:var(--soft)}nav a{margin-right:16px}a{color:var(--mark)}
-.row{display:grid;gap:6px 8px;margin:12px 0}.row figure{margin:0;min-width:0}.row img{width:100%;display:block;
-border-radius:4px}figcaption{font-size:13px;color:var(--soft);padding:5px 1px 2px;font-variant-numeric:tabular-nums}
-figcaption b{color:var(--ink);font-weight:600}.split{display:grid;grid-template-columns:minmax(0,1fr) minmax(0,1fr);
-gap:16px;align-items:start}@media(max-width:900px){.split{grid-template-columns:1fr}}
+h3{font-size:17px;margin:40px 0 2px}
+p{max-width:76ch;margin:6px 0 14px}.lead{font-size:17px}.soft{color:var(--soft)}a{color:var(--mark)}
+nav{display:flex;flex-wrap:wrap;gap:4px 16px;margin:14px 0}
+.row{display:grid;gap:6px 8px;margin:12px 0;overflow-x:auto;padding-bottom:4px}.row figure{margin:0;min-width:0}
+.row img{width:100%;display:block;border-radius:4px}
+figcaption{font-size:13px;line-height:1.35;color:var(--soft);padding:5px 1px 2px;font-variant-numeric:tabular-nums}
+figcaption b{color:var(--ink);font-weight:600}
+.split{display:grid;grid-template-columns:minmax(0,1fr) minmax(0,1fr);gap:16px;align-items:start}
+.many{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(340px,100%),1fr));gap:16px;margin:16px 0}
+@media(max-width:900px){.split{grid-template-columns:minmax(0,1fr)}}
 .card{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px 14px;overflow-x:auto}
+.card h4{margin:0 0 6px;font-size:15px}.card p{margin:8px 0 2px;font-size:14px}
 table{border-collapse:collapse;width:100%;font-size:13.5px;font-variant-numeric:tabular-nums}
-th{font-weight:600;color:var(--soft);text-align:right;border-bottom:1px solid var(--line);padding:3px 6px}
-td{text-align:right;padding:3px 6px;border-bottom:1px solid var(--line)}tr:last-child td{border-bottom:0}
-td:first-child,th:first-child{text-align:left}tr.out td{color:var(--soft)}svg{display:block;width:100%;height:auto}
-svg text{fill:var(--soft);font-size:12px}svg .label{fill:var(--ink)}svg .axis{stroke:var(--line)}
-svg .on{fill:var(--mark)}svg .off{fill:none;stroke:var(--other);stroke-width:1.6}
-svg .front{fill:none;stroke:var(--mark);stroke-width:1.6;opacity:.55}
-.scale{display:inline-block;width:150px;height:10px;border-radius:3px;vertical-align:middle;margin:0 8px}
+th{font-weight:600;color:var(--soft);text-align:right;border-bottom:1px solid var(--line);padding:3px 6px;
+vertical-align:bottom}
+td{text-align:right;padding:3px 6px;border-bottom:1px solid var(--line);vertical-align:top}
+tr:last-child td{border-bottom:0}td:first-child,th:first-child,td.text{text-align:left}td.text{color:var(--soft)}
+tr.out td{color:var(--soft)}tr.head td{font-weight:600;padding-top:12px}
+svg{display:block;width:100%;height:auto}
+svg text{fill:var(--soft);font-size:12.5px;paint-order:stroke;stroke:var(--card);stroke-width:4px;
+stroke-linejoin:round}svg .label{fill:var(--ink)}
+svg .axis{stroke:var(--line)}svg .limit{stroke:var(--warm);stroke-dasharray:4 4}svg text.limit{fill:var(--warm);
+stroke:var(--card);stroke-dasharray:none}svg .on{fill:var(--mark)}svg .off{fill:var(--card);stroke:var(--other);
+stroke-width:1.6}svg .front{fill:none;stroke:var(--mark);stroke-width:1.6;opacity:.55}
+.scale{display:inline-grid;grid-template-columns:repeat(5,44px);vertical-align:middle;margin:0 8px;font-size:11px;
+text-align:center}.scale img{grid-column:1/-1;width:100%;height:10px;border-radius:3px}
+@media(max-width:600px){main{padding:24px 16px 60px}h1{font-size:28px}svg text{font-size:17px}
+.row{grid-auto-columns:150px}table{font-size:13px}}
 """
 
 
 # ------------------------------------------------------------------------------------------------------------- pictures
 
 
-def data_uri(image: npt.NDArray[np.uint8], *, photo: bool) -> str:
-    """An RGB picture as a data URI: JPEG for photographs, else PNG."""
+def data_uri(image: Image) -> str:
+    """An RGB picture as a data URI."""
     bgr = np.ascontiguousarray(image[..., ::-1])
-    done, code = (
-        cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, PHOTO_QUALITY]) if photo else cv2.imencode(".png", bgr)
-    )
+    done, code = cv2.imencode(".webp", bgr, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
     if not done:
         raise ValueError(f"a picture of shape {image.shape} cannot be encoded")
-    kind = "jpeg" if photo else "png"
-    return f"data:image/{kind};base64,{base64.b64encode(code.tobytes()).decode('ascii')}"
+    return f"data:image/webp;base64,{base64.b64encode(code.tobytes()).decode('ascii')}"
 
 
 def error_colors(errors: npt.NDArray[Any]) -> Image:
@@ -98,32 +116,37 @@ def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
 
 
 def crop(image: Image, box: Box) -> Image:
-    """Part of a picture, scaled up in whole steps so that its pixels stay visible."""
+    """Part of a picture: small ones scaled up in whole steps so that pixels stay visible, large ones averaged down."""
     part = image[box]
-    times = max(1, round(CROP_SIDE / part.shape[1]))
-    return np.ascontiguousarray(np.kron(part, np.ones((times, times, 1), np.uint8)))
+    times = max(1, round(CROP_WIDTH / part.shape[1]))
+    if times > 1:
+        return np.ascontiguousarray(np.kron(part, np.ones((times, times, 1), np.uint8)))
+    if part.shape[1] <= CROP_WIDTH:
+        return np.ascontiguousarray(part)
+    size = CROP_WIDTH, max(1, round(part.shape[0] * CROP_WIDTH / part.shape[1]))
+    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def figure(image: Image, caption: str, *, photo: bool = True) -> str:
-    """A picture and what it is; the caption is HTML."""
-    plain = html.escape(caption.replace("<b>", "").replace("</b>", ""), quote=True)
+def figure(image: Image, caption: str, about: str = "") -> str:
+    """A picture and what it is; the caption is HTML, the text for those who do not see it is not."""
+    plain = html.escape(about or caption.replace("<b>", "").replace("</b>", ""), quote=True)
     return (
-        f'<figure><img src="{data_uri(image, photo=photo)}" alt="{plain}"><figcaption>{caption}</figcaption></figure>'
+        f'<figure><img loading="lazy" src="{data_uri(image)}" alt="{plain}"><figcaption>{caption}</figcaption></figure>'
     )
 
 
 def strip(columns: Sequence[tuple[str, Image]], reference: Image | None, box: Box) -> str:
     """Crops side by side, and below each its error against ``reference``."""
-    style = f'<div class="row" style="grid-template-columns:repeat({len(columns)},minmax(0,1fr))">'
-    parts = [style, *(figure(crop(image, box), f"<b>{html.escape(label)}</b>") for label, image in columns)]
+    style = f'<div class="row" style="grid-template-columns:repeat({len(columns)},minmax(150px,1fr))">'
+    parts = [style, *(figure(crop(image, box), f"<b>{html.escape(label)}</b>", label) for label, image in columns)]
     if reference is not None:
-        for _, image in columns:
+        for label, image in columns:
             if image is reference:
                 parts.append("<figure><figcaption>what the others are compared with</figcaption></figure>")
                 continue
             errors = flip_map(reference, image)
-            text = f"FLIP {errors[box].mean():.4f} here, {errors.mean():.4f} overall"
-            parts.append(figure(crop(error_colors(errors), box), text, photo=False))
+            text = f"mean FLIP here {errors[box].mean():.3f}"
+            parts.append(figure(crop(error_colors(errors), box), text, f"error of {label}"))
     return "".join([*parts, "</div>"])
 
 
@@ -138,18 +161,28 @@ def _ticks(low: float, high: float) -> list[float]:
     return inside if len(inside) <= 8 else [10.0**e for e in tens if low <= 10.0**e <= high]
 
 
-def scatter(points: Sequence[tuple[str, float, float, bool]], x_title: str, y_title: str) -> str:
+def scatter(
+    points: Sequence[tuple[str, float, float, bool]],
+    x_title: str,
+    y_title: str,
+    limit: float | None = None,
+    size: tuple[int, int] = PLOT,
+) -> str:
     """A chart of cost against error, cost logarithmic: points that nothing dominates are filled and joined.
 
     Args:
         points: Label, cost, error, whether something dominates it.
         x_title: What the cost is.
         y_title: What the error is.
+        limit: A cost to mark: that of a frame at 30 frames per second.
+        size: Width and height.
     """
-    width, height = PLOT
+    width, height = size
     left, right, top, bottom = MARGIN
     costs = [max(cost, 1e-3) for _, cost, _, _ in points]
     low, high = min(costs) / 1.6, max(costs) * 2.2
+    if limit is not None and not low < limit < high:
+        limit = None
     tall = max(max(error for _, _, error, _ in points) * 1.12, 1e-6)
 
     def x(cost: float) -> float:
@@ -169,12 +202,17 @@ def scatter(points: Sequence[tuple[str, float, float, bool]], x_title: str, y_ti
         parts.append(f'<text x="{left - 8}" y="{at + 4:.1f}" text-anchor="end">{count * step:.3g}</text>')
     for value in _ticks(low, high):
         parts.append(f'<text x="{x(value):.1f}" y="{height - bottom + 18}" text-anchor="middle">{value:g}</text>')
-    parts.append(f'<text x="{width - right}" y="{height - 6}" text-anchor="end">{html.escape(x_title)}</text>')
-    parts.append(f'<text x="{left - 46}" y="12">{html.escape(y_title)}</text>')
+    parts.append(f'<text x="{width - right}" y="{height - 6}" text-anchor="end">{html.escape(x_title)} →</text>')
+    parts.append(f'<text x="2" y="14">↑ {html.escape(y_title)}</text>')
+    if limit is not None:
+        at = x(limit)
+        parts.append(f'<line class="limit" x1="{at:.1f}" x2="{at:.1f}" y1="{top - 14}" y2="{height - bottom}"/>')
+        parts.append(f'<text class="limit" x="{at + 5:.1f}" y="{top - 6}">30 fps</text>')
     front = sorted((cost, error) for _, cost, error, out in points if not out)
     path = " ".join(f"{'M' if k == 0 else 'L'}{x(c):.1f} {y(e):.1f}" for k, (c, e) in enumerate(front))
     parts.append(f'<path class="front" d="{path}"/>')
     taken: list[tuple[float, float]] = []
+    longest = max(len(label) for label, _, _, _ in points)
     for label, cost, error, out in sorted(points, key=lambda point: point[1]):
         px, py = x(cost), y(error)
         parts.append(
@@ -182,12 +220,12 @@ def scatter(points: Sequence[tuple[str, float, float, bool]], x_title: str, y_ti
             f"<title>{html.escape(label)}: {cost:.3g} ms, {error:.4f}</title></circle>"
         )
         ty = py - 9.0
-        while any(abs(ty - other) < 13.0 and abs(px - ox) < 84.0 for ox, other in taken):
-            ty += 13.0 if ty >= py else -13.0
-            if ty < top:
-                ty = py + 18.0
+        while any(abs(ty - other) < 15.0 and abs(px - ox) < 4.0 * (len(label) + longest) for ox, other in taken):
+            ty += 15.0 if ty >= py else -15.0
+            if ty < top - 4.0:
+                ty = py + 19.0
         taken.append((px, ty))
-        anchor = "end" if px > width - 110 else "start" if px < left + 40 else "middle"
+        anchor = "end" if px > width - 20 - 4 * len(label) else "start" if px < left + 4 * len(label) else "middle"
         style = "" if out else ' class="label"'
         parts.append(f'<text{style} x="{px:.1f}" y="{ty:.1f}" text-anchor="{anchor}">{html.escape(label)}</text>')
     return "".join([*parts, "</svg>"])
@@ -208,62 +246,40 @@ def table(head: Sequence[str], rows: Iterable[tuple[Sequence[str], bool]]) -> st
 
 def _knob_table(rows: Sequence[Row]) -> str:
     def cells(row: Row) -> list[str]:
-        error = row.stage_error
+        array = row.stage_error
         numbers = (
             ["–", "–", "–"]
-            if error is None
-            else [f"{error.relative_rmse:.2%}", f"{error.worst:.2f}", f"{error.energy_drift:+.2%}"]
+            if array is None
+            else [f"{array.relative_rmse:.1%}", f"{array.worst:.2f}", f"{array.energy_drift:+.1%}"]
         )
-        return [row.rung, f"{row.milliseconds:.2f}", f"{row.flip:.4f}", *numbers]
+        return [row.rung, f"{row.milliseconds:.2f}", f"{row.flip:.4f}", f"{row.error:.4f}", *numbers]
 
-    head = ("rung", "ms", "FLIP", "rel. RMSE", "worst", "drift")
+    against = "FLIP to the truth" if rows[0].against == "truth" else "FLIP"
+    head = ("rung", "ms", against, "its error", "rel. RMSE", "worst", "drift")
     return table(head, ((cells(row), row.dominated) for row in rows))
 
 
 def _comparisons(rows: Sequence[Row]) -> str:
-    """The cheapest rung, normally the paper's, against the best of equal time and the cheapest of equal error."""
+    """Equal time and equal error within a ladder, where a rung is beaten by more than a twentieth."""
     lines = []
     for row in rows:
-        faster = [other for other in rows if other.milliseconds <= row.milliseconds and other.flip < 0.99 * row.flip]
+        faster = [other for other in rows if other.milliseconds <= row.milliseconds and other.error < 0.95 * row.error]
         if faster:
-            best = min(faster, key=lambda other: other.flip)
-            lines.append(f"In the time of {row.rung}, {best.rung} errs {1 - best.flip / row.flip:.0%} less.")
-        same = [other for other in rows if other.flip <= row.flip and other.milliseconds < 0.95 * row.milliseconds]
+            best = min(faster, key=lambda other: other.error)
+            lines.append(f"In the time of {row.rung}, {best.rung} errs {1 - best.error / row.error:.0%} less.")
+        same = [other for other in rows if other.error <= row.error and other.milliseconds < 0.95 * row.milliseconds]
         if same:
             best = min(same, key=lambda other: other.milliseconds)
-            lines.append(f"For the error of {row.rung}, {best.rung} takes {best.milliseconds / row.milliseconds:.0%}.")
-    return " ".join(dict.fromkeys(lines)) or "No rung is beaten by more than the measurement can tell."
+            share = _share(best.milliseconds, row.milliseconds)
+            lines.append(f"For the error of {row.rung}, {best.rung} takes {share} the time.")
+    return " ".join(dict.fromkeys(lines)) or "Every rung buys something: none is beaten in both time and error."
+
+
+def _share(a: float, b: float) -> str:
+    return f"{a / b:.0%} of" if b > 0.0 else "none of"
 
 
 # ------------------------------------------------------------------------------------------------------------- sections
-
-
-def _whole_section(report: CaseReport) -> str:
-    index = report.case.shown[-1]
-    camera = report.case.frames[index].image
-    box = bounding_box(report.region, camera.shape[:2])
-    by_label = {whole.label: whole for whole in report.wholes}
-    last = ("truth" if report.case.truth else "reference", report.reference[index])
-    shown = ("paper", "ours in the paper's time", "medium", "high")
-    pictures = [(label, by_label[label].images[index]) for label in shown if label in by_label]
-    truth = "the truth" if report.case.truth else "the preset <i>reference</i>"
-    points = [(whole.label, whole.milliseconds, whole.flip, _beaten(whole, report.wholes)) for whole in report.wholes]
-    rows = (
-        ([whole.label, f"{whole.milliseconds:.2f}", f"{whole.flip:.4f}"], _beaten(whole, report.wholes))
-        for whole in report.wholes
-    )
-    return "".join(
-        [
-            f"<p>{len(report.case.frames)} frames of {camera.shape[1]}x{camera.shape[0]}, compared with {truth}. "
-            "FLIP is summed over the picture and divided by the pixels that anything virtual changes.</p>",
-            strip([("camera", camera), *pictures, last], last[1], box),
-            '<div class="split"><div class="card">',
-            scatter(points, "milliseconds per frame", "FLIP"),
-            '</div><div class="card">',
-            table(("as a whole", "ms", "FLIP"), rows),
-            f"<p class=soft>{html.escape(_whole_words(by_label))}</p></div></div>",
-        ]
-    )
 
 
 def _beaten(whole: Whole, others: Sequence[Whole]) -> bool:
@@ -272,27 +288,91 @@ def _beaten(whole: Whole, others: Sequence[Whole]) -> bool:
     )
 
 
-def _whole_words(by_label: Mapping[str, Whole]) -> str:
-    """Equal time and equal error, in words."""
+def _whole_chart(report: CaseReport, limit: float | None, size: tuple[int, int] = PLOT) -> str:
+    points = [(whole.label, whole.milliseconds, whole.flip, _beaten(whole, report.wholes)) for whole in report.wholes]
+    against = "truth" if report.case.truth else "reference"
+    return scatter(points, "milliseconds per frame", f"error: FLIP to the {against}, per changed pixel", limit, size)
+
+
+def _glance(report: CaseReport, anchor: str, limit: float | None) -> str:
+    """A case in one chart and one sentence."""
+    words = html.escape(_whole_words(report.wholes, brief=True))
+    return (
+        f'<div class="card"><h4><a href="#{anchor}">{html.escape(report.case.name)}</a></h4>'
+        f"{_whole_chart(report, limit, SMALL_PLOT)}<p class=soft>{words}</p></div>"
+    )
+
+
+def _whole_section(report: CaseReport, limit: float | None) -> str:
+    index = report.case.shown[-1]
+    camera = report.case.frames[index].image
+    box = bounding_box(report.region, camera.shape[:2])
+    by_label = {whole.label: whole for whole in report.wholes}
+    last = ("truth" if report.case.truth else "reference", report.reference[index])
+    pictures = [(label, by_label[label].images[index]) for label in SHOWN if label in by_label]
+    pixels = "clip" if report.case.darker else "anything virtual changes"
+    truth = "the truth, which a path tracer made" if report.case.truth else "the preset <i>reference</i>"
+    rows = (
+        (
+            [whole.label, f"{whole.milliseconds:.2f}", _times(whole.over_paper), f"{whole.flip:.4f}"],
+            _beaten(whole, report.wholes),
+        )
+        for whole in report.wholes
+    )
+    return "".join(
+        [
+            f"<p>{len(report.case.frames)} frames of {camera.shape[1]}x{camera.shape[0]}, compared with {truth}. "
+            "FLIP is what an observer notices who flips between two pictures, 0 to 1; here it is summed over the "
+            f"picture and divided by the pixels that {pixels}. Below the crops are their errors.</p>",
+            strip([("camera", camera), *pictures, last], last[1], box),
+            '<div class="split"><div class="card">',
+            _whole_chart(report, limit),
+            '</div><div class="card">',
+            table(("as a whole", "ms per frame", "over the paper's", "FLIP"), rows),
+            f"<p class=soft>{html.escape(_whole_words(report.wholes))}</p></div></div>",
+        ]
+    )
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.2f}x" if math.isfinite(ratio) else "–"
+
+
+def _whole_words(wholes: Sequence[Whole], *, brief: bool = False) -> str:
+    """Equal time and equal error, in words; as they were measured, in whichever favour."""
+    by_label = {whole.label: whole for whole in wholes}
     paper = by_label.get("paper")
+    if paper is None:
+        return ""
     lines = []
-    if paper is not None and "ours in the paper's time" in by_label:
+    if "ours in the paper's time" in by_label:
         ours = by_label["ours in the paper's time"]
         lines.append(
-            f"Equal time: with {paper.milliseconds:.1f} ms as budget, {ours.milliseconds:.1f} ms and "
-            f"{1 - ours.flip / paper.flip:.0%} less error: {_settings(ours)}."
+            f"Equal time ({ours.milliseconds:.1f} ms, the paper's way {paper.milliseconds:.1f}): "
+            f"{_less(ours.flip, paper.flip)} error."
         )
-    if paper is not None and "ours at the paper's error" in by_label:
+        lines += [] if brief else [f"It runs {_settings(ours)}."]
+    if "ours at the paper's error" in by_label:
         ours = by_label["ours at the paper's error"]
         lines.append(
-            f"Equal error: {ours.flip:.4f} against {paper.flip:.4f} in {ours.milliseconds / paper.milliseconds:.0%} "
-            f"of the time: {_settings(ours)}."
+            f"Equal error ({ours.flip:.3f}, the paper's way {paper.flip:.3f}): "
+            f"{_less(ours.milliseconds, paper.milliseconds)} time."
         )
+        lines += [] if brief else [f"It runs {_settings(ours)}."]
+    if brief and "high" in by_label:
+        high = by_label["high"]
+        lines.append(f"High: {_less(high.flip, paper.flip)} error in {high.milliseconds / paper.milliseconds:.1f}x.")
     return " ".join(lines)
 
 
+def _less(a: float, b: float) -> str:
+    """The change from b to a in words."""
+    change = 1.0 - a / b if b > 0.0 else 0.0
+    return "the same" if abs(change) < 0.005 else f"{change:.0%} less" if change > 0.0 else f"{-change:.0%} more"
+
+
 def _settings(whole: Whole) -> str:
-    return ", ".join(f"{knob} {rung}" for knob, rung in whole.settings.items())
+    return ", ".join(f"{knob.replace('_', ' ')} {rung}" for knob, rung in whole.settings.items())
 
 
 def _knob_section(report: CaseReport, rows: Sequence[Row]) -> str:
@@ -304,12 +384,19 @@ def _knob_section(report: CaseReport, rows: Sequence[Row]) -> str:
     difference = np.abs(pictures[0][1].astype(int) - pictures[-1][1].astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = [*pictures, ("truth", reference)] if report.case.truth else pictures
-    points = [(row.rung, row.milliseconds, row.excess, row.dominated) for row in rows]
+    points = [(row.rung, row.milliseconds, row.error, row.dominated) for row in rows]
+    about = next((name.converges for name in KNOBS if name.name == knob), True) or not report.case.truth
+    against = f"error: FLIP to {rows[-1].rung}" if about else "error: FLIP to the truth, above the best rung's"
+    what, words = WORDS.get(knob, ("", {}))
+    legend = "; ".join(
+        f"<b>{html.escape(row.rung)}</b> {html.escape(words[row.rung])}" for row in rows if row.rung in words
+    )
     return "".join(
         [
             f"<h3>{html.escape(knob.replace('_', ' '))}</h3>",
+            f'<p class="soft">{html.escape(what.capitalize())}{": " if legend else ""}{legend}.</p>' if what else "",
             '<div class="split"><div class="card">',
-            scatter(points, "milliseconds of its stages", f"FLIP against {rows[0].against}, above the best rung's"),
+            scatter(points, "milliseconds of its stages per frame", against),
             '</div><div class="card">',
             _knob_table(rows),
             f"<p class=soft>{html.escape(_comparisons(rows))}</p></div></div>",
@@ -321,9 +408,52 @@ def _knob_section(report: CaseReport, rows: Sequence[Row]) -> str:
 def _figure_section(shown: Figure) -> str:
     image = shown.columns[0][1]
     picked = shown.region if shown.region is not None else np.zeros(image.shape[:2], bool)
+    text = f"<p>{html.escape(shown.text)}</p>" if shown.text else ""
     return (
-        f"<h3>{html.escape(shown.title)}</h3><p>{html.escape(shown.text)}</p>"
+        f"<h3>{html.escape(shown.title)}</h3>{text}"
         f"{strip(shown.columns, shown.reference, bounding_box(picked, image.shape[:2]))}"
+    )
+
+
+def _list_section(reports: Sequence[CaseReport]) -> str:
+    """Every rung of every knob over all cases: the price list itself."""
+    body = []
+    for knob in KNOBS:
+        rows = [row for report in reports for row in report.rows if row.knob == knob.name]
+        if not rows:
+            continue
+        what, words = WORDS.get(knob.name, ("", {}))
+        title = f"{knob.name.replace('_', ' ')} <span class=soft>{html.escape(what)}</span>"
+        body.append(f'<tr class="head"><td colspan="5">{title}</td></tr>')
+        for rung in knob.rungs:
+            own = [row for row in rows if row.rung == rung]
+            if not own:
+                continue
+            out = ' class="out"' if all(row.dominated for row in own) else ""
+            costs = [row.milliseconds for row in own]
+            spread = f"{min(costs):.2f}" if len(costs) == 1 else f"{min(costs):.2f} – {max(costs):.2f}"
+            body.append(
+                f'<tr{out}><td>{html.escape(rung)}</td><td class="text">{html.escape(words.get(rung, ""))}</td>'
+                f"<td>{spread}</td><td>{sum(row.error for row in own) / len(own):.4f}</td><td>{len(own)}</td></tr>"
+            )
+    return (
+        '<section id="list"><h2>The price list</h2><p>Every rung over all scenes. Its error is FLIP per changed pixel: '
+        "where rungs approximate one thing, the distance from the most exact; where they are models of their own, the "
+        "distance from the truth above that of the best. Grey: another rung is no dearer and no worse in every scene."
+        '</p><div class="card"><table><thead><tr><th>rung</th><th style="text-align:left">what it does</th><th>ms per '
+        f"frame</th><th>error</th><th>scenes</th></tr></thead><tbody>{''.join(body)}</tbody></table></div></section>"
+    )
+
+
+def _arithmetic_section(extra: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of the bench of arithmetic: the cheap form of every sum that matters beside the stable one."""
+    keys = ("row", "size", "form", "median_ms", "error", "unit")
+    rows = ([f"{line[key]:.3g}" if isinstance(line[key], float) else str(line[key]) for key in keys] for line in extra)
+    head = ("where", "size", "form", "ms", "error", "of what")
+    return (
+        '<section id="arithmetic"><h2>Arithmetic</h2><p>Sums in which numbers of very different size meet, each in its '
+        f'cheap and in its stable form.</p><div class="card">{table(head, ((row, False) for row in rows))}</div>'
+        "</section>"
     )
 
 
@@ -335,33 +465,50 @@ def render(
     Args:
         reports: One per case.
         figures: The paper's figures, redone.
-        made: On what it was measured: ``device`` and ``warp``.
+        made: On what it was measured: ``device``, ``warp``, and what ``clock`` counts, ``time`` or ``processor time``.
         extra: Lines of the bench of arithmetic.
     """
     anchors = [(f"case{index}", report) for index, report in enumerate(reports)]
-    ramp = error_colors(np.linspace(0.0, 1.0, 64)[None] ** 2)
+    whole = [(anchor, report) for anchor, report in anchors if report.wholes]
+    by_clock = made.get("clock", "time") == "time"
+    limit = REAL_TIME if by_clock else None
+    counted = "" if by_clock else " Milliseconds are processor time: the work of all threads together."
+    ramp = error_colors(np.linspace(0.0, 1.0, 128)[None].repeat(4, 0) ** 2)
+    # The ramp's colours go with the root of the error.
+    marks = "".join(f"<span>{mark * mark:.2g}</span>" for mark in np.linspace(0.1, 0.9, 5))
+    lines = [line for line in extra if str(line.get("case", "")).startswith("precision")]
     parts = [
         '<!doctype html><html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width,initial-scale=1"><title>What accuracy costs</title>',
         f"<style>{_STYLE}</style></head><body><main><h1>What accuracy costs</h1>",
-        f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}. '
-        "Every stage has rungs, from the paper's way to brute force; here is what each errs and what it takes. "
-        "Rungs that another beats in both are hollow and grey.</p>",
-        f'<p class="soft">Error maps: 0 <img class="scale" alt="" src="{data_uri(ramp, photo=False)}"> 1 (FLIP)</p>',
-        "<nav>",
+        '<p class="lead">Every stage has rungs, from the paper\'s way to brute force. Here is what each takes and what '
+        "it errs: lower is truer, further left is faster.</p>",
+        f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}, '
+        f"marker tracking left out.{counted} Filled points are worth their price; hollow grey ones are beaten by "
+        "another in both time and error.</p>",
+        f'<p class="soft">Error maps show FLIP: <span class="scale"><img alt="black to yellow" src="{data_uri(ramp)}">'
+        f"{marks}</span></p><nav>",
         *(f'<a href="#{anchor}">{html.escape(report.case.name)}</a>' for anchor, report in anchors),
         '<a href="#figures">The paper\'s figures</a>' if figures else "",
+        '<a href="#list">The price list</a>',
+        '<a href="#arithmetic">Arithmetic</a>' if lines else "",
         "</nav>",
+        '<div class="many">' if whole else "",
+        *(_glance(report, anchor, limit) for anchor, report in whole),
+        "</div>" if whole else "",
     ]
-    for anchor, report in anchors:
-        parts.append(f'<section id="{anchor}"><h2>{html.escape(report.case.name)}</h2>')
-        parts.append(_whole_section(report))
-        for _, rows in itertools.groupby(report.rows, lambda row: row.knob):
-            parts.append(_knob_section(report, list(rows)))
-        parts.append("</section>")
     if figures:
         parts.append('<section id="figures"><h2>The paper\'s figures, redone</h2>')
         parts += [_figure_section(shown) for shown in figures]
         parts.append("</section>")
+    parts.append(_list_section(reports))
+    for anchor, report in anchors:
+        parts.append(f'<section id="{anchor}"><h2>{html.escape(report.case.name)}</h2>')
+        parts.append(_whole_section(report, limit) if report.wholes else "")
+        for _, rows in itertools.groupby(report.rows, lambda row: row.knob):
+            parts.append(_knob_section(report, list(rows)))
+        parts.append("</section>")
+    if lines:
+        parts.append(_arithmetic_section(lines))
     parts.append("</main></body></html>\n")
     return "".join(parts)

@@ -121,8 +121,6 @@ def gather(frame, table, reflectance, corner, rung, rim_start, rim_width, half_d
     full = (frame >= 254).astype(np.float64)
 
     def fetch(image, x, y):
-        if rung == "nearest":
-            return image[int(np.rint(y)), int(np.rint(x))]
         i, j = int(y), int(x)
         i1, j1 = min(i + 1, image.shape[0] - 1), min(j + 1, image.shape[1] - 1)
         fy, fx = y - i, x - j

@@ -35,7 +35,6 @@ class Rung:
 
 RUNGS: Mapping[str, Rung] = {
     "coarse": Rung(16, 4, 2, False),
-    "sampled": Rung(64, 4, 2, False),
     "bounce": Rung(64, 4, 2, True),
     "fine": Rung(64, 4, 1, True),
     "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),

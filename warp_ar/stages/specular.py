@@ -30,7 +30,7 @@ class Specular(Stage):
     """Prefilters the environment with lobes of growing width."""
 
     name: ClassVar[str] = "specular"
-    rungs: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis8", "fis32", "fis128", "brute_force")
+    rungs: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis32", "fis128", "brute_force")
     summary: ClassVar[str] = "the environment filtered for glossy reflection, level by level"
 
     @classmethod
