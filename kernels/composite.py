@@ -20,6 +20,9 @@ from warp_ar.kernels.structs import FrameParams
 
 wp.set_module_options({"enable_backward": False})
 
+CPU_RUN = 32
+"""Pixels of a row that one thread of a CPU does."""
+
 
 @dataclasses.dataclass(frozen=True)
 class CompositeConfig:
@@ -117,16 +120,19 @@ def make_composite_kernel(config: CompositeConfig) -> wp.Kernel:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        run: wp.int32,
         # Out:
         image_out: wp.array2d[wp.vec3ub],
     ):
-        i, j = wp.tid()
+        i, part = wp.tid()
         i += row_start
-        code = frame[i, j]
-        if is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
-            radiance = compose(decode(decode_table, code), params, virtual_layer, physical_added, physical_ratio, i, j)
-            code = encode(encode_table, radiance)
-        image_out[i, j] = code
+        for j in range(part * run, wp.min(part * run + run, frame.shape[1])):
+            code = frame[i, j]
+            if is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
+                radiance = decode(decode_table, code)
+                radiance = compose(radiance, params, virtual_layer, physical_added, physical_ratio, i, j)
+                code = encode(encode_table, radiance)
+            image_out[i, j] = code
 
     return composite_kernel
 
@@ -158,10 +164,12 @@ def composite(
         image_out: (H, W) vec3ub; values above clipping give 255, NaN gives 0.
         rows: Band of rows; None means all.
     """
+    height, width = frame.shape
+    run = CPU_RUN if frame.device.is_cpu else 1
     launch_rows(
         make_composite_kernel(config),
-        frame.shape,
-        [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio],
+        (height, -(-width // run)),
+        [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio, run],
         [image_out],
         rows=rows,
         device=frame.device,

@@ -9,14 +9,18 @@ real and in the picture already) and with them. Both are sums over the same samp
 (``room_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black object
 0, and an error of the samples cancels to first order.
 
-Sets. The pixels of a tile of ``side x side`` use one set of samples each, and every set in turn; a filter then averages
-over one tile's worth of pixels, with the edge pixels of a window of ``side + 1`` at half weight, so that each set
-counts the same and the window is centred [KH01]. Neighbours on another surface do not count. All of it is a function of
-the frame alone: nothing flickers and nothing lags.
+Cells. One pixel of every ``stride x stride`` is estimated. The cells of a tile of ``side x side`` use one set of
+samples each, and every set in turn; a filter then averages over one tile's worth of cells, with the edge cells of a
+window of ``side + 1`` at half weight, so that each set counts the same and the window is centred [KH01]. A window half
+as wide has half the blur and twice the noise. It takes over where the two means differ by more than noise: at contacts
+and at the edges of a lamp's shadow. Few cells of many samples, averaged so, are nearer to the truth than many of few at
+twice the rays. Cells on another surface do not count; a pixel between cells of several surfaces looks for its own. All
+of it is a function of the frame alone: nothing flickers and nothing lags.
 
 Culling. A sample matters only if its direction meets the bounding sphere of an object; a dot product tells. Only those
-rays are traced, and pixels that have none are done. Tiles of cells in which a ray met an object note the frame's
-number: elsewhere the ratio is 1, and need not be averaged.
+rays are traced, and cells that have none are done. Tiles of cells in which a ray met an object note the frame's
+number: elsewhere the ratio is 1, and need not be averaged. Nor need it be spread to pixels where it stays within
+``NEGLIGIBLE`` of 1; that is made exactly 1.
 
 Bounce. What a ray meets is not black: an object reflects one of its two lobes, picked by their reflectance. Its rough
 lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an object, that object's own colour; the desk,
@@ -45,13 +49,19 @@ from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_fram
 from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
-from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 
-SHADED_TILE = wp.constant(8)
+SHADED_TILE = wp.constant(4)
 """Cells along a tile that notes whether something in it is shaded."""
+CONTRAST = wp.constant(wp.float32(0.03))
+"""Difference of a narrow and a wide mean over which the narrow one takes over: what noise alone makes of it."""
+NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
+"""Change of the room's light that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+CPU_RUN = 32
+"""Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 WARP_LANES = 32
 """Threads of a CUDA device that go the same way or wait for each other."""
 CHUNK = 64
@@ -248,6 +258,26 @@ def surface_key(scene: RayScene, hit: Hit) -> wp.int32:
 
 
 @functools.cache
+def make_seen_proxy(config: RoomConfig) -> wp.Function:
+    """``seen_proxy(params, ray, scene, probes) -> Hit``: the surface of the desk that a pixel shows, or shape -1."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+
+    @wp.func(module="unique")
+    def seen_proxy(params: FrameParams, ray: wp.vec2, scene: RayScene, probes: wp.array[Probe]) -> Hit:
+        direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params.camera_position, direction, FAR)
+        if hit.shape >= 0:
+            if wp.dot(hit.geometric_normal, direction) >= 0.0:
+                hit.shape = -1
+            if wp.static(config.probes):
+                if meets_probe(probes, params.camera_position, direction, hit.t):
+                    hit.shape = -1
+        return hit
+
+    return seen_proxy
+
+
+@functools.cache
 def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     if config.count > CHUNK and config.count % CHUNK:
@@ -256,6 +286,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     closest_proxy, closest_object = trace.closest_proxy, trace.closest_object
     occluded_by_objects, occluded_by_proxies = trace.occluded_by_objects, trace.occluded_by_proxies
     mask_cone = make_mask_cone(min(config.count, CHUNK), config.near)
+    seen_proxy = make_seen_proxy(config.room)
     bounced = make_bounced(config.room)
     find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
     side = config.side
@@ -278,6 +309,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         lanes: wp.int32,
         # Out:
         ratio_out: wp.array2d[wp.vec4],
+        bounced_out: wp.array2d[wp.vec3],
         surface_out: wp.array2d[wp.int32],
         shaded_out: wp.array2d[wp.int32],
     ):
@@ -297,22 +329,20 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
         if rect[0] >= rect[1] or not inside_rect(row, column, wide):
             return
-        ray = rays[row, column]
-        direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
-        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
-        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+        hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+        if hit.shape < 0:
             return
-        if wp.static(config.room.probes):
-            if meets_probe(room.probes, params[0].camera_position, direction, hit.t):
-                return
         surface_out[i, j] = surface_key(scene, hit)
         ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+        if wp.static(config.bounce):
+            bounced_out[i, j] = wp.vec3(0.0)
 
         point = hit.point
         own = hit.shape
         everywhere = wp.uint64(0) - wp.uint64(1)
         without = wp.vec3(0.0)
-        change = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        sent = wp.vec3(0.0)
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = samples.shape[0] / wp.static(side * side) * ((i % side) * side + j % side)
         for part in range(wp.static(config.count // chunk)):
@@ -394,113 +424,192 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                                 if other.shape >= 0:
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
                                     light = bounced(params[0], frame, decode_table, scene, room, other, direction, seed)
-                                    change += weight * (light - radiance)
+                                    hidden += weight * radiance
+                                    sent += weight * light
                             else:
                                 if occluded_by_objects(scene, origin, direction, reach):
-                                    change -= weight * radiance
+                                    hidden += weight * radiance
                 bit = bit << wp.uint64(1)
-        unchanged = change == wp.vec3(0.0, 0.0, 0.0)
+        unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
         if shaded_out.shape[0] > 0 and not unchanged:
             shaded_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
         for channel in range(3):
             if without[channel] > MIN_IRRADIANCE:
-                ratio[channel] = wp.clamp(1.0 + change[channel] / without[channel], 0.0, MAX_RATIO)
+                ratio[channel] = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
+                sent[channel] = wp.min(sent[channel] / without[channel], MAX_RATIO)
+            else:
+                sent[channel] = 0.0
         ratio_out[i, j] = ratio
+        if wp.static(config.bounce):
+            bounced_out[i, j] = sent
 
     return room_shadow_kernel
 
 
 @wp.func
-def is_near_shaded(
-    shaded: wp.array2d[wp.int32], frame_index: wp.int32, i: wp.int32, j: wp.int32, reach: wp.int32
-) -> wp.bool:
-    """Whether something is shaded in this frame in a tile within ``reach`` cells."""
-    for a in range(wp.max(i - reach, 0) / SHADED_TILE, wp.min((i + reach) / SHADED_TILE + 1, shaded.shape[0])):
-        for b in range(wp.max(j - reach, 0) / SHADED_TILE, wp.min((j + reach) / SHADED_TILE + 1, shaded.shape[1])):
+def any_shaded(shaded: wp.array2d[wp.int32], frame_index: wp.int32, rows: wp.vec2i, columns: wp.vec2i) -> wp.bool:
+    """Whether a tile of cells from the first to the last row and column is noted in this frame."""
+    for a in range(wp.max(rows[0], 0) / SHADED_TILE, wp.min(rows[1] / SHADED_TILE + 1, shaded.shape[0])):
+        for b in range(wp.max(columns[0], 0) / SHADED_TILE, wp.min(columns[1] / SHADED_TILE + 1, shaded.shape[1])):
             if shaded[a, b] == frame_index:
                 return True
     return False
 
 
-@wp.kernel(enable_backward=False)
-def filter_ratio_kernel(
-    # In:
-    row_start: wp.int32,
-    params: wp.array[FrameParams],
-    shaded: wp.array2d[wp.int32],
-    ratio: wp.array2d[wp.vec4],
-    surface: wp.array2d[wp.int32],
-    side: wp.int32,
-    # Out:
-    filtered_out: wp.array2d[wp.vec3],
-):
-    """Mean over one tile's worth of neighbours on the same surface."""
-    i, j = wp.tid()
-    i += row_start
-    key = surface[i, j]
-    if key < 0:
-        return
-    depth = ratio[i, j][3]
-    reach = side / 2
-    if shaded.shape[0] > 0:
-        if not is_near_shaded(shaded, params[0].frame_index, i, j, reach):
-            filtered_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
+def window_weight(offset: int, reach: int) -> float:
+    """Of a cell in a window around another: whole inside, half at its edge, nothing beyond."""
+    distance = abs(offset)
+    return 1.0 if distance < max(reach, 1) else 0.5 if distance == reach else 0.0
+
+
+@functools.cache
+def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
+    """Kernel of ``filter_ratio`` for tiles of so many cells along."""
+    wide, narrow = side // 2, side // 4
+    width = 2 * wide + 1
+    wide_weights = tuple(window_weight(a - wide, wide) for a in range(width))
+    narrow_weights = tuple(window_weight(a - wide, narrow) for a in range(width))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_ratio_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        shaded: wp.array2d[wp.int32],
+        ratio: wp.array2d[wp.vec4],
+        bounced: wp.array2d[wp.vec3],
+        surface: wp.array2d[wp.int32],
+        # Out:
+        filtered_out: wp.array2d[wp.vec3],
+        seen_out: wp.array2d[wp.int32],
+    ):
+        """Mean over neighbours on the same surface: one tile's worth, or a quarter of it where that differs.
+
+        What is hidden decides: what objects bounce is too noisy to tell.
+        """
+        i, j = wp.tid()
+        i += row_start
+        key = surface[i, j]
+        if key < 0:
             return
-    total = wp.vec3(0.0)
-    weights = float(0.0)
-    for ni in range(wp.max(i - reach, 0), wp.min(i + reach + 1, ratio.shape[0])):
-        for nj in range(wp.max(j - reach, 0), wp.min(j + reach + 1, ratio.shape[1])):
-            if surface[ni, nj] == key:
-                value = ratio[ni, nj]
-                weight = float(1.0)
-                if side > 1:
-                    weight = wp.where(wp.abs(ni - i) == reach, 0.5, 1.0) * wp.where(wp.abs(nj - j) == reach, 0.5, 1.0)
-                # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
-                if key % 8 == MESH_KEY and wp.abs(value[3] - depth) > DEPTH_STEP * depth:
-                    weight = 0.0
-                total += weight * wp.vec3(value[0], value[1], value[2])
-                weights += weight
-    filtered_out[i, j] = total / weights
+        if shaded.shape[0] > 0:
+            rows = wp.vec2i(i - wp.static(wide), i + wp.static(wide))
+            if not any_shaded(shaded, params[0].frame_index, rows, wp.vec2i(j - wp.static(wide), j + wp.static(wide))):
+                filtered_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
+                return
+        depth = ratio[i, j][3]
+        # Means of all neighbours, and of the nearer ones; the fourth component sums the weights.
+        far_left = wp.vec4(0.0)
+        near_left = wp.vec4(0.0)
+        far_sent = wp.vec3(0.0)
+        near_sent = wp.vec3(0.0)
+        for a in range(wp.static(width)):
+            ni = i + a - wp.static(wide)
+            for b in range(wp.static(width)):
+                nj = j + b - wp.static(wide)
+                if ni >= 0 and nj >= 0 and ni < surface.shape[0] and nj < surface.shape[1]:
+                    if surface[ni, nj] == key:
+                        value = ratio[ni, nj]
+                        # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
+                        if key % 8 != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
+                            value[3] = 1.0
+                            far_left += wp.static(wide_weights[a] * wide_weights[b]) * value
+                            if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
+                                near_left += wp.static(narrow_weights[a] * narrow_weights[b]) * value
+                            if wp.static(bounce):
+                                sent = bounced[ni, nj]
+                                far_sent += wp.static(wide_weights[a] * wide_weights[b]) * sent
+                                if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
+                                    near_sent += wp.static(narrow_weights[a] * narrow_weights[b]) * sent
+        left = wp.vec3(far_left[0], far_left[1], far_left[2]) / far_left[3]
+        mean = left + far_sent / far_left[3]
+        if wp.static(wide > 1):
+            sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
+            share = wp.clamp(wp.max(wp.abs(sharp - left)) / CONTRAST - 0.5, 0.0, 1.0)
+            mean += share * (sharp + near_sent / near_left[3] - mean)
+        if wp.max(wp.abs(mean - wp.vec3(1.0, 1.0, 1.0))) < NEGLIGIBLE:
+            mean = wp.vec3(1.0, 1.0, 1.0)
+        elif seen_out.shape[0] > 0:
+            seen_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
+        filtered_out[i, j] = mean
+
+    return filter_ratio_kernel
 
 
-@wp.kernel(enable_backward=False)
-def spread_ratio_kernel(
-    # In:
-    row_start: wp.int32,
-    params: wp.array[FrameParams],
-    filtered: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    # Out:
-    physical_ratio_out: wp.array2d[wp.vec3],
-):
-    """From cells to pixels: bilinear among the cells on the surface of the nearest one."""
-    i, j = wp.tid()
-    i += row_start
-    physical_ratio_out[i, j] = wp.vec3(1.0, 1.0, 1.0)
-    if not inside_rect(i, j, params[0].shadow_rect):
-        return
-    key = surface[wp.min(i / stride, surface.shape[0] - 1), wp.min(j / stride, surface.shape[1] - 1)]
-    if key < 0:
-        return
-    # Cell c was estimated at pixel c * stride + stride / 2.
-    y = wp.float32(i - stride / 2) / wp.float32(stride)
-    x = wp.float32(j - stride / 2) / wp.float32(stride)
-    row = wp.int32(wp.floor(y))
-    column = wp.int32(wp.floor(x))
-    total = wp.vec3(0.0)
-    weights = float(0.0)
-    for a in range(2):
-        for b in range(2):
-            weight = (1.0 - wp.abs(y - wp.float32(row + a))) * (1.0 - wp.abs(x - wp.float32(column + b)))
-            ni = wp.clamp(row + a, 0, surface.shape[0] - 1)
-            nj = wp.clamp(column + b, 0, surface.shape[1] - 1)
-            if weight > 0.0 and surface[ni, nj] == key:
-                total += weight * filtered[ni, nj]
-                weights += weight
-    if weights > 0.0:
-        physical_ratio_out[i, j] = total / weights
+@functools.cache
+def make_spread_ratio_kernel(config: RoomConfig) -> wp.Kernel:
+    """Kernel of ``spread_ratio``, specialised to ``config``."""
+    seen_proxy = make_seen_proxy(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def spread_ratio_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        probes: wp.array[Probe],
+        filtered: wp.array2d[wp.vec3],
+        surface: wp.array2d[wp.int32],
+        seen: wp.array2d[wp.int32],
+        stride: wp.int32,
+        run: wp.int32,
+        # Out:
+        physical_ratio_out: wp.array2d[wp.vec3],
+    ):
+        """From cells to pixels: bilinear among the cells on the pixel's surface."""
+        i, part = wp.tid()
+        i += row_start
+        begin = part * run
+        stop = wp.min(begin + run, physical_ratio_out.shape[1])
+        rect = params[0].shadow_rect
+        # Cell c was estimated at pixel c * stride + stride / 2.
+        y = wp.float32(i - stride / 2) / wp.float32(stride)
+        row = wp.int32(wp.floor(y))
+        columns = wp.vec2i(begin / stride - 2, stop / stride + 2)  # as far as a pixel looks for its surface
+        touched = seen.shape[0] == 0
+        if not touched:
+            touched = any_shaded(seen, params[0].frame_index, wp.vec2i(row - 1, row + 2), columns)
+        for j in range(begin, stop):
+            value = wp.vec3(1.0, 1.0, 1.0)
+            if touched and inside_rect(i, j, rect):
+                x = wp.float32(j - stride / 2) / wp.float32(stride)
+                column = wp.int32(wp.floor(x))
+                key = surface[wp.clamp(row, 0, surface.shape[0] - 1), wp.clamp(column, 0, surface.shape[1] - 1)]
+                mixed = wp.bool(False)
+                for corner in range(1, 4):
+                    ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+                    nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+                    mixed = mixed or surface[ni, nj] != key
+                if mixed:
+                    hit = seen_proxy(params[0], rays[i, j], scene, probes)
+                    key = wp.int32(-1)
+                    if hit.shape >= 0:
+                        key = surface_key(scene, hit)
+                if key >= 0:
+                    total = wp.vec3(0.0)
+                    weights = float(0.0)
+                    for corner in range(4):
+                        ni = wp.clamp(row + corner / 2, 0, surface.shape[0] - 1)
+                        nj = wp.clamp(column + corner % 2, 0, surface.shape[1] - 1)
+                        weight = 1.0 - wp.abs(y - wp.float32(row + corner / 2))
+                        weight *= 1.0 - wp.abs(x - wp.float32(column + corner % 2))
+                        if weight > 0.0 and surface[ni, nj] == key:
+                            total += weight * filtered[ni, nj]
+                            weights += weight
+                    if weights == 0.0:
+                        # None of the four is on this surface: those around them.
+                        for a in range(wp.max(row - 1, 0), wp.min(row + 3, surface.shape[0])):
+                            for b in range(wp.max(column - 1, 0), wp.min(column + 3, surface.shape[1])):
+                                if surface[a, b] == key:
+                                    total += filtered[a, b]
+                                    weights += 1.0
+                    if weights > 0.0:
+                        value = total / weights
+            physical_ratio_out[i, j] = value
+
+    return spread_ratio_kernel
 
 
 def shade_room(
@@ -516,6 +625,7 @@ def shade_room(
     samples: wp.array[RoomSample],
     stride: int,
     ratio_out: wp.array2d[wp.vec4],
+    bounced_out: wp.array2d[wp.vec3] | None,
     surface_out: wp.array2d[wp.int32],
     *,
     shaded_out: wp.array2d[wp.int32] | None = None,
@@ -535,7 +645,8 @@ def shade_room(
         flux: (the same) radiance times solid angle of the samples.
         samples: (the same) the samples.
         stride: Pixels from one estimate to the next.
-        ratio_out: (ceil(H / stride), ceil(W / stride)) RGB ratio and depth.
+        ratio_out: (ceil(H / stride), ceil(W / stride)) RGB share of the room's light that is not hidden, and depth.
+        bounced_out: (the same) what objects send there, relative to the room's light; needed if ``config.bounce``.
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         rows: Band of rows of the outputs; None means all.
@@ -546,7 +657,7 @@ def shade_room(
         make_room_shadow_kernel(config),
         ratio_out.shape,
         [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride, lanes],
-        [ratio_out, surface_out, shaded_out],
+        [ratio_out, bounced_out, surface_out, shaded_out],
         rows=rows,
         device=rays.device,
     )
@@ -559,58 +670,76 @@ def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
 
 def filter_ratio(
     ratio: wp.array2d[wp.vec4],
+    bounced: wp.array2d[wp.vec3] | None,
     surface: wp.array2d[wp.int32],
     side: int,
     filtered_out: wp.array2d[wp.vec3],
     *,
     params: wp.array[FrameParams] | None = None,
     shaded: wp.array2d[wp.int32] | None = None,
+    seen_out: wp.array2d[wp.int32] | None = None,
     rows: Rows | None = None,
 ) -> None:
-    """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded.
+    """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
 
     Args:
         ratio: From ``shade_room``.
+        bounced: From ``shade_room``, or None if nothing is bounced.
         surface: From ``shade_room``.
         side: Cells along a tile.
         filtered_out: As ``ratio``, without the depth; written only where a surface is seen.
-        params: (1,) FrameParams: frame_index; needed with ``shaded``.
+        params: (1,) FrameParams: frame_index; needed with ``shaded`` and ``seen_out``.
         shaded: From ``shade_room``; where it is left out every cell is averaged.
+        seen_out: As ``shaded``: number of the last frame in which something in a tile of cells is not 1.
         rows: Band of rows; None means all.
     """
     launch_rows(
-        filter_ratio_kernel,
+        make_filter_ratio_kernel(side, bounced is not None),
         surface.shape,
-        [params, shaded, ratio, surface, side],
-        [filtered_out],
+        [params, shaded, ratio, bounced, surface],
+        [filtered_out, seen_out],
         rows=rows,
         device=surface.device,
     )
 
 
 def spread_ratio(
+    config: RoomConfig,
     params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    scene: RayScene,
+    probes: wp.array[Probe],
     filtered: wp.array2d[wp.vec3],
     surface: wp.array2d[wp.int32],
     stride: int,
     physical_ratio_out: wp.array2d[wp.vec3],
     *,
+    seen: wp.array2d[wp.int32] | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Give every pixel its ratio.
 
+    A pixel between cells of several surfaces looks for its own.
+
     Args:
-        params: (1,) FrameParams: shadow_rect.
+        config: Kinds of proxies, and whether there are mirror balls.
+        params: (1,) FrameParams: camera, shadow_rect, frame_index.
+        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+        scene: Proxies.
+        probes: Mirror balls; needed if ``config.probes``.
         filtered: From ``filter_ratio``.
         surface: From ``shade_room``.
         stride: Pixels per cell.
         physical_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
+        seen: From ``filter_ratio``; where it is left out every pixel is looked at.
         rows: Band of rows; None means all.
     """
+    height, width = physical_ratio_out.shape
+    run = CPU_RUN if rays.device.is_cpu else 1
     launch_rows(
-        spread_ratio_kernel,
-        physical_ratio_out.shape,
-        [params, filtered, surface, stride],
+        make_spread_ratio_kernel(config),
+        (height, -(-width // run)),
+        [params, rays, scene, probes, filtered, surface, seen, stride, run],
         [physical_ratio_out],
         rows=rows,
         device=surface.device,

@@ -124,6 +124,7 @@ def run(
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     cells = -(-H // stride), -(-W // stride)
     ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
+    bounced = wp.zeros(cells, wp.vec3) if bounce else None
     shaded = wp.full(room_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
     rays = wp.array(RAYS, dtype=wp.vec2)
     room_shadow.shade_room(
@@ -137,6 +138,7 @@ def run(
         *drawn,
         stride,
         ratio,
+        bounced,
         surface,
         shaded_out=shaded,
         rows=rows,
@@ -144,12 +146,20 @@ def run(
     if not filtered:
         return ratio.numpy()[..., :3], surface.numpy()
     averaged, skipped = wp.zeros(cells, wp.vec3), wp.zeros(cells, wp.vec3)
-    room_shadow.filter_ratio(ratio, surface, side, averaged, rows=rows)
+    seen = wp.full_like(shaded, -1)
+    room_shadow.filter_ratio(ratio, bounced, surface, side, averaged, rows=rows)
     # Around cells that are not shaded nothing is averaged, with the same result.
-    room_shadow.filter_ratio(ratio, surface, side, skipped, params=params, shaded=shaded, rows=rows)
+    room_shadow.filter_ratio(
+        ratio, bounced, surface, side, skipped, params=params, shaded=shaded, seen_out=seen, rows=rows
+    )
     np.testing.assert_array_equal(skipped.numpy(), averaged.numpy())
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    room_shadow.spread_ratio(params, averaged, surface, stride, out)
+    spread = [forms, params, rays, scene, room.probes, averaged, surface, stride]
+    room_shadow.spread_ratio(*spread, out)
+    # Tiles in which no cell differs from 1 are passed by, with the same result.
+    passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
+    room_shadow.spread_ratio(*spread, passed, seen=seen)
+    np.testing.assert_array_equal(passed.numpy(), out.numpy())
     return out.numpy()
 
 
@@ -447,34 +457,85 @@ def test_filter_keeps_surfaces_apart(device):
     surface[:, 8:] = 8
     surface[3, :] = -1
     out = wp.full((16, 16), wp.vec3(5.0, 5.0, 5.0), dtype=wp.vec3)
-    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), wp.array(surface, dtype=wp.int32), 4, out)
+    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), None, wp.array(surface, dtype=wp.int32), 4, out)
     expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
     expected[3] = 5.0
     np.testing.assert_array_equal(out.numpy(), expected)
 
 
+def filtered(ratio, side=4):
+    """What ``filter_ratio`` makes of one channel."""
+    cells = np.repeat(np.asarray(ratio, np.float32)[..., None], 4, -1)
+    surface = wp.zeros(cells.shape[:2], wp.int32)
+    out = wp.zeros(surface.shape, wp.vec3)
+    cells = wp.array(cells, dtype=wp.vec4)
+    room_shadow.filter_ratio(cells, None, surface, side, out)
+    return out.numpy()[..., 0]
+
+
 def test_filter_weights_every_set_alike(device):
     # Each set has its own value; away from borders the mean of all is exact wherever the window lies.
     rows, columns = np.mgrid[:24, :24]
-    ratio = np.zeros((24, 24, 4), np.float32)
-    ratio[..., :3] = ((rows % 4) * 4 + columns % 4)[..., None]
-    out = wp.zeros((24, 24), wp.vec3)
-    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), wp.zeros((24, 24), wp.int32), 4, out)
-    np.testing.assert_allclose(out.numpy()[2:-2, 2:-2], 7.5, rtol=1e-6)
+    value = 1 + 1e-3 * ((rows % 4) * 4 + columns % 4)
+    np.testing.assert_allclose(filtered(value)[2:-2, 2:-2], 1.0075, rtol=1e-6)
+
+
+def test_filter_narrows_where_that_makes_a_difference(device):
+    # An edge between two even halves: only cells within a quarter of a tile of it are blurred. Noise is averaged wide.
+    edge = np.full((24, 24), 0.2)
+    edge[:, 12:] = 0.8
+    expected = np.where(np.arange(24) < 12, 0.2, 0.8)
+    expected[11:13] = 0.35, 0.65
+    np.testing.assert_allclose(filtered(edge)[8], expected, atol=1e-6)
+    weak = np.full((24, 24), 0.5)
+    weak[:, 12:] += 0.5 * room_shadow.CONTRAST
+    assert np.ptp(filtered(weak)[8, 10:14]) < np.ptp(filtered(weak, side=2)[8, 10:14])
+
+
+def test_what_no_picture_shows_is_exactly_one(device):
+    value = np.ones((24, 24), np.float32)
+    value[:, 12:] = 1 - 0.9 * room_shadow.NEGLIGIBLE
+    assert (filtered(value) == 1).all()
+    value[:, 12:] = 1 - 1.1 * room_shadow.NEGLIGIBLE
+    assert (filtered(value)[:, 14:] != 1).all()
+
+
+ON_DESK = RoomConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
 
 def test_spread_is_a_ramp(device):
     # Cells hold the row and column of the pixel that they were estimated at: between them a ramp has no step, no shift.
-    for stride in (1, 2, 3):
+    for stride in (1, 2, 3, 4):
         cells = (9, 12)
         size = (cells[0] * stride, cells[1] * stride)
         axes = [np.arange(n) * stride + stride // 2 for n in cells]
         values = np.stack([*np.meshgrid(*axes, indexing="ij"), np.zeros(cells)], -1).astype(np.float32)
         params = records(FrameParams, {"shadow_rect": (0, size[0], 0, size[1])})
-        out = wp.zeros(size, wp.vec3)
-        room_shadow.spread_ratio(params, wp.array(values, dtype=wp.vec3), wp.zeros(cells, wp.int32), stride, out)
+        out, rays = wp.zeros(size, wp.vec3), wp.zeros(size, wp.vec2)
+        surface = wp.zeros(cells, wp.int32)
+        averaged = wp.array(values, dtype=wp.vec3)
+        room_shadow.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, surface, stride, out)
         expected = [np.clip(np.arange(n), axis[0], axis[-1]) for n, axis in zip(size, axes, strict=True)]
         np.testing.assert_allclose(out.numpy()[..., :2], np.stack(np.meshgrid(*expected, indexing="ij"), -1), atol=1e-5)
+
+
+def test_pixels_between_surfaces_find_their_own(device):
+    # A board above the desk, dark, and the desk around it, unshaded: no pixel takes the other's ratio.
+    board = shape(PLANE, (0.003, 0.004, 0.1), (0.083, 0.061, 0))
+    params = records(
+        FrameParams, {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "shadow_rect": (0, H, 0, W)}
+    )
+    scene = RayScene()
+    scene.proxies = records(Shape, DESK, board)
+    stride = 4
+    meets = CAMERA + (POINTS - CAMERA) * (0.6 - 0.1) / 0.6
+    on_board = (np.abs(meets[..., :2] - (0.003, 0.004)) <= (0.083, 0.061)).all(-1)
+    middle = on_board[stride // 2 :: stride, stride // 2 :: stride]
+    surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
+    averaged = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
+    out, rays = wp.zeros((H, W), wp.vec3), wp.array(RAYS, dtype=wp.vec2)
+    room_shadow.spread_ratio(ON_DESK, params, rays, scene, None, averaged, surface, stride, out)
+    np.testing.assert_array_equal(out.numpy()[..., 0], np.where(on_board, 0.25, 1.0))
 
 
 def test_count_must_fill_chunks():

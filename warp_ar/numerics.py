@@ -107,7 +107,7 @@ NUMERICS: dict[str, StageNumerics] = {
         (4, 6, 17, 18),
     ),
     "room_shadow": StageNumerics(
-        "float32; a ratio of equal sums, exactly 1 where nothing is shaded",
+        "float32; a ratio of equal sums, exactly 1 where less than 1/512 is shaded",
         2e-3,
         "rays at the rims of balls fall to either side",
         5.4e-06,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -28,18 +29,30 @@ class Rung:
     side: int
     """Estimates along a tile."""
     stride: int
-    """Pixels from one estimate to the next."""
+    """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
     bounce: bool
     """Whether objects reflect light onto the desk."""
 
 
 RUNGS: Mapping[str, Rung] = {
-    "coarse": Rung(16, 4, 2, False),
+    "coarse": Rung(32, 4, 4, False),
     "bounce": Rung(64, 4, 2, True),
     "fine": Rung(64, 4, 1, True),
     "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),
 }
 """Cheapest first, after ``none``."""
+
+
+STRIDE_ROWS = 480
+"""Rows of a frame for which the strides of ``RUNGS`` are."""
+
+
+def cell_size(rung: Rung, rows: int) -> int:
+    """Pixels from one estimate to the next, growing as the root of the frame's rows.
+
+    So estimates grow in number as the rows, not as the pixels, and larger pictures still have finer shadows.
+    """
+    return rung.stride if rung.stride == 1 else max(1, round(rung.stride * math.sqrt(rows / STRIDE_ROWS)))
 
 
 def bounces_light(request: Request) -> bool:
@@ -114,7 +127,7 @@ class RoomShadow(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
-        stride = RUNGS[self.rung].stride
+        stride = cell_size(RUNGS[self.rung], height)
         cells = -(-height // stride), -(-width // stride)
         specs = {
             "physical_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
@@ -122,7 +135,10 @@ class RoomShadow(Stage):
             "room_shadow_filtered": ArraySpec(cells, wp.vec3),
             "room_shadow_surface": ArraySpec(cells, wp.int32, -1),
             "room_shadow_shaded": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
+            "room_shadow_seen": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
         }
+        if RUNGS[self.rung].bounce:
+            specs["room_shadow_bounced"] = ArraySpec(cells, wp.vec3)
         if METALLIC_ROUGHNESS in room_config(self.request).models:
             specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
         return specs
@@ -136,21 +152,24 @@ class RoomShadow(Stage):
         near = knows_lamps(self.request)
         config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, near)
         room_shadow.make_room_shadow_kernel(config)
+        room_shadow.make_filter_ratio_kernel(rung.side, rung.bounce)
+        room_shadow.make_spread_ratio_kernel(forms)
         dfg = arrays.get("room_shadow_dfg")
         if dfg is not None:
             integrate_dfg(dfg)
         room = make_room(forms, self.request, arrays, dfg)
         ratio, surface, filtered = (arrays[f"room_shadow_{name}"] for name in ("ratio", "surface", "filtered"))
+        bounced = arrays.get("room_shadow_bounced")
         out = arrays["physical_ratio"]
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode", "ray_scene")]
-        shadow_rows = arrays["shadow_rows"]
+        shadow_rows, stride = arrays["shadow_rows"], cell_size(rung, self.request.size[1])
 
         def cells() -> Rows:
             start, stop = shadow_rows()
             reach = rung.side  # the filter looks beyond the rows that it writes
-            return max(start // rung.stride - reach, 0), min(-(-stop // rung.stride) + reach, ratio.shape[0])
+            return max(start // stride - reach, 0), min(-(-stop // stride) + reach, ratio.shape[0])
 
-        params, shaded = arrays["params"], arrays["room_shadow_shaded"]
+        params, shaded, seen = arrays["params"], arrays["room_shadow_shaded"], arrays["room_shadow_seen"]
         samples = [arrays[name] for name in sample_names(self.request)]
 
         def estimate(rows: Rows | None) -> None:
@@ -159,18 +178,33 @@ class RoomShadow(Stage):
                 *inputs,
                 room,
                 *samples,
-                rung.stride,
+                stride,
                 ratio,
+                bounced,
                 surface,
                 shaded_out=shaded,
                 rows=rows,
             )
 
         def average(rows: Rows | None) -> None:
-            room_shadow.filter_ratio(ratio, surface, rung.side, filtered, params=params, shaded=shaded, rows=rows)
+            room_shadow.filter_ratio(
+                ratio, bounced, surface, rung.side, filtered, params=params, shaded=shaded, seen_out=seen, rows=rows
+            )
 
         def spread(rows: Rows | None) -> None:
-            room_shadow.spread_ratio(params, filtered, surface, rung.stride, out, rows=rows)
+            room_shadow.spread_ratio(
+                forms,
+                params,
+                arrays["rays"],
+                arrays["ray_scene"],
+                arrays["probes"],
+                filtered,
+                surface,
+                stride,
+                out,
+                seen=seen,
+                rows=rows,
+            )
 
         return [
             Pass(estimate, rows=ratio.shape[0], extent=cells),
