@@ -57,7 +57,9 @@ wp.set_module_options({"enable_backward": False})
 SHADED_TILE = wp.constant(4)
 """Cells along a tile that notes whether something in it is shaded."""
 CONTRAST = wp.constant(wp.float32(0.03))
-"""Difference of a narrow and a wide mean over which the narrow one takes over: what noise alone makes of it."""
+"""Least difference of a narrow and a wide mean at which the narrow one takes over."""
+NOISE = wp.constant(wp.float32(1.0))
+"""The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the room's light that no 8-bit picture shows: a quarter of a code at most, taken for none."""
 CPU_RUN = 32
@@ -502,6 +504,7 @@ def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
         # Means of all neighbours, and of the nearer ones; the fourth component sums the weights.
         far_left = wp.vec4(0.0)
         near_left = wp.vec4(0.0)
+        squares = wp.vec4(0.0)
         far_sent = wp.vec3(0.0)
         near_sent = wp.vec3(0.0)
         for a in range(wp.static(width)):
@@ -517,6 +520,7 @@ def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
                             far_left += wp.static(wide_weights[a] * wide_weights[b]) * value
                             if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
                                 near_left += wp.static(narrow_weights[a] * narrow_weights[b]) * value
+                                squares += wp.static(narrow_weights[a] * narrow_weights[b]) * wp.cw_mul(value, value)
                             if wp.static(bounce):
                                 sent = bounced[ni, nj]
                                 far_sent += wp.static(wide_weights[a] * wide_weights[b]) * sent
@@ -526,7 +530,11 @@ def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
         mean = left + far_sent / far_left[3]
         if wp.static(wide > 1):
             sharp = wp.vec3(near_left[0], near_left[1], near_left[2]) / near_left[3]
-            share = wp.clamp(wp.max(wp.abs(sharp - left)) / CONTRAST - 0.5, 0.0, 1.0)
+            # Cells that differ among themselves are noise, or the middle of an edge, where both means agree.
+            count = near_left[3]
+            spread = wp.vec3(squares[0], squares[1], squares[2]) / count - wp.cw_mul(sharp, sharp)
+            error = wp.sqrt(wp.max(wp.max(spread), 0.0) / count)
+            share = wp.clamp(wp.max(wp.abs(sharp - left)) / wp.max(CONTRAST, NOISE * error) - 0.5, 0.0, 1.0)
             mean += share * (sharp + near_sent / near_left[3] - mean)
         if wp.max(wp.abs(mean - wp.vec3(1.0, 1.0, 1.0))) < NEGLIGIBLE:
             mean = wp.vec3(1.0, 1.0, 1.0)

@@ -490,6 +490,10 @@ def test_filter_narrows_where_that_makes_a_difference(device):
     weak = np.full((24, 24), 0.5)
     weak[:, 12:] += 0.5 * room_shadow.CONTRAST
     assert np.ptp(filtered(weak)[8, 10:14]) < np.ptp(filtered(weak, side=2)[8, 10:14])
+    # A mean of 16 cells has half the noise of a mean of 4; where cells differ by chance, chance picks few of the latter.
+    noise = 0.5 + np.random.default_rng(0).normal(0, 0.1, (96, 96))
+    wide, narrow = (filtered(noise, side=side)[4:-4, 4:-4].std() for side in (4, 2))
+    assert wide < 0.7 * narrow
 
 
 def test_what_no_picture_shows_is_exactly_one(device):
