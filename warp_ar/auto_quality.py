@@ -43,6 +43,7 @@ from warp_ar.ladder import (
     Price,
     choose,
     frontier,
+    light_only,
     load_errors,
     relevant_knobs,
     setting,
@@ -52,6 +53,7 @@ from warp_ar.ladder import (
 from warp_ar.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.quality import PRESETS, Quality
 from warp_ar.scene import Scene
+from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking import Pose
 
 AUTO = "auto"
@@ -81,6 +83,10 @@ BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""
 _MEASURED_FRAMES = 6
 _WARM_UP = 2
+NOW_AND_THEN = "recover"
+"""Stage that works some times a second, so that its mean counts and not its median."""
+_SPREAD_FRAMES = 12
+"""Frames over which that mean is taken where its own rungs are compared: two of its turns."""
 _ENOUGH_MS = 300.0
 """Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
 _KEPT_PIPELINES = 6
@@ -284,10 +290,12 @@ def measure_steps(
     for knob in knobs:
         start = setting(BASE, knob)
         times: dict[str, dict[str, float]] = {}
+        spread = knob.name == NOW_AND_THEN
         for rung in knob.rungs:
             if rung != "brute_force":
                 quality = turn(BASE, {knob.name: rung})
-                times[rung] = base if rung == start else _time_stages(scene, image, pose, device, size, quality, clock)
+                known = rung == start and not spread
+                times[rung] = base if known else _time_stages(scene, image, pose, device, size, quality, clock, spread)
             done += 1
             yield done / count
         # Stages that run whatever the rung is cost the same: what was measured of them is noise.
@@ -305,24 +313,30 @@ def _time_stages(
     size: tuple[int, int],
     quality: Quality,
     clock: Callable[[], float],
+    spread: bool = False,
 ) -> dict[str, float]:
     times: dict[str, list[float]] = {}
     spent = 0.0
-    with Pipeline(scene, device=device, quality=quality, size=size, profile=True) as pipeline:
+    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, _MEASURED_FRAMES)
+    shown_at = light_only(quality) if spread else quality
+    with Pipeline(scene, device=device, quality=shown_at, size=size, profile=True) as pipeline:
         pipeline.scheduler.clock = clock
-        for index in range(_WARM_UP + _MEASURED_FRAMES):
+        for index in range(warm_up + count):
             # Brighter and darker by an eighth, else stages would be skipped.
             shown = image if index % 2 == 0 else image - image // 8
             result = pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
-            if index < _WARM_UP:
+            if index < warm_up:
                 continue
             for name, timing in result.stages.items():
                 times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
             spent += sum(timing.milliseconds for timing in result.stages.values())
-            if spent > _ENOUGH_MS:
+            if spent > _ENOUGH_MS and not spread:
                 break
     times.pop(TRACK, None)
-    return {name: statistics.median(own or [0.0]) for name, own in times.items()}
+    return {
+        name: statistics.fmean(own or [0.0]) if spread and name == NOW_AND_THEN else statistics.median(own or [0.0])
+        for name, own in times.items()
+    }
 
 
 def cache_folder() -> Path:

@@ -134,6 +134,17 @@ NUMBERS = ("environment_height", "edge_samples")
 """Knobs that are numbers of ``Quality``, not rungs."""
 
 
+_LIGHT_ONLY = {
+    "diffuse": "sh2",
+    "specular": "box_mip",
+    "relight": "paper",
+    "room_shadow": "none",
+    "shade": "environment",
+    "edge_samples": "1",
+}
+"""Rungs of what only shows the light, for frames that nobody looks at."""
+
+
 def setting(quality: Quality, knob: Knob) -> str:
     """Rung that ``quality`` has the knob on; one that it does not name is on the stage's own default, the last."""
     if knob.name in NUMBERS:
@@ -161,6 +172,11 @@ def turn(quality: Quality, settings: Mapping[str, str]) -> Quality:
         else:
             rungs[name] = rung
     return dataclasses.replace(quality.with_rungs(**rungs), **numbers)  # type: ignore[arg-type]
+
+
+def light_only(quality: Quality) -> Quality:
+    """The same light, cheaply shown: for frames that only bring it."""
+    return turn(quality, _LIGHT_ONLY)
 
 
 def relevant_knobs(scene: Scene, size: tuple[int, int]) -> tuple[Knob, ...]:

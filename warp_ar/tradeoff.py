@@ -6,7 +6,7 @@ Every knob of a scene (see ``ladder``) is turned through its rungs, all others s
 - how far the picture is from the truth (a path tracer's: bundled scenes come with one frame of it), and from the
   picture at the knob's last rung: FLIP, summed over the picture and divided by the pixels that anything virtual
   changes, so that errors of different knobs are on one scale;
-- the mean milliseconds per frame of the knob's own stages, and of those that run only for this rung.
+- the milliseconds per frame of the knob's own stages, and of those that run only for this rung.
 
 **A rung's error.** Where the rungs approximate one thing that the last of them gives (``converges``), it is the
 distance from the last: nearer to the truth than the exact light would be is luck, for something else is wrong then.
@@ -47,7 +47,7 @@ from rich.table import Table
 
 from warp_ar import tradeoff_page
 from warp_ar.auto_quality import BASE as COST_BASE
-from warp_ar.auto_quality import make_prices, measure_costs
+from warp_ar.auto_quality import NOW_AND_THEN, make_prices, measure_costs
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.graph import make_plan
 from warp_ar.kernels.color import decode_table
@@ -57,6 +57,7 @@ from warp_ar.ladder import (
     Knob,
     choose,
     frontier,
+    light_only,
     load_errors,
     relevant_knobs,
     setting,
@@ -107,16 +108,6 @@ NORMALS = (24, 48)
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
 """Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
 
-_LIGHT_ONLY = {
-    "diffuse": "sh2",
-    "specular": "box_mip",
-    "relight": "paper",
-    "room_shadow": "none",
-    "shade": "environment",
-    "edge_samples": "1",
-}
-"""Rungs of what only shows the light, for frames that nobody looks at."""
-
 _FAIR = {"unwrap": {"environment_height": "32"}}
 """Other rungs at which a knob is turned: footprints on the ball matter where texels are coarse."""
 _OUTPUT = {
@@ -165,7 +156,7 @@ class Outcome:
     quality: Quality
     images: Mapping[int, Image]
     stages: Mapping[str, float]
-    """Mean milliseconds of every stage over the frames in which it ran, the marker's tracking left out."""
+    """Median milliseconds of every stage, of one that works now and then the mean; the marker's tracking left out."""
     output: npt.NDArray[Any] | None
     """What the knob's stage had written at the end."""
 
@@ -384,11 +375,6 @@ def open_cases(options: argparse.Namespace) -> Iterator[Case]:
 # ------------------------------------------------------------------------------------------------------------ measuring
 
 
-def light_only(quality: Quality) -> Quality:
-    """The same light, cheaply shown: for frames that only bring it."""
-    return turn(quality, _LIGHT_ONLY)
-
-
 def run(
     case: Case,
     quality: Quality,
@@ -415,6 +401,7 @@ def run(
     count = len(case.frames)
     wanted = {*case.shown, *range(max(0, count - timed), count)} if between is not None else set(range(count))
     skip = 1 if len(wanted) > 1 else 0
+    turns: list[float] = []
 
     def note(result: Result) -> None:
         for name, timing in result.stages.items():
@@ -431,6 +418,8 @@ def run(
             result = now(frame.image, time_seconds=frame.time, pose=pose)
             if index in case.shown:
                 images[index] = result.image
+            if knob is not None and knob.name == NOW_AND_THEN and index >= WARM_UP and NOW_AND_THEN in result.stages:
+                turns.append(result.stages[NOW_AND_THEN].milliseconds)
             if now is pipeline:
                 if skip > 0:
                     skip -= 1
@@ -442,8 +431,11 @@ def run(
             pipeline.scheduler.forget()
             note(pipeline(case.frames[-1].image, time_seconds=case.frames[-1].time + 1e-3, pose=case.poses[-1]))
     times.pop(TRACK, None)
-    # The mean, not the median: what a stage does now and then costs as well.
-    return Outcome(quality, images, {name: statistics.fmean(own or [0.0]) for name, own in times.items()}, output)
+    stages = {name: statistics.median(own or [0.0]) for name, own in times.items()}
+    if turns:
+        # What a stage does now and then costs as well: the mean over all frames, whatever showed them.
+        stages[NOW_AND_THEN] = statistics.fmean(turns)
+    return Outcome(quality, images, stages, output)
 
 
 def _open(case: Case, quality: Quality, device: str, clock: Clock) -> Pipeline:
