@@ -85,7 +85,7 @@ class Expose(Stage):
                 virtual,
                 added,
                 ratio,
-                arrays.get("summed_area"),
+                arrays["summed_area"] if "summed_area" in self.wiring.reads else None,
                 scale,
                 codes,
                 arrays["image"],

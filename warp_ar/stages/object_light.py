@@ -74,7 +74,7 @@ class ObjectLight(Stage):
         room = make_room(forms, self.request, arrays, dfg)
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
         inputs += [arrays.get("physical_ratio"), arrays.get("physical_added"), arrays["ray_scene"], room]
-        inputs += [arrays.get("room_samples"), arrays["hit_object"], arrays["hits"]]
+        inputs += [arrays["room_samples"] if forms.diffuse != "none" else None, arrays["hit_object"], arrays["hits"]]
         raw = arrays.get("object_light_irradiance"), arrays.get("object_light_mirrored")
         out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
 

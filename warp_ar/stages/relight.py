@@ -47,7 +47,8 @@ class Relight(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows that light can reach."""
-        form = "sh" if irradiance_name(self.request) == "irradiance_sh" else "map"
+        reads, irradiance = self.wiring.reads, irradiance_name(self.request)
+        form = "sh" if irradiance == "irradiance_sh" else "map"
         scene = self.request.scene
         config = relight.RelightConfig(
             relight_rung(self.request),
@@ -55,7 +56,7 @@ class Relight(Stage):
             form,
             bool(scene.probes),
             casts_soft(self.request),
-            "lamps" in self.wiring.reads,
+            "lamps" in reads,
         )
         relight.make_relight_kernel(config)
 
@@ -66,14 +67,14 @@ class Relight(Stage):
                 arrays["rays"],
                 arrays["frame"],
                 arrays["decode"],
-                arrays.get("summed_area"),
+                arrays["summed_area"] if "summed_area" in reads else None,
                 arrays["ray_scene"],
                 arrays["probes"],
                 arrays["light_array"],
-                arrays.get("key_lights"),
-                arrays.get(irradiance_name(self.request)),
+                arrays["key_lights"] if "key_lights" in reads else None,
+                arrays[irradiance] if irradiance in reads else None,
                 arrays["physical_added"],
-                lamps=arrays.get("lamps"),
+                lamps=arrays["lamps"] if "lamps" in reads else None,
                 rows=rows,
             )
 

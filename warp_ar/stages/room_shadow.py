@@ -75,7 +75,7 @@ def room_config(request: Request) -> RoomConfig:
 
 def room_reads(config: RoomConfig) -> tuple[str, ...]:
     """Resources that hold the forms of a ``RoomConfig``."""
-    reads = ["environment"]
+    reads = []
     if config.diffuse != "none":
         reads.append(f"irradiance_{config.diffuse}")
     if config.specular:
@@ -86,7 +86,6 @@ def room_reads(config: RoomConfig) -> tuple[str, ...]:
 def make_room(config: RoomConfig, request: Request, arrays: Arrays, dfg: Any) -> Room:
     """The room's light as kernels read it."""
     room = Room()
-    room.environment = arrays["environment"]
     if config.diffuse == "sh":
         room.irradiance_sh = arrays["irradiance_sh"]
     if config.diffuse == "map":
@@ -121,7 +120,7 @@ class RoomShadow(Stage):
             return LeftOut(f"the quality {request.quality.name!r} leaves out shadows of the room's light")
         reads = ["pose", "objects", "room_samples"]
         if RUNGS[request.quality.rung(cls.name)].bounce:
-            reads += ["frame", *room_reads(room_config(request))]
+            reads += ["frame", "environment", *room_reads(room_config(request))]
         return Wiring(tuple(reads), ("physical_ratio",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -158,10 +157,13 @@ class RoomShadow(Stage):
         if dfg is not None:
             integrate_dfg(dfg)
         room = make_room(forms, self.request, arrays, dfg)
+        if rung.bounce:
+            room.environment = arrays["environment"]
         ratio, surface, filtered = (arrays[f"room_shadow_{name}"] for name in ("ratio", "surface", "filtered"))
         bounced = arrays.get("room_shadow_bounced")
         out = arrays["physical_ratio"]
-        inputs = [arrays[name] for name in ("params", "rays", "frame", "decode", "ray_scene")]
+        frame = arrays["frame"] if rung.bounce else None
+        inputs = [arrays["params"], arrays["rays"], frame, arrays["decode"], arrays["ray_scene"]]
         shadow_rows, stride = arrays["shadow_rows"], cell_size(rung, self.request.size[1])
 
         def cells() -> Rows:

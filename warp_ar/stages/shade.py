@@ -116,7 +116,7 @@ class Shade(Stage):
             arrays["params"],
             arrays["rays"],
             arrays["ray_scene"],
-            arrays["light_array"],
+            arrays["light_array"] if config.lights else None,
             irradiance["sh"] if config.room_diffuse == "sh" else None,
             irradiance["map"] if config.room_diffuse == "map" else None,
             arrays["specular_levels"] if config.room_specular else None,
