@@ -88,5 +88,5 @@ def test_an_undeclared_read_is_found(monkeypatch):
     relight = next(kind for kind in STAGES if kind.name == "relight")
     wire = relight.wire
     monkeypatch.setattr(relight, "wire", lambda request: dataclasses.replace(wire(request), reads=("pose",)))
-    with pytest.raises(AssertionError, match="relight takes .*, declares pose"):
+    with pytest.raises(AssertionError, match=r"relight takes .*, declares pose"):
         test_stages_read_what_they_declare("desk", "medium", monkeypatch)

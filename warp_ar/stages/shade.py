@@ -111,14 +111,13 @@ class Shade(Stage):
         dfg = arrays.get("shade_dfg")
         if dfg is not None:
             integrate_dfg(dfg)
-        irradiance = {form: arrays.get(f"irradiance_{form}") for form in ("sh", "map")}
         inputs = (
             arrays["params"],
             arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
-            irradiance["sh"] if config.room_diffuse == "sh" else None,
-            irradiance["map"] if config.room_diffuse == "map" else None,
+            arrays["irradiance_sh"] if config.room_diffuse == "sh" else None,
+            arrays["irradiance_map"] if config.room_diffuse == "map" else None,
             arrays["specular_levels"] if config.room_specular else None,
             self.request.quality.environment_height,
             dfg,
