@@ -26,6 +26,7 @@ def launch_rows(
     *,
     rows: Rows | None,
     device: wp.DeviceLike,
+    stream: wp.Stream | None = None,
 ) -> None:
     """Launch ``kernel`` over ``shape``, restricted to ``rows`` along the first axis.
 
@@ -36,10 +37,12 @@ def launch_rows(
         outputs: Arrays that the kernel writes.
         rows: Band to launch; None means all rows.
         device: Where the arrays live.
+        stream: CUDA stream; None means the device's current one.
     """
     start, stop = rows if rows is not None else (0, shape[0])
     if stop > start:
-        wp.launch(kernel, dim=(stop - start, *shape[1:]), inputs=[start, *inputs], outputs=outputs, device=device)
+        dim = (stop - start, *shape[1:])
+        wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
 
 
 # Warp's CPU tiles take their memory from one arena per module, which nothing guards: two threads in one tile kernel

@@ -561,6 +561,7 @@ def trace_lamps(
     *,
     proxies: tuple[int, ...],
     rows: Rows | None = None,
+    stream: wp.Stream | None = None,
 ) -> None:
     """Irradiance that a surface point receives from lamps, per unit of their radiant intensity.
 
@@ -573,6 +574,7 @@ def trace_lamps(
         transfer_out: ``wp.float32`` (n, q), per square metre.
         proxies: Kinds of proxy in the scene.
         rows: Band of points, None for all.
+        stream: CUDA stream; None means the device's current one.
     """
     launch_rows(
         make_kernels(proxies)[2],
@@ -581,4 +583,5 @@ def trace_lamps(
         [transfer_out],
         rows=rows,
         device=transfer_out.device,
+        stream=stream,
     )

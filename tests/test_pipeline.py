@@ -99,6 +99,55 @@ def test_frames_sent_ahead_are_the_same(frames: Frames, device: str) -> None:
             np.testing.assert_array_equal(result.image, image)
 
 
+def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> None:
+    outputs = ("image", "environment")
+    with (
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs) as first,
+        Pipeline(make_scene(), device=device, quality="low", outputs=outputs) as second,
+    ):
+        expected = run(first, frames)
+        ahead, buffer = [], np.empty_like(frames[0])
+        for index, image in enumerate(frames):
+            np.copyto(buffer, image)
+            ahead.append(second.submit(buffer, time_seconds=index / 30))
+        for result, wanted in zip(ahead, expected, strict=True):
+            np.testing.assert_array_equal(result.image, wanted.image)
+            assert result.stages.keys() == wanted.stages.keys()
+            if device == "cpu":
+                np.testing.assert_array_equal(result.environment, wanted.environment)
+
+
+def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames, device: str) -> None:
+    scene = make_scene()
+    with contextlib.ExitStack() as stack:
+        plain, ahead, heir, expected_heir = (
+            stack.enter_context(Pipeline(scene, device=device, quality="low")) for _ in range(4)
+        )
+        first, second = run(plain, frames[:2])
+        submitted = ahead.submit(frames[0], time_seconds=0.0)
+        np.testing.assert_array_equal(ahead(frames[1], time_seconds=1 / 30).image, second.image)
+        np.testing.assert_array_equal(submitted.image, first.image)
+        for pipeline in (plain, ahead):
+            pipeline.submit(frames[2], time_seconds=2 / 30)
+            assert pipeline.update(edited(scene))
+            pipeline.submit(frames[3], time_seconds=3 / 30)
+        heir.continue_from(ahead)
+        expected_heir.continue_from(plain)
+        np.testing.assert_array_equal(heir(frames[0]).image, expected_heir(frames[0]).image)
+
+
+def test_an_error_while_rendering_is_raised_with_its_result(frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low") as pipeline:
+
+        def fail() -> None:
+            raise RuntimeError("broken stage")
+
+        pipeline._scheduler.run = fail  # type: ignore[assignment]
+        result = pipeline.submit(frames[0])
+        with pytest.raises(RuntimeError, match="broken stage"):
+            _ = result.image
+
+
 def test_a_known_pose_spares_tracking(frames: Frames, device: str) -> None:
     with (
         Pipeline(make_scene(), device=device, quality="low") as tracked,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
+import time
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from warp_ar.quality import PRESETS
 from warp_ar.ray_scene import HostScene, trace_config
 from warp_ar.scene import load_scene, loads_scene
 from warp_ar.session import Session
+from warp_ar.stages.recover import LATENCY, Recover
 from warp_ar.tracking import Pose
 
 ROWS, COLUMNS = kernels.CELL_ROWS, kernels.CELL_COLUMNS
@@ -505,13 +509,13 @@ def test_points_are_traced_once_when_they_come_into_view(device):
 
 @pytest.mark.parametrize(("fps", "expected"), [(12, [0, 1, 2, 5, 8, 11]), (30, [0, 1, 2, 8, 14]), (3, [0, 1, 2, 5, 8])])
 def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
-    frames, update = [], recovery.Recovery.update
+    frames, ask = [], Recover._ask
 
-    def counted(self, *args, **kwargs):
+    def counted(self, rows):
         frames.append(index)
-        return update(self, *args, **kwargs)
+        ask(self, rows)
 
-    monkeypatch.setattr(recovery.Recovery, "update", counted)
+    monkeypatch.setattr(Recover, "_ask", counted)
     rng = np.random.default_rng(5)
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     quality = PRESETS["low"].with_rungs(recover="white_card")
@@ -520,6 +524,54 @@ def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
             image = rng.integers(0, 255, (240, 320, 3), np.uint8)
             pipeline(image, time_seconds=index / fps, pose=pose)
     assert frames == expected
+
+
+def spied_estimates(monkeypatch, seconds=0.0):
+    """Let the n-th estimate, from 1 on, put n into every cell; it takes ``seconds``."""
+    numbers = itertools.count(1)
+
+    def update(self, cells, *_):
+        time.sleep(seconds)
+        return recovery.Estimate(np.full((*cells.shape, 3), next(numbers), np.float32), (False,) * 3)
+
+    monkeypatch.setattr(recovery.Recovery, "update", update)
+
+
+def shown_estimates(scene, device, count, turns=1):
+    """Number of the estimate that each of ``count`` frames, 30 a second, was lit by; pipelines take turns."""
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    rng = np.random.default_rng(6)
+    shown = []
+    with contextlib.ExitStack() as stack:
+        quality = PRESETS["low"].with_rungs(recover="white_card")
+        arguments = {"device": device, "quality": quality, "outputs": ("environment",)}
+        pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
+        for index in range(count):
+            now, before = pipelines[index % turns], pipelines[(index - 1) % turns]
+            if index and turns > 1:
+                now.continue_from(before)
+            now(rng.integers(0, 255, (240, 320, 3), np.uint8), time_seconds=index / 30, pose=pose)
+            shown.append(int(now.arrays["recover_excess"].numpy()[0, 0, 0]))
+    return shown
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+@pytest.mark.parametrize("seconds", [0.0, 0.05])
+def test_estimates_take_effect_a_fixed_number_of_frames_later(scene, device, monkeypatch, seconds, turns):
+    """The first frames wait for theirs; however long one takes, and whoever has the frames meanwhile."""
+    spied_estimates(monkeypatch, seconds)
+    # Begun in frames 0, 1, 2, 8 and 14.
+    expected = [1, 2, *[3] * (8 + LATENCY - 2), *[4] * 6, 5, 5]
+    assert shown_estimates(scene, device, len(expected), turns) == expected
+
+
+def test_a_failing_estimate_is_reported_with_its_frame(scene, monkeypatch):
+    def update(*_):
+        raise ArithmeticError("no such light")
+
+    monkeypatch.setattr(recovery.Recovery, "update", update)
+    with pytest.raises(ArithmeticError, match="no such light"):
+        shown_estimates(scene, "cpu", 1)
 
 
 CLIPPED_ERROR = 0.4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import types
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -166,3 +167,51 @@ def test_two_owners_of_one_resource_are_an_error() -> None:
     arrays.add("x", None)
     with pytest.raises(ValueError, match="'x' is already there"):
         arrays.add("x", None)
+
+
+def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each waits for the other; one thread after another would never end."""
+    meeting = threading.Barrier(2, timeout=10.0)
+
+    def build(self: AddOne, arrays: Arrays, device: Any) -> list[Pass]:
+        return [Pass(lambda rows: meeting.wait(), on_host=True)]  # type: ignore[arg-type,return-value]
+
+    branches = tuple(
+        type(f"To{target}", (AddOne,), {"name": target, "source": "frame", "target": target, "build": build})
+        for target in ("a", "b")
+    )
+    plan = plan_of(monkeypatch, branches, ("a", "b"))
+    scheduler = Scheduler(plan, inputs("cpu"), wp.get_device("cpu"), bands=2)
+    scheduler._threads = 2  # on any machine
+    assert run_count(scheduler.run()) == 2
+    scheduler.close()
+
+
+def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """And the host's among them cut no graph while they are not."""
+    calls: list[str] = []
+
+    class Sometimes(AddOne):
+        name, source, target = "sometimes", "frame", "a"
+
+        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+            (add,) = super().build(arrays, device)
+            again = Pass(add.launch, rows=SIZE, due=lambda: self.frame % 2 == 0)
+            return [add, Pass(lambda rows: calls.append("host"), on_host=True, due=again.due), again]
+
+        frame = -1
+
+        def begin(self) -> None:
+            self.frame += 1
+
+    arrays = inputs(device)
+    scheduler = Scheduler(plan_of(monkeypatch, (Sometimes,), ("a",)), arrays, wp.get_device(device))
+    for frame in range(6):
+        arrays["frame"].fill_(frame)
+        arrays.touch("frame")
+        scheduler.run()
+        np.testing.assert_array_equal(arrays["a"].numpy(), frame + 1)
+    assert calls == ["host"] * 3
+    if wp.get_device(device).is_cuda:
+        assert sorted(len(segments) for segments in scheduler._patterns.values()) == [1, 3]
+    scheduler.close()

@@ -14,15 +14,25 @@ import warp as wp
 from warp_ar.errors import UsageError
 
 _CUDA = threading.RLock()
+_TRANSLATION = threading.RLock()
 
 
 def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
     """Keeps other threads off a CUDA device for as long as it is entered; on CPU it does nothing.
 
     Warp's current stream, current device and running capture belong to the process, not to the thread: what one thread
-    allocates or launches while another captures would end up in that graph, or break it.
+    allocates or launches while another captures would end up in that graph, or break it. Not meant are launches and
+    copies on a stream that they name.
     """
     return _CUDA if device.is_cuda else contextlib.nullcontext()
+
+
+def translating(device: Any) -> contextlib.AbstractContextManager[Any]:
+    """Held by who declares kernels or launches them for the first time.
+
+    Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
+    """
+    return _CUDA if device.is_cuda else _TRANSLATION
 
 
 @contextlib.contextmanager

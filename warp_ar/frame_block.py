@@ -36,11 +36,11 @@ class FrameBlock:
             bytes_needed = np.dtype(struct.numpy_dtype()).itemsize * max(count, 1)
             size += -(-bytes_needed // _ALIGNMENT) * _ALIGNMENT
         self._device_buffer = wp.zeros(size, dtype=wp.uint8, device=device)
-        self._pinned: list[tuple[Any, Any]] = []
+        self._pinned: list[tuple[Any, Any, Any]] = []
         if not device.is_cpu:
-            self._pinned = [
-                (wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True), wp.Event(device)) for _ in range(_SLOTS)
-            ]
+            buffers = [wp.zeros(size, dtype=wp.uint8, device="cpu", pinned=True) for _ in range(_SLOTS)]
+            self._pinned = [(buffer, buffer.numpy(), wp.Event(device)) for buffer in buffers]
+            self._stream = wp.get_stream(device)
         self._uploads = 0
         self._bytes = self._device_buffer.numpy() if device.is_cpu else np.zeros(size, np.uint8)
         self._host: dict[str, Any] = {}
@@ -63,10 +63,10 @@ class FrameBlock:
         """Copy the host's values to the device; on CPU they are the same memory."""
         if not self._pinned:
             return
-        buffer, done = self._pinned[self._uploads % _SLOTS]
+        buffer, view, done = self._pinned[self._uploads % _SLOTS]
         if self._uploads >= _SLOTS:
             wp.synchronize_event(done)
         self._uploads += 1
-        buffer.numpy()[:] = self._bytes
-        wp.copy(self._device_buffer, buffer)
-        wp.record_event(done)
+        view[:] = self._bytes
+        wp.copy(self._device_buffer, buffer, stream=self._stream)
+        self._stream.record_event(done)

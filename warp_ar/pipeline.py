@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, cast
 
@@ -28,7 +29,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
 from warp_ar.stages.base import Arrays, Request
 from warp_ar.tracking import Pose, Tracker, TrackState
-from warp_ar.transfer import Transfers
+from warp_ar.transfer import Image, Slot, Transfers
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the room's light from frame to frame."""
@@ -36,46 +37,93 @@ LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_c
 TRACK = "track"
 """Name of the host's own stage in reports: the marker's pose."""
 
+AHEAD = 2
+"""Submitted frames that may wait for being rendered."""
+
 DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
 """Seconds between frames whose caller gives no time."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Result:
-    """What one frame became."""
+class Rendered:
+    """What the stages made of one frame."""
 
     image_array: Any
-    """The lit frame, (height, width) of 8-bit RGB, on the pipeline's device; valid until the next call."""
     environment_array: Any
-    """The room's light, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
+    stages: Mapping[str, StageTiming]
+    image: Callable[[], Image] | Image | None = None
+    """The picture, or how to wait for it, where it was sent ahead."""
+    environment: npt.NDArray[np.float32] | None = None
+    """The room's light where it was kept."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What one frame became; of a frame that was submitted, all but the pose waits until it has been rendered."""
+
     pose: Pose | None
     """From marker to camera; None while the marker is lost or when nothing needed it."""
     state: TrackState | None
     """Tracked, held or lost; None when nothing needed the pose."""
-    stages: Mapping[str, StageTiming]
-    """Milliseconds of every stage of the plan, and whether it was skipped."""
-    download: Future[npt.NDArray[np.uint8]] | None = None
-    """The lit frame on its way to the host, where it was sent ahead."""
+    _rendered: Future[Rendered]
     shown: bool = True
     """False: the frame has another exposure than the shown ones; it only told of the light, the picture is the last."""
 
+    @property
+    def image_array(self) -> Any:
+        """The lit frame, (height, width) of 8-bit RGB, on the pipeline's device; valid until the next call."""
+        return self._rendered.result().image_array
+
+    @property
+    def environment_array(self) -> Any:
+        """The room's light, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
+        return self._rendered.result().environment_array
+
+    @property
+    def stages(self) -> Mapping[str, StageTiming]:
+        """Milliseconds of every stage of the plan, and whether it was skipped."""
+        return self._rendered.result().stages
+
     @functools.cached_property
-    def image(self) -> npt.NDArray[np.uint8]:
+    def image(self) -> Image:
         """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
-        if self.download is not None:
-            return self.download.result()
-        if not isinstance(self.image_array, wp.array):
-            return np.array(self.image_array)
-        with exclusive(self.image_array.device):
-            return np.array(self.image_array.numpy())
+        rendered = self._rendered.result()
+        if rendered.image is not None:
+            return rendered.image() if callable(rendered.image) else rendered.image
+        lit = rendered.image_array
+        if not isinstance(lit, wp.array):
+            return np.array(lit)
+        with exclusive(lit.device):
+            return np.array(lit.numpy())
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
         """The room's light as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
-        if self.environment_array is None:
-            return None
-        with exclusive(self.environment_array.device):
-            return np.array(self.environment_array.numpy())
+        rendered = self._rendered.result()
+        if rendered.environment is not None or rendered.environment_array is None:
+            return rendered.environment
+        with exclusive(rendered.environment_array.device):
+            return np.array(rendered.environment_array.numpy())
+
+
+@dataclasses.dataclass(frozen=True)
+class _Frame:
+    """A frame that has been looked at, not rendered."""
+
+    image: Any
+    """As it was given, or a copy of one's own."""
+    slot: Slot | None
+    """Its way to the device, where that has begun."""
+    pose: Pose | None
+    lost: bool
+    index: int
+    time: float
+    """Seconds, by the caller's clock."""
+    seconds: float
+    """Since the first frame."""
+    step: float
+    """Seconds since the frame before that was lit."""
+    timings: dict[str, StageTiming]
 
 
 def resolve_quality(quality: str | Quality) -> Quality:
@@ -142,10 +190,10 @@ class Pipeline:
         self._shown: Any = None
         self._has_light = False
         self._arrays = Arrays()
-        self._short: ShortFrames | None = None
-        with exclusive(self.device):
-            with wp.ScopedDevice(self.device):
-                self._add_inputs()
+        self._renderer: ThreadPoolExecutor | None = None
+        self._ahead: collections.deque[Future[Rendered]] = collections.deque()
+        with exclusive(self.device), wp.ScopedDevice(self.device):
+            self._add_inputs()
             self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.request, self._arrays, self.device)
@@ -160,9 +208,9 @@ class Pipeline:
 
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
+        if self._renderer is not None:
+            self._renderer.shutdown()
         self._scheduler.close()
-        if self._transfers is not None:
-            self._transfers.close()
 
     @property
     def scheduler(self) -> Scheduler:
@@ -223,6 +271,7 @@ class Pipeline:
         Raises:
             SceneError: The scene's camera does not fit the size of the frames.
         """
+        self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
         request = dataclasses.replace(self.plan.request, scene=scene)
         if skeleton(scene) != skeleton(self.scene):
@@ -245,8 +294,9 @@ class Pipeline:
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
-        self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
-        self._shown = other._shown
+        self._finish()
+        other._finish()
+        self._start_time, self._last_time = other._start_time, other._last_time
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         with exclusive(self.device):
@@ -287,18 +337,47 @@ class Pipeline:
         pose: Pose | None = None,
         exposure_time: float | None = None,
     ) -> Result:
-        """Light one frame without waiting for it: on CUDA its picture is sent ahead, and waited for when it is read.
+        """Light one frame without waiting for it; arguments as those of a call.
 
-        With the next frame submitted before this one's image is read, tracking, both ways over the bus and the kernels
-        run side by side. The device's own arrays of a result still hold only until the next frame. Arguments as those
-        of a call.
+        This thread looks for the marker and hands the frame over; another renders it, and on CUDA sends its picture
+        ahead. With the next frame submitted before this one's image is read, tracking, both ways over the bus and the
+        kernels run side by side. The device's own arrays of a result still hold only until the next frame is rendered.
         """
-        result = self(image, time_seconds=time_seconds, pose=pose, exposure_time=exposure_time)
-        if self._transfers is None or not isinstance(result.image_array, wp.array):
-            _ = result.image  # kept: the next frame writes the same array
-            return result
-        with exclusive(self.device):
-            return dataclasses.replace(result, download=self._transfers.download(result.image_array))
+        host_image = self._accept(image)
+        now, exposure = self._note_time(time_seconds, exposure_time)
+        if exposure > 0:
+            return self._take_short(image, host_image, exposure, now, pose)
+        if host_image is None:
+            self._finish()
+            frame, state = self._look(image, None, now, pose)
+            return Result(frame.pose, state, _done(self._keep(self._render(frame))))
+        frame, state = self._look(host_image, host_image, now, pose)
+        while len(self._ahead) >= AHEAD:
+            self._ahead.popleft().result()
+        if self._renderer is None:
+            self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
+        # The caller may write its picture anew before it is rendered.
+        if self._transfers is None or frame.lost:
+            frame = dataclasses.replace(frame, image=host_image.copy())
+        else:
+            frame = dataclasses.replace(frame, slot=self._transfers.upload(host_image))
+        self._ahead.append(self._renderer.submit(lambda: self._keep(self._render(frame))))
+        return Result(frame.pose, state, self._ahead[-1])
+
+    def _finish(self) -> None:
+        """Wait until all that was submitted is rendered."""
+        while self._ahead:
+            self._ahead.popleft().result()
+
+    def _keep(self, rendered: Rendered) -> Rendered:
+        """Have the picture outlast the next frame."""
+        lit, light = rendered.image_array, rendered.environment_array
+        if not isinstance(lit, wp.array):
+            return dataclasses.replace(rendered, image=lit)
+        if self._transfers is not None:
+            return dataclasses.replace(rendered, image=self._transfers.download(lit))
+        kept = None if light is None else np.array(light.numpy())
+        return dataclasses.replace(rendered, image=np.array(lit.numpy()), environment=kept)
 
     def __call__(
         self,
@@ -321,35 +400,59 @@ class Pipeline:
             UsageError: The image has another size or type.
         """
         host_image = self._accept(image)
+        self._finish()
+        now, exposure = self._note_time(time_seconds, exposure_time)
+        if exposure > 0:
+            return self._take_short(image, host_image, exposure, now, pose)
+        frame, state = self._look(image, host_image, now, pose)
+        if host_image is not None and not frame.lost and self._transfers is not None:
+            frame = dataclasses.replace(frame, slot=self._transfers.upload(host_image))
+        return Result(frame.pose, state, _done(self._render(frame)))
+
+    def _note_time(self, time_seconds: float | None, exposure_time: float | None) -> tuple[float, int]:
+        """When a frame was taken, and which of the exposures it has."""
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:
             self._start_time = self._last_time = self._lit_time = now
-        exposure = find_exposure(exposure_time, self._longest, self.plan.request.exposures)
-        if exposure > 0:
-            return self._take_short(image, host_image, exposure, now, pose)
+        return now, find_exposure(exposure_time, self._longest, self.plan.request.exposures)
+
+    def _look(
+        self, image: Any, host_image: Image | None, now: float, pose: Pose | None
+    ) -> tuple[_Frame, TrackState | None]:
+        """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         state: TrackState | None = None
         if self._tracker is not None and pose is None:
+            if host_image is None:
+                with exclusive(self.device):
+                    host_image = image.numpy()
             start = time.perf_counter()
-            track = self._tracker.track(cast(Any, image).numpy() if host_image is None else host_image, now)
+            track = self._tracker.track(cast(Image, host_image), now)
             timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
             pose, state = track.pose, track.state
         lost = self._tracker is not None and pose is None
-        if not lost:
-            with exclusive(self.device):
-                if self._short is not None and self._short.refresh(now):
-                    self._has_light = False
-                self._set_frame_values(pose, now)
-                self._upload(image, host_image)
-                timings.update(self._scheduler.run())
-            self._has_light = True
+        seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
+        return _Frame(image, None, pose, lost, self._index - 1, now, seconds, step, timings), state
+
+    def _render(self, frame: _Frame) -> Rendered:
+        """Run the stages on a frame."""
+        timings = frame.timings
+        if not frame.lost:
+            with exclusive(self.device):
+                if self._short is not None and self._short.refresh(frame.time):
+                    self._has_light = False
+                self._set_frame_values(frame)
+                self._take_frame(frame)
+                timings = {**timings, **self._scheduler.run()}
+            self._has_light = True
         # A lost marker says nothing about where things are: the frame passes as it came, the last light is kept.
-        lit = image if lost or "image" not in self._arrays else self._arrays["image"]
-        light = self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
-        self._shown = lit
-        return Result(lit, light, pose, state, timings)
+        self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
+        return Rendered(self._shown, self._light(), timings)
+
+    def _light(self) -> Any:
+        return self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
 
     def _take_short(
         self,
@@ -360,6 +463,7 @@ class Pipeline:
         pose: Pose | None,
     ) -> Result:
         """Let a frame of another exposure tell of the light; the picture stays."""
+        self._finish()
         timings: dict[str, StageTiming] = {}
         state: TrackState | None = None
         bright: Any = image
@@ -378,8 +482,7 @@ class Pipeline:
             timings["unwrap"] = StageTiming((time.perf_counter() - start) * 1e3, False)
         self._last_time = now
         shown = bright if self._shown is None else self._shown
-        light = self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None
-        return Result(shown, light, pose, state, timings, shown=False)
+        return Result(pose, state, _done(self._keep(Rendered(shown, self._light(), timings))), shown=False)
 
     def _accept(self, image: Any) -> npt.NDArray[np.uint8] | None:
         width, height = self.size
@@ -395,23 +498,18 @@ class Pipeline:
             raise UsageError(f"frame is {got}; expected uint8 RGB ({height}, {width}, 3)")
         return np.ascontiguousarray(image)
 
-    def _set_frame_values(self, pose: Pose | None, now: float) -> None:
+    def _set_frame_values(self, frame: _Frame) -> None:
         params = self._block.host("params")
         touched: list[str] = ["clock"]
         before = params.copy()
+        pose = frame.pose
         if pose is not None:
             inverse = pose.inverse()
             params["camera_position"] = inverse.translation
             params["world_from_camera"] = inverse.rotation
-        if (
-            self._host_scene.write_lights(self._block.host("lights"), now - (self._start_time or 0.0))
-            or self._index == 0
-        ):
+        if self._host_scene.write_lights(self._block.host("lights"), frame.seconds) or frame.index == 0:
             touched.append("lights")
-        if (
-            self._host_scene.write_objects(self._block.host("objects"), now - (self._start_time or 0.0))
-            or self._index == 0
-        ):
+        if self._host_scene.write_objects(self._block.host("objects"), frame.seconds) or frame.index == 0:
             touched.append("objects")
         moved = (
             pose is not None
@@ -428,25 +526,32 @@ class Pipeline:
             if "physical_ratio" in self._arrays:
                 params["shadow_rect"] = self._host_scene.shadow_rect(pose, self.camera)
                 self._shadow_rows = (int(params["shadow_rect"][0][0]), int(params["shadow_rect"][0][1]))
-        params["time"] = now - (self._start_time or 0.0)
-        params["time_step"] = max(now - self._lit_time, 0.0)
-        params["frame_index"] = self._index
+        params["time"] = frame.seconds
+        params["time_step"] = frame.step
+        params["frame_index"] = frame.index
         params["environment_reset"] = int(not self._has_light)
         self._block.upload()
         for name in touched:
             self._arrays.touch(name)
 
-    def _upload(self, image: Any, host_image: npt.NDArray[np.uint8] | None) -> None:
-        if host_image is None:
-            wp.copy(self._frame, image)
-        elif self._transfers is None:
-            target = self._frame.numpy()
-            if self._index and np.array_equal(target, host_image):
-                return  # a still picture: nothing that reads the frame needs to run
-            np.copyto(target, host_image)
+    def _take_frame(self, frame: _Frame) -> None:
+        """The frame becomes the one that stages read."""
+        if frame.slot is not None and self._transfers is not None:
+            self._transfers.receive(frame.slot, self._frame)
+        elif isinstance(frame.image, wp.array):
+            wp.copy(self._frame, frame.image)
         else:
-            self._transfers.upload(host_image, self._frame)
+            target = self._frame.numpy()
+            if frame.index and np.array_equal(target, frame.image):
+                return  # a still picture: nothing that reads the frame needs to run
+            np.copyto(target, frame.image)
         self._arrays.touch("frame")
+
+
+def _done(rendered: Rendered) -> Future[Rendered]:
+    future: Future[Rendered] = Future()
+    future.set_result(rendered)
+    return future
 
 
 def resample_light(

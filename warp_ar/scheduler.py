@@ -2,7 +2,8 @@
 
 On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
 graph. In the graph a stage waits only for those whose output it reads, so that short kernels, which leave most of the
-device idle, run beside others.
+device idle, run beside others. On CPU it is the same: threads take bands of whatever stage has its inputs, the first in
+order first, so that nobody waits for a pass that cannot be split, or for the last band of one that can.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ import collections
 import dataclasses
 import itertools
 import os
+import threading
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
-from warp_ar.device import exclusive
+from warp_ar.device import exclusive, translating
 from warp_ar.graph import INPUTS, Plan
 from warp_ar.stages.base import Arrays, Pass, Rows, Stage
 
@@ -36,7 +38,8 @@ class StageTiming:
     """What one stage did in one frame."""
 
     milliseconds: float
-    """On CUDA, unless the pipeline profiles, the stage's share of the time that launching took the host."""
+    """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
+    profiles, an equal share of the time that launching took the host."""
     skipped: bool
     """True: nothing that it reads had changed."""
 
@@ -67,24 +70,32 @@ class Scheduler:
         self._stages: list[Step] = []
         self._fills: dict[str, Any] = {}
         self._seen: dict[str, tuple[int, ...]] = {}
-        self._translated: set[Pass] = set()
-        self._graphs: dict[tuple[str, ...], Any] = {}
+        self._translated: set[int] = set()
+        self._patterns: dict[Any, list[Segment]] = {}
+        self._graphs: dict[tuple[int, ...], Any] = {}
+        self._stream: Any = wp.get_stream(device) if device.is_cuda else None
         self._streams: list[Any] = []
-        self._marks: dict[str, tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
+        self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
-        with wp.ScopedDevice(device):
+        with wp.ScopedDevice(device), translating(device):
             for kind, wiring in plan.stages:
                 stage = kind(plan.request, wiring)
                 for name, spec in stage.arrays().items():
                     arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
                     self._fills[name] = spec.fill
                 self._stages.append((stage, stage.build(arrays, device)))
+        self._readers = _find_readers([stage for stage, _ in self._stages])
+        self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
+        # Stages that decide per frame what they do: their passes are part of a frame's pattern.
+        self._changing = {stage.name for stage, passes in self._stages if any(step.due for step in passes)}
 
     def close(self) -> None:
         """Stop the worker threads."""
         if self._pool is not None:
             self._pool.shutdown()
+        for stage, _ in self._stages:
+            stage.close()
 
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
@@ -100,6 +111,7 @@ class Scheduler:
             if all(name in other.arrays and other.arrays[name].shape == self.arrays[name].shape for name in names):
                 for name in names:
                     wp.copy(self.arrays[name], other.arrays[name])
+                    self.arrays.touch(name)
                 stage.resume(others[stage.name])
 
     def _remembered(self, stage: Stage) -> list[str]:
@@ -119,9 +131,9 @@ class Scheduler:
         for stage, passes in self._stages:
             for step in passes:
                 if not step.on_host:
-                    with exclusive(self.device), wp.ScopedStream(stream):
+                    with translating(self.device), wp.ScopedStream(stream):
                         step.launch(None)
-                    self._translated.add(step)
+                    self._translated.add(id(step))
             with exclusive(self.device), wp.ScopedStream(stream):
                 for name in self._remembered(stage):
                     self.arrays[name].fill_(self._fills[name])
@@ -146,6 +158,9 @@ class Scheduler:
                 self.arrays.touch(name)
 
     def _run_eager(self) -> dict[str, StageTiming]:
+        """Stage after stage, or side by side where there are threads for it."""
+        if self._pool is not None:
+            return SideBySide(self, self._pool, self._threads).run()
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
@@ -153,88 +168,102 @@ class Scheduler:
                 timings[stage.name] = StageTiming(0.0, True)
                 continue
             start = self.clock()
-            for step in passes:
-                self._run_pass(step)
+            for step in _due_passes(stage, passes):
+                # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
+                step.launch(step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
             self._publish(stage)
             timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)
         return timings
 
-    def _run_pass(self, step: Pass) -> None:
-        if self._pool is None or step.rows is None:
-            # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
-            step.launch(step.extent() if step.extent is not None and self.device.is_cpu else None)
-            return
+    def _split(self, step: Pass) -> list[Rows | None]:
+        """Bands of a pass in this frame."""
+        if step.rows is None:
+            return [step.extent() if step.extent is not None else None]
         start, stop = step.extent() if step.extent is not None else (0, step.rows)
+        if stop <= start:
+            return []
+        if id(step) not in self._translated:
+            return [(start, stop)]
         wanted = self.bands or self._threads * (2 if stop - start >= UNEVEN_ROWS else 1)
         bands = min(wanted, max(1, (stop - start) // MIN_BAND_ROWS))
-        edges = [start + (stop - start) * band // bands for band in range(bands + 1)]
-        waiting = collections.deque(itertools.pairwise(edges))
-        # This thread works as well: one hand-over less per pass. It works alone at first, when kernels are translated:
-        # Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
-        helpers = min(bands - 1, max(self._threads - 1, 1)) if step in self._translated else 0
-        if stop > start:
-            self._translated.add(step)
-        futures: list[Future[None]] = [self._pool.submit(_drain, step.launch, waiting) for _ in range(helpers)]
-        _drain(step.launch, waiting)
-        for future in futures:
-            future.result()
+        return list(itertools.pairwise(start + (stop - start) * band // bands for band in range(bands + 1)))
+
+    def _launch_band(self, step: Pass, rows: Rows | None) -> None:
+        if step.on_host or id(step) in self._translated:
+            step.launch(rows)
+            return
+        with translating(self.device):
+            step.launch(rows)
+        self._translated.add(id(step))
 
     def _run_captured(self) -> dict[str, StageTiming]:
         due: list[Step] = []
+        pattern: list[Any] = []
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
                 timings[stage.name] = StageTiming(0.0, True)
                 continue
-            due.append((stage, passes))
+            chosen = _due_passes(stage, passes)
+            due.append((stage, chosen))
+            pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
             self._publish(stage)
-        key = tuple(stage.name for stage, _ in due)
-        if not key:
+        if not due:
             return timings
+        key = tuple(pattern)
+        if key not in self._patterns:
+            self._patterns[key] = _segments(due)
         start = self.clock()
-        for index, (on_host, part) in enumerate(_segments(due)):
-            if on_host:
-                self._launch_in_turn(part)
+        for segment in self._patterns[key]:
+            if segment.on_host:
+                for _, steps in segment.part:
+                    for step in steps:
+                        step.launch(None)
             else:
-                self._replay((*key, str(index)), part)
-        share = (self.clock() - start) * 1e3 / len(key)
-        times = dict.fromkeys(key, share)
+                self._replay(segment)
+        share = (self.clock() - start) * 1e3 / len(due)
+        times = {stage.name: share for stage, _ in due}
         if self._marks is not None:
-            times = {name: wp.get_event_elapsed_time(*self._marks[name]) for name in key}
+            times = dict.fromkeys(times, 0.0)
+            for segment in self._patterns[key]:
+                for stage, steps in segment.part:
+                    if not segment.on_host:
+                        times[stage.name] += wp.get_event_elapsed_time(*self._marks[_ids(steps)])
         timings.update({name: StageTiming(milliseconds, False) for name, milliseconds in times.items()})
         return timings
 
-    def _replay(self, key: tuple[str, ...], part: list[Step]) -> None:
-        graph = self._graphs.get(key)
+    def _replay(self, segment: Segment) -> None:
+        graph = self._graphs.get(segment.key)
         if graph is not None:
-            wp.capture_launch(graph)
+            wp.capture_launch(graph, stream=self._stream)
             return
-        # Launched once outside the capture: that loads every module, which a capture must not do.
-        self._launch_in_turn(part)
-        with wp.ScopedCapture(device=self.device) as capture:
-            if self._marks is None:
-                self._launch_side_by_side(part)
-            else:
-                self._launch_in_turn(part)
-        self._graphs[key] = capture.graph
+        with exclusive(self.device), wp.ScopedStream(self._stream, sync_enter=False):
+            # Launched once outside the capture: that loads every module, which a capture must not do.
+            self._launch_in_turn(segment.part)
+            with wp.ScopedCapture(device=self.device) as capture:
+                if self._marks is None:
+                    self._launch_side_by_side(segment.part)
+                else:
+                    self._launch_in_turn(segment.part)
+        self._graphs[segment.key] = capture.graph
 
     def _launch_in_turn(self, part: list[Step]) -> None:
         """Launch stages one after another; if profiling, between two marks each."""
-        for stage, passes in part:
+        for _stage, steps in part:
             if self._marks is not None:
-                begin, end = self._marks.setdefault(stage.name, _make_marks(self.device))
+                begin, end = self._marks.setdefault(_ids(steps), _make_marks(self.device))
                 wp.record_event(begin)
-            for step in passes:
+            for step in steps:
                 step.launch(None)
             if self._marks is not None:
                 wp.record_event(end)
 
     def _launch_side_by_side(self, part: list[Step]) -> None:
         """Launch each stage on a stream of its own that waits for the writers of what it reads."""
-        stream = wp.get_stream(self.device)
+        stream = self._stream
         self._streams += [wp.Stream(self.device) for _ in range(len(part) - len(self._streams))]
         begun = stream.record_event()
         written: dict[str, Any] = {}
@@ -251,27 +280,168 @@ class Scheduler:
             stream.wait_event(done)
 
 
+@dataclasses.dataclass(frozen=True)
+class Segment:
+    """A stretch of a frame: on the host, or captured as one graph."""
+
+    on_host: bool
+    part: list[Step]
+    key: tuple[int, ...]
+    """Of its passes."""
+
+
+class _Running:
+    """A stage in one frame on CPU."""
+
+    def __init__(self, stage: Stage, steps: list[Pass], waits: int) -> None:
+        self.stage, self.steps = stage, steps
+        self.waits = waits
+        """Stages whose output it reads and that are not done."""
+        self.versions: tuple[int, ...] = ()
+        self.left: collections.deque[Pass] = collections.deque()
+        self.step: Pass | None = None
+        self.bands: collections.deque[Rows | None] = collections.deque()
+        self.out = 0
+        """Bands under way."""
+        self.seconds = 0.0
+
+
+class SideBySide:
+    """One frame on CPU: threads take the next band of the first stage that has one ready."""
+
+    def __init__(self, scheduler: Scheduler, pool: ThreadPoolExecutor, threads: int) -> None:
+        """Prepare; stages without unfinished inputs are ready at once."""
+        self._scheduler, self._pool, self._threads = scheduler, pool, threads
+        self._changed = threading.Condition()
+        readers = scheduler._readers
+        counts = collections.Counter(reader for found in readers.values() for reader in found)
+        self._stages = {stage.name: _Running(stage, steps, counts[stage.name]) for stage, steps in scheduler._stages}
+        self._timings: dict[str, StageTiming] = {}
+        self._open = len(self._stages)
+        self._ready: list[_Running] = []
+        self._error: BaseException | None = None
+
+    def run(self) -> dict[str, StageTiming]:
+        """Run all; this thread works too. The first error ends it, once bands under way are done."""
+        start = self._scheduler.clock()
+        with self._changed:
+            for running in [first for first in self._stages.values() if first.waits == 0]:
+                self._begin(running)
+        helpers = [self._pool.submit(self._work) for _ in range(self._threads - 1)] if self._open else []
+        self._work()
+        for helper in helpers:
+            helper.result()
+        if self._error is not None:
+            raise self._error
+        whole = (self._scheduler.clock() - start) * 1e3
+        busy = sum(running.seconds for running in self._stages.values()) or 1.0
+        for name, running in self._stages.items():
+            if name not in self._timings:
+                self._timings[name] = StageTiming(whole * running.seconds / busy, False)
+        return {name: self._timings[name] for name in self._stages}
+
+    def _begin(self, running: _Running) -> None:
+        """All inputs are there: ready, or done at once where none of them changed."""
+        versions = self._scheduler._due(running.stage)
+        if versions is None:
+            self._timings[running.stage.name] = StageTiming(0.0, True)
+            self._end(running)
+            return
+        running.versions = versions
+        running.left.extend(_due_passes(running.stage, running.steps))
+        self._ready.append(running)
+        self._advance(running)
+
+    def _advance(self, running: _Running) -> None:
+        """Go to the next pass that has rows, or to the end."""
+        while running.left:
+            running.step = running.left.popleft()
+            running.bands.extend(self._scheduler._split(running.step))
+            if running.bands:
+                return
+        self._ready.remove(running)
+        self._scheduler._seen[running.stage.name] = running.versions
+        self._scheduler._publish(running.stage)
+        self._end(running)
+
+    def _end(self, running: _Running) -> None:
+        self._open -= 1
+        for name in self._scheduler._readers[running.stage.name]:
+            reader = self._stages[name]
+            reader.waits -= 1
+            if reader.waits == 0:
+                self._begin(reader)
+
+    def _work(self) -> None:
+        """Take bands until no stage is left."""
+        while True:
+            with self._changed:
+                while (chosen := self._choose()) is None:
+                    if self._open == 0 or self._error is not None:
+                        return
+                    self._changed.wait()
+                rows = chosen.bands.popleft()
+                chosen.out += 1
+                step = chosen.step
+            assert step is not None
+            start = self._scheduler.clock()
+            error: BaseException | None = None
+            try:
+                self._scheduler._launch_band(step, rows)
+            except BaseException as caught:  # handed to the thread that asked for the frame
+                error = caught
+            spent = self._scheduler.clock() - start
+            with self._changed:
+                chosen.out -= 1
+                chosen.seconds += spent
+                if error is None and self._error is None and not chosen.bands and chosen.out == 0:
+                    try:
+                        self._advance(chosen)
+                    except BaseException as caught:
+                        error = caught
+                self._error = self._error or error
+                self._changed.notify_all()
+
+    def _choose(self) -> _Running | None:
+        """The first stage in order that has a band left."""
+        if self._error is not None:
+            return None
+        order = self._scheduler._order
+        return min((r for r in self._ready if r.bands), key=lambda r: order[r.stage.name], default=None)
+
+
 def _make_marks(device: Any) -> tuple[Any, Any]:
     return wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
 
 
-def _segments(due: list[Step]) -> list[tuple[bool, list[Step]]]:
+def _ids(steps: list[Pass]) -> tuple[int, ...]:
+    return tuple(map(id, steps))
+
+
+def _due_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
+    """Passes of a stage that take part in this frame."""
+    stage.begin()
+    return [step for step in passes if step.due is None or step.due()]
+
+
+def _segments(due: list[Step]) -> list[Segment]:
     """Stages in order, cut into stretches that are captured as one and stretches that run on the host."""
     steps = [(step.on_host, stage, step) for stage, passes in due for step in passes]
-    return [
+    parts = [
         (on_host, [(stage, [step for _, _, step in own]) for stage, own in itertools.groupby(stretch, lambda s: s[1])])
         for on_host, stretch in itertools.groupby(steps, lambda s: s[0])
     ]
+    return [Segment(on_host, part, _ids([step for _, own in part for step in own])) for on_host, part in parts]
 
 
-def _drain(launch: Callable[[Rows | None], None], waiting: collections.deque[Rows]) -> None:
-    """Launch bands until none is waiting."""
-    while True:
-        try:
-            rows = waiting.popleft()
-        except IndexError:
-            return
-        launch(rows)
+def _find_readers(stages: list[Stage]) -> dict[str, list[str]]:
+    """Stages that read what each stage writes."""
+    return {
+        stage.name: [
+            later.name for later in stages[index + 1 :] if not set(stage.wiring.writes).isdisjoint(later.wiring.reads)
+        ]
+        for index, stage in enumerate(stages)
+    }
 
 
 def add_inputs(arrays: Arrays, inputs: Mapping[str, Any]) -> None:

@@ -112,11 +112,13 @@ class Session:
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
-        if pipeline.device.is_cpu or self.source.live or "environment" in pipeline.plan.request.outputs:
+        kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
+        if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self.source:
                 yield frame, pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
-        # One frame ahead of what is handed out, so that reading a picture does not hold up the next frame.
+        # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
+        # and reading a picture does not hold up the next frame. A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
         try:
             for frame in self.source:

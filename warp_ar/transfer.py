@@ -1,15 +1,18 @@
 """Frames to a CUDA device and pictures back, beside the kernels: pinned memory, and a stream for each direction.
 
-A frame takes four steps: into pinned memory (host), to the device (copy engine), through the kernels, back into pinned
-memory (copy engine). Each of ``SLOTS`` slots has buffers for all four, so that the host fills one, the engines move a
-second and the kernels work on a third. Kernels read and write arrays of their own, at addresses that a captured graph
-may keep; they are copied to and from the slots on the device, which takes a hundredth of the way over the bus.
+A frame goes into pinned memory (host), to the device (copy engine), through the kernels, and back into pinned memory
+(copy engine). Each of ``SLOTS`` slots has buffers for the first two and the last step, so that the host fills one, the
+engines move a second and the kernels work on a third. Kernels read and write arrays of their own, at addresses that a
+captured graph may keep; they are copied to and from the slots on the device, which takes a hundredth of the way over
+the bus. A picture stays in the pinned memory that it came into until nobody refers to it any more: to copy it again
+takes the host longer than all the rest.
 """
 
 from __future__ import annotations
 
-import itertools
-from concurrent.futures import Future, ThreadPoolExecutor
+import collections
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,24 +24,26 @@ Image = npt.NDArray[np.uint8]
 SLOTS = 3
 """Frames under way at once; the host waits before it begins one more."""
 
-COPY_THREADS = 4
-"""Threads that copy one frame to or from pinned memory; one alone takes longer than the bus."""
-
-_COPY_ROWS = 256
-"""Rows from which splitting a host copy pays for handing parts over."""
+KEPT = 8
+"""Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
 
 
-class _Slot:
+class Slot:
     """Buffers of one frame under way."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
-        self.to_device = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
-        self.from_device = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
-        self.to_device_host, self.from_device_host = self.to_device.numpy(), self.from_device.numpy()
+        self.pinned = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
+        self.host = self.pinned.numpy()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.uploaded, self.consumed, self.rendered, self.downloaded = (wp.Event(device) for _ in range(4))
-        self.fetched: Future[Image] | None = None
+
+
+class _Holder:
+    """What arrays over one buffer of pictures refer to: it goes when the last of them does."""
+
+    def __init__(self, host: Image) -> None:
+        self.__array_interface__ = host.__array_interface__
 
 
 class Transfers:
@@ -51,66 +56,78 @@ class Transfers:
             shape: Rows and columns of a frame.
             device: CUDA device.
         """
+        self._shape, self._device = shape, device
         self._compute = wp.get_stream(device)
         self._up, self._down = wp.Stream(device), wp.Stream(device)
-        self._slots = [_Slot(shape, device) for _ in range(SLOTS)]
+        self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
-        self._pool = ThreadPoolExecutor(COPY_THREADS, "warp_ar-copy") if shape[0] >= 2 * _COPY_ROWS else None
-        self._fetcher = ThreadPoolExecutor(1, "warp_ar-fetch")
+        self._free: collections.deque[tuple[Any, Image, Any]] = collections.deque()
+        for _ in range(SLOTS):
+            self._free.append(self._new_buffer())
+        self._buffers = SLOTS
 
-    def close(self) -> None:
-        """Stop the copying threads."""
-        self._fetcher.shutdown()
-        if self._pool is not None:
-            self._pool.shutdown()
+    def _new_buffer(self) -> tuple[Any, Image, Any]:
+        pinned = wp.zeros(self._shape, dtype=wp.vec3ub, device="cpu", pinned=True)
+        return pinned, pinned.numpy(), wp.Event(self._device)
 
-    def _copy(self, target: Image, source: Image) -> None:
-        """Copy one host picture to another."""
-        if self._pool is None:
-            np.copyto(target, source)
-            return
-        edges = np.linspace(0, len(source), COPY_THREADS + 1).astype(int)
-        parts = [slice(start, stop) for start, stop in itertools.pairwise(edges)]
-        others = [self._pool.submit(np.copyto, target[part], source[part]) for part in parts[1:]]
-        np.copyto(target[parts[0]], source[parts[0]])
-        for other in others:
-            other.result()
+    def upload(self, image: Image) -> Slot:
+        """Send a host picture on its way; when this returns, the caller may write it anew.
 
-    def upload(self, image: Image, frame_out: Any) -> None:
-        """Send a host picture to ``frame_out``; kernels launched from now on see it, those under way do not."""
+        Returns:
+            What to ``receive`` it from, before ``SLOTS`` more are sent.
+        """
         slot = self._slots[self._uploads % SLOTS]
         if self._uploads >= SLOTS:
             wp.synchronize_event(slot.uploaded)
             self._up.wait_event(slot.consumed)
         self._uploads += 1
-        self._copy(slot.to_device_host, image)
-        wp.copy(slot.frame, slot.to_device, stream=self._up)
+        np.copyto(slot.host, image)
+        wp.copy(slot.frame, slot.pinned, stream=self._up)
         self._up.record_event(slot.uploaded)
+        return slot
+
+    def receive(self, slot: Slot, frame_out: Any) -> None:
+        """Have kernels that are launched from now on see an uploaded picture in ``frame_out``."""
         self._compute.wait_event(slot.uploaded)
         wp.copy(frame_out, slot.frame, stream=self._compute)
         self._compute.record_event(slot.consumed)
 
-    def download(self, image: Any) -> Future[Image]:
+    def download(self, image: Any) -> Callable[[], Image]:
         """Send the device's picture to the host as soon as the kernels launched so far have written it.
 
         Returns:
-            Gives the picture, an array of its own; a thread waits for it and copies it out of pinned memory.
+            Waits for the picture and gives it; the array is the caller's for as long as he refers to it.
         """
         slot = self._slots[self._downloads % SLOTS]
         self._downloads += 1
-        if slot.fetched is not None:
-            slot.fetched.result()  # its buffers are needed now
-            self._compute.wait_event(slot.downloaded)
+        self._compute.wait_event(slot.downloaded)
         wp.copy(slot.image, image, stream=self._compute)
         self._compute.record_event(slot.rendered)
         self._down.wait_event(slot.rendered)
-        wp.copy(slot.from_device, slot.image, stream=self._down)
+        if not self._free and self._buffers < KEPT:
+            self._free.append(self._new_buffer())
+            self._buffers += 1
+        try:
+            buffer = self._free.popleft()
+        except IndexError:
+            kept = wp.empty(self._shape, dtype=wp.vec3ub, device="cpu")
+            wp.copy(kept, slot.image, stream=self._down)
+            self._down.record_event(slot.downloaded)
+            wp.synchronize_event(slot.downloaded)
+            ordinary: Image = kept.numpy()
+            return lambda: ordinary
+        pinned, host, done = buffer
+        wp.copy(pinned, slot.image, stream=self._down)
         self._down.record_event(slot.downloaded)
-        slot.fetched = self._fetcher.submit(self._fetch, slot)
-        return slot.fetched
+        self._down.record_event(done)
+        holder = _Holder(host)
+        # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
+        weakref.finalize(holder, self._free.append, buffer)
+        picture = np.asarray(holder)
+        del holder
 
-    def _fetch(self, slot: _Slot) -> Image:
-        wp.synchronize_event(slot.downloaded)
-        image: Image = np.empty(slot.from_device_host.shape, np.uint8)
-        self._copy(image, slot.from_device_host)
-        return image
+        def wait() -> Image:
+            wp.synchronize_event(done)
+            return picture
+
+        return wait

@@ -72,7 +72,9 @@ class Pass:
     extent: Callable[[], Rows] | None = None
     """Rows that matter in this frame, asked on CPU before splitting; None means all."""
     on_host: bool = False
-    """Works on the host between launches, and may read arrays back: it cannot be part of a captured graph."""
+    """Works on the host between launches: it cannot be part of a captured graph, which is cut where it is due."""
+    due: Callable[[], bool] | None = None
+    """Whether the pass takes part in this frame, asked once, after ``Stage.begin``; None means always."""
 
 
 class Arrays(Mapping[str, Any]):
@@ -140,6 +142,12 @@ class Stage(abc.ABC):
     @abc.abstractmethod
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Passes that do the work on ``arrays``; compiles what it needs by asking for its kernels."""
+
+    def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
+        """Called once in every frame in which the stage runs, before any of its passes."""
+
+    def close(self) -> None:  # noqa: B027
+        """Let go of what the stage holds beside arrays: its threads."""
 
     def changed(self, name: str) -> bool:
         """Whether the last run changed the written resource ``name`` enough for its readers to run again."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_ar import recovery
+from warp_ar.host_copies import HostCopies
 from warp_ar.kernels import environment
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.structs import RoomLamp
@@ -20,7 +24,35 @@ EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
 EVERY_SECONDS = 0.2
 """Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched lamp."""
+LATENCY = 3
+"""Frames after which an estimate takes effect, those at the start excepted: it is solved for beside them. The number is
+fixed, so that the same frames give the same pictures; where it is not solved for in time, the frame waits."""
 MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
+
+
+@dataclasses.dataclass
+class _Progress:
+    """What is known on the host, from frame to frame."""
+
+    solver: recovery.Recovery
+    estimate: recovery.Estimate | None = None
+    """The one that took effect last."""
+    pending: Future[_Solution] | None = None
+    """The one that is being solved for."""
+    age: int = 0
+    """Frames since that began."""
+    frames: int = 0
+    waited: int = 0
+    """Frames since the last estimate was begun."""
+    last: float = 0.0
+    """When that was, seconds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Solution:
+    estimate: recovery.Estimate
+    cells: npt.NDArray[Any]
+    """What it was estimated from: records of ``Cell``."""
 
 
 class Recover(Stage):
@@ -33,7 +65,7 @@ class Recover(Stage):
     name: ClassVar[str] = "recover"
     rungs: ClassVar[tuple[str, ...]] = recovery.RUNGS
     summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
-    remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "lamps")
+    remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "recover_cells", "lamps")
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
@@ -59,30 +91,41 @@ class Recover(Stage):
             **{name: ArraySpec((recovery.PEAKS,), RoomLamp) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
+            "recover_cells_now": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
             "recover_observations": ArraySpec((points,), kernels.Observation),
             "recover_traced": ArraySpec((points,), wp.int32),
             "recover_transfer": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_mirrored": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_lamps": ArraySpec((MOST_LAMPS,), wp.vec4),
-            "recover_lamp_transfer": ArraySpec((points, MOST_LAMPS), wp.float32),
+            "recover_lamp_transfer": ArraySpec((points * MOST_LAMPS,), wp.float32),
             "recover_published": ArraySpec(shape, wp.vec3),
             "recover_difference": ArraySpec((height,), wp.float32),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Both sides of the equations on the device, their solution on the host, and its effect on the map."""
+        """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         scene = self.request.scene
         height = self.request.quality.environment_height
         proxies = trace_config(scene).proxies
-        self._arrays, self._on_cpu = arrays, device.is_cpu
+        self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
-        self._solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
-        cells = arrays["recover_cells"]
+        solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
+        self._progress = _Progress(solver)
+        self._asks = self._arrives = False
+        self._worker: ThreadPoolExecutor | None = None
+        cells = arrays["recover_cells_now"]
         points = len(self._surfaces.points)
-        self.estimate: recovery.Estimate | None = None
-        self._frames, self._waited, self._last = 0, 0, 0.0
         arrays.add("recover_status", self.status)
+        equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations")
+        effects = ("recover_excess", "recover_cells", *(name for name in self.wiring.writes if name == "lamps"))
+        self._equations = HostCopies({name: arrays[name] for name in equations}, device)
+        self._effects = HostCopies({name: arrays[name] for name in effects}, device)
+        sides = {name: arrays[name] for name in ("recover_lamps", "recover_lamp_transfer")}
+        self._lamps = {name: HostCopies({name: array}, device) for name, array in sides.items()}
+        # Streams of its own: beside frames, and beside their capture.
+        self._stream = None if device.is_cpu else wp.Stream(device)
+        self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
         def condense(rows: Rows | None) -> None:
             kernels.condense_cells(
@@ -123,49 +166,12 @@ class Recover(Stage):
                 rows=rows,
             )
 
-        def trace(lamps: Any) -> Any:
-            count = len(lamps)
-            target = arrays["recover_lamp_transfer"][:, :count]
-            arrays["recover_lamps"][:count].assign(lamps)
-            kernels.trace_lamps(
-                arrays["recover_points"],
-                arrays["recover_observations"],
-                arrays["recover_lamps"][:count],
-                arrays["probes"],
-                arrays["ray_scene"],
-                target,
-                proxies=proxies,
-            )
-            return np.array(target.numpy(), np.float64)
-
-        def solve(rows: Rows | None) -> None:
-            due = self._due()
-            self._frames += 1
-            self._waited += 1
-            if not due:
-                return
-            self._waited, self._last = 0, arrays["seconds"]()
-            self.estimate = self._solver.update(
-                cells.numpy(),
-                arrays["recover_transfer"].numpy(),
-                arrays["recover_mirrored"].numpy(),
-                arrays["recover_observations"].numpy(),
-                trace,
-            )
-            arrays["recover_excess"].assign(self.estimate.excess)
-
-            records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
-            for record, lamp in zip(records, self.estimate.lamps, strict=False):
-                record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
-            if "lamps" in arrays:
-                arrays["lamps"].assign(records)
-
         def add(rows: Rows | None) -> None:
             kernels.add_excess(
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
                 arrays["environment_clipped"],
-                cells,
+                arrays["recover_cells"],
                 arrays["recover_excess"],
                 arrays["environment"],
                 rows=rows,
@@ -177,18 +183,90 @@ class Recover(Stage):
             )
 
         passes = [
-            Pass(condense, rows=cells.shape[0], extent=lambda: (0, cells.shape[0] * self._due())),
-            Pass(observe, rows=points, extent=lambda: (0, points * self._due())),
-            Pass(transfer, rows=points, extent=lambda: (0, points * self._due())),
-            Pass(solve, on_host=True),
+            Pass(self._take, on_host=True, due=lambda: self._arrives),
+            Pass(condense, rows=cells.shape[0], due=lambda: self._asks),
+            Pass(observe, rows=points, due=lambda: self._asks),
+            Pass(transfer, rows=points, due=lambda: self._asks),
+            Pass(self._ask, on_host=True, due=lambda: self._asks),
             Pass(add, rows=height),
         ]
-        return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
+        return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
 
-    def _due(self) -> bool:
-        """Whether this frame is one to estimate from."""
-        waited = abs(self._arrays["seconds"]() - self._last) > EVERY_SECONDS - 1e-3
-        return self._frames < EVERY_FRAME or (waited and self._waited + 1 >= EVERY_FRAME)
+    def begin(self) -> None:
+        """Decide whether an estimate is begun in this frame, and whether one takes effect."""
+        now, seconds = self._progress, self._arrays["seconds"]()
+        now.frames += 1
+        now.waited += 1
+        now.age += 1
+        waited = abs(seconds - now.last) > EVERY_SECONDS - 1e-3
+        self._arrives = now.pending is not None and now.age >= LATENCY
+        self._asks = now.frames <= EVERY_FRAME or (waited and now.waited >= EVERY_FRAME)
+        if self._asks:
+            now.waited, now.last = 0, seconds
+
+    def _ask(self, rows: Rows | None) -> None:
+        """Begin to solve; at a stream's start wait for it."""
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
+            if self.rung == "shading":
+                # Now, not in the worker later: kernels are translated by one thread at a time.
+                proxies = trace_config(self.request.scene).proxies
+                wp.load_module(kernels.make_kernels(proxies)[2].module, device=self._device)
+        self._equations.fetch(self._stream, self._frames_stream)
+        now = self._progress
+        now.pending, now.age = self._worker.submit(self._solve, now.solver), 0
+        if now.frames <= EVERY_FRAME:
+            self._take(None)
+
+    def _solve(self, solver: recovery.Recovery) -> _Solution:
+        """In the worker. Nothing writes the equations before this is done: it takes effect before the next begins."""
+        sides = self._equations.fetched()
+        cells = sides["recover_cells_now"]
+        estimate = solver.update(
+            cells, sides["recover_transfer"], sides["recover_mirrored"], sides["recover_observations"], self._trace
+        )
+        return _Solution(estimate, cells)
+
+    def _trace(self, lamps: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Irradiance from lamps, (n, q); in the worker."""
+        arrays, count, points = self._arrays, len(lamps), len(self._surfaces.points)
+        places = np.zeros((MOST_LAMPS, 4), np.float32)
+        places[:count] = lamps
+        self._lamps["recover_lamps"].send({"recover_lamps": places}, self._stream)
+        target = arrays["recover_lamp_transfer"][: points * count].reshape((points, count))
+        kernels.trace_lamps(
+            arrays["recover_points"],
+            arrays["recover_observations"],
+            arrays["recover_lamps"][:count],
+            arrays["probes"],
+            arrays["ray_scene"],
+            target,
+            proxies=trace_config(self.request.scene).proxies,
+            stream=self._stream,
+        )
+        received = self._lamps["recover_lamp_transfer"]
+        received.fetch(self._stream, self._stream, points * count)
+        flat = received.fetched()["recover_lamp_transfer"][: points * count]
+        return np.array(flat.reshape(points, count), np.float64)
+
+    def _take(self, rows: Rows | None) -> None:
+        """Let what was solved for take effect."""
+        now = self._progress
+        assert now.pending is not None
+        solution, now.pending = now.pending.result(), None
+        now.estimate = solution.estimate
+        values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
+        if "lamps" in self.wiring.writes:
+            records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
+            for record, lamp in zip(records, solution.estimate.lamps, strict=False):
+                record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
+            values["lamps"] = records
+        self._effects.send(values, self._frames_stream)
+
+    def close(self) -> None:
+        """Let the worker end when it has solved what it is at."""
+        if self._worker is not None:
+            self._worker.shutdown(wait=False)
 
     def resume(self, other: Stage) -> None:
         """Keep the lamps that were found, and when; on another rung, or on another desk, look anew."""
@@ -196,12 +274,13 @@ class Recover(Stage):
             return
         mine, yours = self.request.scene, other.request.scene
         if (mine.marker, mine.probes, mine.proxies) == (yours.marker, yours.probes, yours.proxies):
-            self._solver, self.estimate = other._solver, other.estimate
-            self._frames, self._waited, self._last = other._frames, other._waited, other._last
+            self._progress = dataclasses.replace(other._progress)
 
     def changed(self, name: str) -> bool:
-        """As ``Fill.changed``."""
-        if not self._on_cpu or name == "lamps":
+        """As ``Fill.changed``; lamps change where an estimate takes effect."""
+        if name == "lamps":
+            return self._arrives or (self._asks and self._progress.frames <= EVERY_FRAME)
+        if not self._device.is_cpu:
             return True
         if not self._arrays["recover_difference"].numpy().max() > 1.0:
             return False
@@ -210,7 +289,8 @@ class Recover(Stage):
 
     def status(self) -> Mapping[str, Any]:
         """What the last estimate rests on, for reports."""
-        if self.estimate is None:
+        estimate = self._progress.estimate
+        if estimate is None:
             return {}
         lamps = [
             {
@@ -218,9 +298,9 @@ class Recover(Stage):
                 "distance": round(lamp.distance, 3) if np.isfinite(lamp.distance) else None,
                 "power": [round(float(x), 4) for x in lamp.power],
             }
-            for lamp in self.estimate.lamps
+            for lamp in estimate.lamps
         ]
-        return {"lower_bound": list(self.estimate.lower_bound), "lamps": lamps}
+        return {"lower_bound": list(estimate.lower_bound), "lamps": lamps}
 
 
 def recovers(request: Request) -> bool:
