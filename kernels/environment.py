@@ -598,69 +598,147 @@ def measure_difference(
 # ---- key lights ----
 
 
+# A warp works on each sum: its lanes take parts side by side and add them up without waiting for other warps. On CPU a
+# warp is one lane, and a block is one warp.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+""")
+def lane_count() -> wp.int32:
+    """Lanes of a warp."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+#endif
+    return value;
+""")
+def warp_sum(value: wp.vec4) -> wp.vec4:
+    """Sum over the warp's lanes, known to all of them, the same in all bits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32][4];
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+    const int lane = threadIdx.x & 31;
+    if (lane == 0)
+        for (int k = 0; k < 4; ++k) parts[threadIdx.x / 32][k] = value[k];
+    __syncthreads();
+    for (int k = 0; k < 4; ++k) value[k] = lane < blockDim.x / 32 ? parts[lane][k] : 0.0f;
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+    __syncthreads();
+#endif
+    return value;
+""")
+def block_sum(value: wp.vec4) -> wp.vec4:
+    """Sum over the block's warps, known to all threads, the same in all bits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32];
+    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
+    const int lane = threadIdx.x & 31;
+    if (lane == 0) parts[threadIdx.x / 32] = value;
+    __syncthreads();
+    value = parts[lane < blockDim.x / 32 ? lane : 0];
+    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
+    __syncthreads();
+#endif
+    return value;
+""")
+def block_max(value: wp.float32) -> wp.float32:
+    """Largest value of the block's threads, known to all of them."""
+
+
+@wp.func
+def rotated(at: wp.vec3, cos_step: wp.float32, sin_step: wp.float32) -> wp.vec3:
+    """The next texel's direction along a row."""
+    return wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
+
+
 @wp.kernel(enable_backward=False)
 def sum_rows_kernel(
     # In:
-    row_start: wp.int32,
+    lanes: wp.int32,
     environment: wp.array2d[wp.vec3],
     # Out:
     sums_out: wp.array[wp.vec4],  # luminance times direction, and luminance, over the row's solid angle
 ):
-    """Flow of one row a thread."""
-    i = row_start + wp.tid()
+    """Flow of one row a warp."""
+    i, lane = wp.tid()
     height = environment.shape[0]
     width = environment.shape[1]
-    moment = wp.vec3(0.0, 0.0, 0.0)
-    total = wp.float32(0.0)
-    at = direction_from_latlong(wp.float32(i) + 0.5, 0.5, height, width)
+    sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    start = lane * width // lanes
+    at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
     cos_step = wp.cos(2.0 * PI / wp.float32(width))
     sin_step = wp.sin(2.0 * PI / wp.float32(width))
-    for j in range(width):
-        value = luminance(environment[i, j])
-        moment += value * at
-        total += value
-        at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
-    area = texel_solid_angle(i, height, width)
-    sums_out[i] = wp.vec4(area * moment[0], area * moment[1], area * moment[2], area * total)
+    for j in range(start, (lane + 1) * width // lanes):
+        sum += luminance(environment[i, j]) * wp.vec4(at[0], at[1], at[2], 1.0)
+        at = rotated(at, cos_step, sin_step)
+    sum = warp_sum(sum)
+    if lane == 0:
+        sums_out[i] = texel_solid_angle(i, height, width) * sum
 
 
 @wp.func
-def sum_all(sums: wp.array[wp.vec4]) -> wp.vec4:
-    """Vector irradiance and scalar irradiance of the whole map."""
+def sum_all(sums: wp.array[wp.vec4], lane: wp.int32, lanes: wp.int32) -> wp.vec4:
+    """Vector irradiance and scalar irradiance of the whole map; for a whole warp."""
     total = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for i in range(sums.shape[0]):
+    for i in range(lane, sums.shape[0], lanes):
         total += sums[i]
-    return total
+    return warp_sum(total)
 
 
 @wp.kernel(enable_backward=False)
 def sum_cells_kernel(
     # In:
+    lanes: wp.int32,
+    parts: wp.int32,
     environment: wp.array2d[wp.vec3],
     sums: wp.array[wp.vec4],
     # Out:
     cells_out: wp.array[wp.vec3],  # excess luminance times direction, over the cell's solid angle
 ):
-    """Excess of one cell a thread."""
-    cell = wp.tid()
+    """Excess of one cell a warp; lanes take ``parts`` of its rows."""
+    cell, lane = wp.tid()
     cell_row = cell // CELL_COLUMNS
     cell_column = cell % CELL_COLUMNS
     height = environment.shape[0]
     width = environment.shape[1]
-    mean = sum_all(sums)[3] / (4.0 * PI)
+    mean = sum_all(sums, lane, lanes)[3] / (4.0 * PI)
     cos_step = wp.cos(2.0 * PI / wp.float32(width))
     sin_step = wp.sin(2.0 * PI / wp.float32(width))
-    start = cell_column * width // CELL_COLUMNS
-    stop = (cell_column + 1) * width // CELL_COLUMNS
+    first_row = cell_row * height // CELL_ROWS
+    rows = (cell_row + 1) * height // CELL_ROWS - first_row
+    first_column = cell_column * width // CELL_COLUMNS
+    columns = (cell_column + 1) * width // CELL_COLUMNS - first_column
     moment = wp.vec3(0.0, 0.0, 0.0)
-    for i in range(cell_row * height // CELL_ROWS, (cell_row + 1) * height // CELL_ROWS):
+    for item in range(lane, rows * parts, lanes):
+        i = first_row + item // parts
+        start = first_column + item % parts * columns // parts
+        stop = first_column + (item % parts + 1) * columns // parts
         area = texel_solid_angle(i, height, width)
         at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
         for j in range(start, stop):
             moment += area * wp.max(luminance(environment[i, j]) - mean, 0.0) * at
-            at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
-    cells_out[cell] = moment
-    cells_out[KEY_CELLS + cell] = moment  # what is left over by the lights found so far
+            at = rotated(at, cos_step, sin_step)
+    sum = warp_sum(wp.vec4(moment[0], moment[1], moment[2], 0.0))
+    if lane == 0:
+        moment = wp.vec3(sum[0], sum[1], sum[2])
+        cells_out[cell] = moment
+        cells_out[KEY_CELLS + cell] = moment  # what is left over by the lights found so far
 
 
 @wp.func
@@ -679,18 +757,10 @@ def left_over(direction: wp.vec3, found: mat43, count: wp.int32) -> wp.float32:
 
 
 @wp.func
-def block_sum(value: wp.vec4) -> wp.vec4:
-    """Sum over the block's threads, known to all of them."""
-    total = wp.tile_sum(wp.tile(value, preserve_type=True))
-    return total[0]
-
-
-@wp.func
-def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32, thread: wp.int32) -> wp.vec3:
-    """One mean shift with the kernel cos^power of all that faces the direction; for a whole block, power 0, 2 or 8."""
+def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32, lane: wp.int32) -> wp.vec3:
+    """One mean shift with the kernel cos^power of all that faces the direction; for a whole warp, power 0, 2 or 8."""
     sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    cell = thread
-    while cell < KEY_CELLS:
+    for cell in range(lane, KEY_CELLS, lane_count()):
         moment = cells[KEY_CELLS + cell]
         facing = wp.dot(moment, direction)
         if facing > 0.0:
@@ -702,8 +772,7 @@ def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32
                 weight *= cosine * cosine * cosine
                 weight *= cosine * cosine * cosine
             sum += weight * wp.vec4(moment[0], moment[1], moment[2], 0.0)
-        cell += wp.block_dim()
-    total = block_sum(sum)
+    total = warp_sum(sum)
     centre = wp.vec3(total[0], total[1], total[2])
     if wp.length(centre) > 0.0:
         return wp.normalize(centre)
@@ -711,11 +780,10 @@ def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32
 
 
 @wp.func
-def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, thread: wp.int32) -> wp.float32:
-    """Excess within some 17 degrees of a direction, weighted by cos^16; for a whole block."""
+def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, lane: wp.int32) -> wp.float32:
+    """Excess within some 17 degrees of a direction, weighted by cos^16; for a whole warp."""
     sum = wp.float32(0.0)
-    cell = thread
-    while cell < KEY_CELLS:
+    for cell in range(lane, KEY_CELLS, lane_count()):
         facing = wp.dot(cells[cell], direction)
         if facing > 0.0:
             cosine = facing / wp.length(cells[cell])
@@ -723,9 +791,7 @@ def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, thread: wp.int32
             power *= power
             power *= power
             sum += facing / cosine * power * power
-        cell += wp.block_dim()
-    total = wp.tile_sum(wp.tile(sum))
-    return total[0]
+    return warp_sum(wp.vec4(sum, 0.0, 0.0, 0.0))[0]
 
 
 # A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
@@ -738,12 +804,16 @@ def find_key_lights_kernel(
     cells_out: wp.array[wp.vec3],
     key_lights_out: wp.array[KeyLight],
 ):
-    """One block finds all lights, one after another; thread 0 ranks and writes them."""
+    """One block finds all lights, one after another; thread 0 ranks and writes them.
+
+    What concerns cells, every warp does for itself: to wait for each other would take longer. Texels are shared out.
+    """
     _block, thread = wp.tid()
     threads = wp.block_dim()
+    lane = thread % lane_count()
     height = environment.shape[0]
     width = environment.shape[1]
-    all = sum_all(sums)
+    all = sum_all(sums, lane, lane_count())
     flow = wp.vec3(all[0], all[1], all[2])
     mean = all[3] / (4.0 * PI)
     cos_step = wp.cos(2.0 * PI / wp.float32(width))
@@ -776,14 +846,13 @@ def find_key_lights_kernel(
                 best = received
                 best_cell = wp.float32(candidate)
             candidate += threads
-        most = wp.tile_max(wp.tile(best))
-        if best < most[0]:
+        most = block_max(best)
+        if best < most:
             best_cell = wp.float32(KEY_CELLS)
-        first = wp.tile_min(wp.tile(best_cell))
+        chosen = -wp.int32(block_max(-best_cell))
         direction = wp.vec3(0.0, 0.0, 1.0)
-        lit = most[0] > 0.0
+        lit = most > 0.0
         if lit:
-            chosen = wp.int32(first[0])
             direction = direction_from_latlong(
                 wp.float32(chosen // CELL_COLUMNS) + 0.5,
                 wp.float32(chosen % CELL_COLUMNS) + 0.5,
@@ -792,7 +861,7 @@ def find_key_lights_kernel(
             )
             for step in range(10):
                 power = wp.where(step < 2, 0, wp.where(step < 4, 2, 8))
-                direction = shift_on_cells(cells_out, direction, power, thread)
+                direction = shift_on_cells(cells_out, direction, power, lane)
 
         # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
         # 3: what the lobe gives.
@@ -829,7 +898,7 @@ def find_key_lights_kernel(
                                 # Light above the room's mean, in the texel's own colour.
                                 given = (weight / luminance(value) * cosine) * value
                                 sum += wp.vec4(given[0], given[1], given[2], 0.0)
-                    at = wp.vec3(at[0] * cos_step - at[1] * sin_step, at[0] * sin_step + at[1] * cos_step, at[2])
+                    at = rotated(at, cos_step, sin_step)
                 item += threads
             if step == 3:
                 # Each thread its own cells; the sums below make all of them wait for that.
@@ -841,9 +910,9 @@ def find_key_lights_kernel(
                         cells_out[KEY_CELLS + cell] = (1.0 - taken) * moment
                     cell += threads
             total = block_sum(sum)
-            top = wp.tile_max(wp.tile(highest))
+            if step == 1:
+                peak = block_max(highest)
             if step < 3:
-                peak = top[0]
                 centre = wp.vec3(total[0], total[1], total[2])
                 if wp.length(centre) > 0.0:
                     direction = wp.normalize(centre)
@@ -860,10 +929,10 @@ def find_key_lights_kernel(
     around = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for k in range(count):
         a = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
-        around[k] = excess_around(cells_out, a, thread)
+        around[k] = excess_around(cells_out, a, lane)
         for j in range(k):
             b = wp.vec3(found[j, 0], found[j, 1], found[j, 2])
-            middle = excess_around(cells_out, wp.normalize(a + b), thread)
+            middle = excess_around(cells_out, wp.normalize(a + b), lane)
             least = wp.min(around[j], around[k])
             rivalry = wp.clamp(2.0 * (1.0 - wp.dot(a, b)), 0.0, 1.0)
             if least > 0.0:
@@ -909,14 +978,10 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
     if not 1 <= len(key_lights_out) <= MAX_KEY_LIGHTS:
         raise ValueError(f"key_lights_out has {len(key_lights_out)} places; expected 1 to {MAX_KEY_LIGHTS}")
     device = environment.device
-    launch_rows(sum_rows_kernel, (environment.shape[0],), [environment], [sums_out], rows=None, device=device)
-    wp.launch(
-        sum_cells_kernel,
-        dim=CELL_ROWS * CELL_COLUMNS,
-        inputs=[environment, sums_out],
-        outputs=[cells_out],
-        device=device,
-    )
+    lanes, parts = (1, 1) if device.is_cpu else (32, 4)
+    wp.launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
+    cells = CELL_ROWS * CELL_COLUMNS
+    wp.launch(sum_cells_kernel, (cells, lanes), [lanes, parts, environment, sums_out], [cells_out], device=device)
     launch_tiles(
         find_key_lights_kernel,
         [1],

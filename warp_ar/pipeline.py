@@ -190,6 +190,7 @@ class Pipeline:
         self._shown: Any = None
         self._has_light = False
         self._arrays = Arrays()
+        self._short: ShortFrames | None = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with exclusive(self.device), wp.ScopedDevice(self.device):
@@ -296,7 +297,8 @@ class Pipeline:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
         self._finish()
         other._finish()
-        self._start_time, self._last_time = other._start_time, other._last_time
+        self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
+        self._shown = other._shown
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
         with exclusive(self.device):
