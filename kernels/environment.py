@@ -79,6 +79,10 @@ FULL_TRUST = wp.constant(wp.float32(0.5))
 SUPPORT = wp.constant(wp.float32(4.0))
 """A coarser texel is fully trusted once a quarter of it is: smaller holes are then filled from nearby only."""
 
+COARSE_TEXELS = 2048
+"""Texels from which on the levels of filling are the work of one block, of ``COARSE_BLOCK`` threads."""
+COARSE_BLOCK = 512
+
 CHANGE_FLOOR = 0.0005
 CHANGE_SHARE = 0.01
 """An environment has changed once some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value``, about one
@@ -136,6 +140,78 @@ def usable_confidence(value: wp.vec3, confidence: wp.float32) -> wp.float32:
     return 0.0
 
 
+# A warp works on each sum: its lanes take parts side by side and add them up without waiting for other warps. On CPU a
+# warp is one lane, and a block is one warp.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+""")
+def lane_count() -> wp.int32:
+    """Lanes of a warp."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+#endif
+    return value;
+""")
+def warp_sum(value: wp.vec4) -> wp.vec4:
+    """Sum over the warp's lanes, known to all of them, the same in all bits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32][4];
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+    const int lane = threadIdx.x & 31;
+    if (lane == 0)
+        for (int k = 0; k < 4; ++k) parts[threadIdx.x / 32][k] = value[k];
+    __syncthreads();
+    for (int k = 0; k < 4; ++k) value[k] = lane < blockDim.x / 32 ? parts[lane][k] : 0.0f;
+    for (int reach = 16; reach > 0; reach /= 2)
+        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+    __syncthreads();
+#endif
+    return value;
+""")
+def block_sum(value: wp.vec4) -> wp.vec4:
+    """Sum over the block's warps, known to all threads, the same in all bits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[32];
+    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
+    const int lane = threadIdx.x & 31;
+    if (lane == 0) parts[threadIdx.x / 32] = value;
+    __syncthreads();
+    value = parts[lane < blockDim.x / 32 ? lane : 0];
+    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
+    __syncthreads();
+#endif
+    return value;
+""")
+def block_max(value: wp.float32) -> wp.float32:
+    """Largest value of the block's threads, known to all of them."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait_for_block():
+    """Goes on once all threads of the block are here and what they wrote can be read."""
+
+
 # ---- accumulation ----
 
 
@@ -151,6 +227,7 @@ def light_confidence(radiance: wp.vec3, confidence: wp.float32) -> wp.float32:
 def measure_change_kernel(
     # In:
     row_start: wp.int32,
+    lanes: wp.int32,
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
     environment: wp.array2d[wp.vec3],
@@ -158,32 +235,37 @@ def measure_change_kernel(
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
-    """Mean signed change of one cell a thread."""
-    band_row, cell_column = wp.tid()
+    """Mean signed change of one cell a warp."""
+    band_row, cell_column, lane = wp.tid()
     cell_row = row_start + band_row
     height = radiance.shape[0]
     width = radiance.shape[1]
+    first_row = cell_row * height // change_out.shape[0]
+    first_column = cell_column * width // change_out.shape[1]
+    rows = (cell_row + 1) * height // change_out.shape[0] - first_row
+    columns = (cell_column + 1) * width // change_out.shape[1] - first_column
     difference = wp.float32(0.0)
     level = wp.float32(0.0)
-    for i in range(cell_row * height // change_out.shape[0], (cell_row + 1) * height // change_out.shape[0]):
-        area = texel_solid_angle(i, height, width)
-        for j in range(cell_column * width // change_out.shape[1], (cell_column + 1) * width // change_out.shape[1]):
-            x = radiance[i, j]
-            m = environment[i, j]
-            weight = area * wp.min(
-                light_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j])
-            )
-            if weight > 0.0:
-                new = brightness(x)
-                old = brightness(m)
-                difference += weight * (new - old)
-                level += weight * (wp.max(new, old) + DARK)
-    change = wp.float32(0.0)
-    if level > 0.0:
-        change = difference / level
-    if not wp.isfinite(change):
-        change = 0.0
-    change_out[cell_row, cell_column] = wp.vec2(change, change_out[cell_row, cell_column][0])
+    for item in range(lane, rows * columns, lanes):
+        i = first_row + item // columns
+        j = first_column + item % columns
+        x = radiance[i, j]
+        m = environment[i, j]
+        weight = wp.min(light_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j]))
+        if weight > 0.0:
+            weight *= texel_solid_angle(i, height, width)
+            new = brightness(x)
+            old = brightness(m)
+            difference += weight * (new - old)
+            level += weight * (wp.max(new, old) + DARK)
+    sum = warp_sum(wp.vec4(difference, level, 0.0, 0.0))
+    if lane == 0:
+        change = wp.float32(0.0)
+        if sum[1] > 0.0:
+            change = sum[0] / sum[1]
+        if not wp.isfinite(change):
+            change = 0.0
+        change_out[cell_row, cell_column] = wp.vec2(change, change_out[cell_row, cell_column][0])
 
 
 @wp.func
@@ -276,10 +358,11 @@ def measure_change(
         change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
         rows: Band of cell rows, None for all.
     """
+    lanes = 1 if change_out.device.is_cpu else 32
     launch_rows(
         measure_change_kernel,
-        change_out.shape,
-        [radiance, confidence, environment, environment_confidence],
+        (*change_out.shape, lanes),
+        [lanes, radiance, confidence, environment, environment_confidence],
         [change_out],
         rows=rows,
         device=change_out.device,
@@ -374,23 +457,18 @@ def seed_fill_kernel(
     )
 
 
-@wp.kernel(enable_backward=False)
-def pull_level_kernel(
-    # In:
-    row_start: wp.int32,
+@wp.func
+def pulled(
+    levels: wp.array[wp.vec4],
+    i: wp.int32,
+    j: wp.int32,
     fine_offset: wp.int32,
     fine_height: wp.int32,
     fine_width: wp.int32,
-    offset: wp.int32,
     height: wp.int32,
     width: wp.int32,
-    most: wp.float32,
-    # Out:
-    levels_out: wp.array[wp.vec4],
-):
-    """Next coarser level: means over exactly what each texel covers."""
-    band_row, j = wp.tid()
-    i = row_start + band_row
+) -> wp.vec4:
+    """Texel of the next coarser level: means over exactly what it covers."""
     top = wp.float32(i * fine_height) / wp.float32(height)
     bottom = wp.float32((i + 1) * fine_height) / wp.float32(height)
     left = wp.float32(j * fine_width) / wp.float32(width)
@@ -402,14 +480,32 @@ def pull_level_kernel(
         band = band_solid_angle(wp.max(top, wp.float32(r)), wp.min(bottom, wp.float32(r + 1)), fine_height)
         for c in range(wp.int32(left), wp.min(wp.int32(wp.ceil(right)), fine_width)):
             part = band * (wp.min(right, wp.float32(c + 1)) - wp.max(left, wp.float32(c)))
-            texel = levels_out[fine_offset + r * fine_width + c]
+            texel = levels[fine_offset + r * fine_width + c]
             area += part
             weight = part * texel[3]
             if weight > 0.0:
                 total += weight
-                value = wp.vec3(wp.min(texel[0], most), wp.min(texel[1], most), wp.min(texel[2], most))
-                mean += (weight / total) * (value - mean)
-    levels_out[offset + i * width + j] = wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
+                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)
+    return wp.vec4(mean[0], mean[1], mean[2], wp.min(1.0, SUPPORT * total / area))
+
+
+@wp.kernel(enable_backward=False)
+def pull_level_kernel(
+    # In:
+    row_start: wp.int32,
+    fine_offset: wp.int32,
+    fine_height: wp.int32,
+    fine_width: wp.int32,
+    offset: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """Next coarser level."""
+    band_row, j = wp.tid()
+    i = row_start + band_row
+    levels_out[offset + i * width + j] = pulled(levels_out, i, j, fine_offset, fine_height, fine_width, height, width)
 
 
 @wp.func
@@ -456,6 +552,68 @@ def push_level_kernel(
     value = completed(levels_out, i, j, offset, height, width, coarse_offset, coarse_height, coarse_width)
     # Trust stays: nothing reads it again but this texel.
     levels_out[offset + i * width + j] = wp.vec4(value[0], value[1], value[2], 1.0)
+
+
+# A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
+@wp.kernel(module="unique", enable_backward=False)
+def fill_coarse_kernel(
+    # In:
+    first_offset: wp.int32,
+    first_height: wp.int32,
+    first_width: wp.int32,
+    count: wp.int32,
+    # Out:
+    levels_out: wp.array[wp.vec4],
+):
+    """One block builds the ``count`` levels below the first and completes them and the first, up again."""
+    _block, thread = wp.tid()
+    offset = first_offset
+    height = first_height
+    width = first_width
+    for _level in range(count):
+        coarse_height = (height + 1) / 2
+        coarse_width = (width + 1) / 2
+        coarse_offset = offset + height * width
+        for texel in range(thread, coarse_height * coarse_width, wp.block_dim()):
+            levels_out[coarse_offset + texel] = pulled(
+                levels_out,
+                texel // coarse_width,
+                texel % coarse_width,
+                offset,
+                height,
+                width,
+                coarse_height,
+                coarse_width,
+            )
+        wait_for_block()
+        offset = coarse_offset
+        height = coarse_height
+        width = coarse_width
+    for level in range(count):
+        offset = first_offset
+        height = first_height
+        width = first_width
+        for _finer in range(count - 1 - level):
+            offset += height * width
+            height = (height + 1) / 2
+            width = (width + 1) / 2
+        coarse_height = (height + 1) / 2
+        coarse_width = (width + 1) / 2
+        coarse_offset = offset + height * width
+        for texel in range(thread, height * width, wp.block_dim()):
+            value = completed(
+                levels_out,
+                texel // width,
+                texel % width,
+                offset,
+                height,
+                width,
+                coarse_offset,
+                coarse_height,
+                coarse_width,
+            )
+            levels_out[offset + texel] = wp.vec4(value[0], value[1], value[2], 1.0)
+        wait_for_block()
 
 
 @wp.kernel(enable_backward=False)
@@ -539,9 +697,19 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     device = levels_out.device
     levels: list[tuple[Any, ...]] = [(offset, *shape) for offset, shape in zip(offsets, shapes, strict=False)]
-    for fine, coarse in itertools.pairwise(levels):
-        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse, most], [levels_out], rows=None, device=device)
-    for coarse, fine in itertools.pairwise(reversed(levels[1:])):
+    # Small levels take one block less time than a launch each.
+    first = next((n for n, shape in enumerate(shapes) if n and shape[0] * shape[1] <= COARSE_TEXELS), len(levels) - 1)
+    for fine, coarse in itertools.pairwise(levels[: first + 1]):
+        launch_rows(pull_level_kernel, coarse[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
+    launch_tiles(
+        fill_coarse_kernel,
+        [1],
+        [*levels[first], len(levels) - 1 - first],
+        [levels_out],
+        block_dim=COARSE_BLOCK,
+        device=device,
+    )
+    for coarse, fine in itertools.pairwise(reversed(levels[1 : first + 1])):
         launch_rows(push_level_kernel, fine[1:], [*fine, *coarse], [levels_out], rows=None, device=device)
 
 
@@ -596,69 +764,6 @@ def measure_difference(
 
 
 # ---- key lights ----
-
-
-# A warp works on each sum: its lanes take parts side by side and add them up without waiting for other warps. On CPU a
-# warp is one lane, and a block is one warp.
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return 32;
-#else
-    return 1;
-#endif
-""")
-def lane_count() -> wp.int32:
-    """Lanes of a warp."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int reach = 16; reach > 0; reach /= 2)
-        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
-#endif
-    return value;
-""")
-def warp_sum(value: wp.vec4) -> wp.vec4:
-    """Sum over the warp's lanes, known to all of them, the same in all bits."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ float parts[32][4];
-    for (int reach = 16; reach > 0; reach /= 2)
-        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
-    const int lane = threadIdx.x & 31;
-    if (lane == 0)
-        for (int k = 0; k < 4; ++k) parts[threadIdx.x / 32][k] = value[k];
-    __syncthreads();
-    for (int k = 0; k < 4; ++k) value[k] = lane < blockDim.x / 32 ? parts[lane][k] : 0.0f;
-    for (int reach = 16; reach > 0; reach /= 2)
-        for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
-    __syncthreads();
-#endif
-    return value;
-""")
-def block_sum(value: wp.vec4) -> wp.vec4:
-    """Sum over the block's warps, known to all threads, the same in all bits."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __shared__ float parts[32];
-    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
-    const int lane = threadIdx.x & 31;
-    if (lane == 0) parts[threadIdx.x / 32] = value;
-    __syncthreads();
-    value = parts[lane < blockDim.x / 32 ? lane : 0];
-    for (int reach = 16; reach > 0; reach /= 2) value = fmaxf(value, __shfl_xor_sync(0xffffffffu, value, reach));
-    __syncthreads();
-#endif
-    return value;
-""")
-def block_max(value: wp.float32) -> wp.float32:
-    """Largest value of the block's threads, known to all of them."""
 
 
 @wp.func

@@ -291,6 +291,27 @@ def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
     return a + t * (b - a)
 
 
+GATHER_LANES = 8
+"""Threads that share a texel's samples on CUDA; on CPU one has them all."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_xor_sync(0xffu << (threadIdx.x & 24), value, reach);
+#else
+    return value;
+#endif
+""")
+def lane_across(value: wp.float32, reach: wp.int32) -> wp.float32:
+    """Value of the lane whose number among the ``GATHER_LANES`` of a texel differs by the bit ``reach``."""
+
+
+@wp.func
+def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
+    """``lane_across`` of a vector."""
+    return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
+
+
 @functools.cache
 def make_gather_probe_kernel(rung: str) -> wp.Kernel:
     """Kernel of one rung; raises ValueError for an unknown one."""
@@ -301,6 +322,7 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
     def gather_probe_kernel(
         # In:
         row_start: wp.int32,
+        lanes: wp.int32,
         frame: wp.array2d[wp.vec3ub],
         table: wp.array[wp.vec3],
         probes: wp.array[Probe],
@@ -312,7 +334,7 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
         confidence_out: wp.array2d[wp.float32],
         clipped_out: wp.array2d[wp.vec3],
     ):
-        band_row, column = wp.tid()
+        band_row, column, lane = wp.tid()
         row = row_start + band_row
         height = radiance_out.shape[0]
         width = radiance_out.shape[1]
@@ -342,37 +364,61 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
                 mean_clipped = wp.vec3(0.0, 0.0, 0.0)
                 total = wp.float32(0.0)
                 possible = wp.float32(0.0)
-                for a in range(count_y):
-                    y = (wp.float32(a) + 0.5) / wp.float32(count_y)
-                    # Solid angle of this part of the texel.
-                    area = wp.sin(PI * (wp.float32(row) + y) / wp.float32(height))
-                    left = mix(c00, c10, y)
-                    right = mix(c01, c11, y)
-                    for b in range(count_x):
-                        at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
-                        possible += area
-                        # At the frame's border the same ramp as at the rim.
-                        inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
-                        ramp = wp.clamp(wp.min(at[2] - rim_start, inside) / rim_width, 0.0, 1.0)
-                        if inside >= 0.0 and ramp > 0.0:
-                            weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
-                            i = wp.int32(at[1])
-                            j = wp.int32(at[0])
-                            fy = at[1] - wp.float32(i)
-                            fx = at[0] - wp.float32(j)
-                            i1 = wp.min(i + 1, frame.shape[0] - 1)
-                            j1 = wp.min(j + 1, frame.shape[1] - 1)
-                            p00 = frame[i, j]
-                            p01 = frame[i, j1]
-                            p10 = frame[i1, j]
-                            p11 = frame[i1, j1]
-                            top = mix(decode(table, p00), decode(table, p01), fx)
-                            value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
-                            top = mix(is_clipped(p00), is_clipped(p01), fx)
-                            saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
-                            total += weight
-                            mean = mix(mean, value, weight / total)
-                            mean_clipped = mix(mean_clipped, saturated, weight / total)
+                line = wp.int32(-1)
+                area = wp.float32(0.0)
+                left = wp.vec3(0.0, 0.0, 0.0)
+                right = wp.vec3(0.0, 0.0, 0.0)
+                for sample in range(lane, count_y * count_x, lanes):
+                    a = sample // count_x
+                    b = sample % count_x
+                    if a != line:
+                        line = a
+                        y = (wp.float32(a) + 0.5) / wp.float32(count_y)
+                        # Solid angle of this part of the texel.
+                        area = wp.sin(PI * (wp.float32(row) + y) / wp.float32(height))
+                        left = mix(c00, c10, y)
+                        right = mix(c01, c11, y)
+                    at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
+                    possible += area
+                    # At the frame's border the same ramp as at the rim.
+                    inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
+                    ramp = wp.clamp(wp.min(at[2] - rim_start, inside) / rim_width, 0.0, 1.0)
+                    if inside >= 0.0 and ramp > 0.0:
+                        weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
+                        i = wp.int32(at[1])
+                        j = wp.int32(at[0])
+                        fy = at[1] - wp.float32(i)
+                        fx = at[0] - wp.float32(j)
+                        i1 = wp.min(i + 1, frame.shape[0] - 1)
+                        j1 = wp.min(j + 1, frame.shape[1] - 1)
+                        p00 = frame[i, j]
+                        p01 = frame[i, j1]
+                        p10 = frame[i1, j]
+                        p11 = frame[i1, j1]
+                        top = mix(decode(table, p00), decode(table, p01), fx)
+                        value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
+                        top = mix(is_clipped(p00), is_clipped(p01), fx)
+                        saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
+                        total += weight
+                        mean = mix(mean, value, weight / total)
+                        mean_clipped = mix(mean_clipped, saturated, weight / total)
+                reach = lanes / 2
+                while reach > 0:
+                    other = lane_across(total, reach)
+                    mean_across = vec_across(mean, reach)
+                    clipped_across = vec_across(mean_clipped, reach)
+                    possible += lane_across(possible, reach)
+                    if total + other > 0.0:
+                        # The lower lane's mean first: all lanes get the same bits.
+                        t = other / (total + other)
+                        if (lane & reach) == 0:
+                            mean = mix(mean, mean_across, t)
+                            mean_clipped = mix(mean_clipped, clipped_across, t)
+                        else:
+                            mean = mix(mean_across, mean, total / (total + other))
+                            mean_clipped = mix(clipped_across, mean_clipped, total / (total + other))
+                    total += other
+                    reach = reach / 2
                 if total > 0.0:
                     across = c11 - c00
                     along = c10 - c01
@@ -386,9 +432,10 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
                         radiance = mix(radiance, wp.cw_div(mean, probes[index].reflectance), vote / votes)
                         clipped = mix(clipped, mean_clipped, vote / votes)
                         confidence = wp.max(confidence, certainty)
-        radiance_out[row, column] = radiance
-        confidence_out[row, column] = confidence
-        clipped_out[row, column] = clipped
+        if lane == 0:
+            radiance_out[row, column] = radiance
+            confidence_out[row, column] = confidence
+            clipped_out[row, column] = clipped
 
     return gather_probe_kernel
 
@@ -435,10 +482,12 @@ def gather_probe(
     Raises:
         ValueError: There is no such rung.
     """
+    # A texel has one sample but at the rung that averages.
+    lanes = GATHER_LANES if rung == "area" and radiance_out.device.is_cuda else 1
     launch_rows(
         make_gather_probe_kernel(rung),
-        radiance_out.shape,
-        [frame, decode_table, probes, corners, rim_start, rim_width],
+        (*radiance_out.shape, lanes),
+        [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
         [radiance_out, confidence_out, clipped_out],
         rows=rows,
         device=radiance_out.device,
