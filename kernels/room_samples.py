@@ -124,41 +124,67 @@ def brightness(radiance: wp.vec3) -> wp.float32:
     return (radiance[0] + radiance[1] + radiance[2]) / 3.0
 
 
+# Sums that run along rows are one chain of additions, whoever does them. On CUDA a warp's lanes load what comes next
+# side by side and hand it round: a thread that loads and stores in turn waits for memory at every step.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    value = __shfl_sync(0xffffffffu, value, lane);
+#endif
+    return value;
+""")
+def of_lane(value: wp.float32, lane: wp.int32) -> wp.float32:
+    """A lane's value; on CPU there is one lane."""
+
+
 @wp.kernel(enable_backward=False)
 def sum_along_rows_kernel(
     # In:
     row_start: wp.int32,
+    lanes: wp.int32,
     environment: wp.array2d[wp.vec3],
     # Out:
     cumulative_out: wp.array2d[wp.float32],
 ):
     """Running sums of brightness along one row; compensated, so that a sun does not swallow the sky beside it."""
-    i = wp.tid() + row_start
+    band_row, lane = wp.tid()
+    i = band_row + row_start
+    width = environment.shape[1]
     total = float(0.0)
     lost = float(0.0)
-    for j in range(environment.shape[1]):
-        term = brightness(safe_radiance(environment[i, j])) - lost
-        after = total + term
-        lost = (after - total) - term
-        total = after
-        cumulative_out[i, j] = total
+    for first in range(0, width, lanes):
+        own = brightness(safe_radiance(environment[i, wp.min(first + lane, width - 1)]))
+        for k in range(wp.min(lanes, width - first)):
+            term = of_lane(own, k) - lost
+            after = total + term
+            lost = (after - total) - term
+            total = after
+            if k == lane:
+                cumulative_out[i, first + k] = total
 
 
 @wp.kernel(enable_backward=False)
 def sum_rows_kernel(
     # In:
+    lanes: wp.int32,
     cumulative: wp.array2d[wp.float32],
     # Out:
     rows_out: wp.array[wp.vec2],
 ):
-    """Running sums over rows of (weighted brightness, weight); one thread, a few hundred terms."""
+    """Running sums over rows of (weighted brightness, weight); one warp, a few hundred terms."""
+    lane = wp.tid()
     height = cumulative.shape[0]
     width = cumulative.shape[1]
     total = wp.vec2(0.0, 0.0)
-    for i in range(height):
-        weight = row_weight(i, height, width)
-        total += wp.vec2(weight * cumulative[i, width - 1], weight * wp.float32(width))
-        rows_out[i] = total
+    for first in range(0, height, lanes):
+        row = wp.min(first + lane, height - 1)
+        weight = row_weight(row, height, width)
+        bright = weight * cumulative[row, width - 1]
+        for k in range(wp.min(lanes, height - first)):
+            total += wp.vec2(of_lane(bright, k), of_lane(weight * wp.float32(width), k))
+            if k == lane:
+                rows_out[first + k] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -317,14 +343,16 @@ def sum_environment(
         rows_out: (h,) weighted brightness and weight, summed over rows.
     """
     device = environment.device
-    wp.launch(
+    lanes = 1 if device.is_cpu else 32
+    launch_rows(
         sum_along_rows_kernel,
-        dim=environment.shape[0],
-        inputs=[0, environment],
-        outputs=[cumulative_out],
+        (environment.shape[0], lanes),
+        [lanes, environment],
+        [cumulative_out],
+        rows=None,
         device=device,
     )
-    wp.launch(sum_rows_kernel, dim=1, inputs=[cumulative_out], outputs=[rows_out], device=device)
+    wp.launch(sum_rows_kernel, dim=lanes, inputs=[lanes, cumulative_out], outputs=[rows_out], device=device)
 
 
 def draw_samples(

@@ -117,6 +117,27 @@ def test_submitted_frames_may_be_written_anew(frames: Frames, device: str) -> No
                 np.testing.assert_array_equal(result.environment, wanted.environment)
 
 
+def test_steps_of_submitted_frames_are_timed(frames: Frames, device: str) -> None:
+    with Pipeline(make_scene(), device=device, quality="low") as pipeline:
+        results = [pipeline.submit(image) for image in frames]
+        on_device = set() if device == "cpu" else {"upload", "kernels", "download"}
+        for result in results:
+            assert set(result.steps) == {"track", "render"} | on_device
+            assert all(milliseconds > 0.0 for milliseconds in result.steps.values())
+
+
+def test_pictures_are_kept_however_many(device: str) -> None:
+    """More than there are buffers for, by views of them alone; buffers come back when nobody has a view."""
+    generator = np.random.default_rng(8)
+    images = [generator.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(12)]
+    plain = make_scene(objects=(), lights=(), probes=())
+    with Pipeline(plain, device=device, quality="low") as pipeline:
+        for _ in range(3):
+            rows = [pipeline.submit(image).image[100:] for image in images]
+            expected = [pipeline(image).image[100:] for image in images]
+            np.testing.assert_array_equal(rows, expected)
+
+
 def test_calls_updates_and_hand_overs_wait_for_what_was_submitted(frames: Frames, device: str) -> None:
     scene = make_scene()
     with contextlib.ExitStack() as stack:

@@ -35,6 +35,47 @@ def translating(device: Any) -> contextlib.AbstractContextManager[Any]:
     return _CUDA if device.is_cuda else _TRANSLATION
 
 
+class _Captures:
+    """Who captures, and who waits for events: CUDA allows one or the other."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()
+        self.waiting = 0
+        self.capturing = False
+
+
+_CAPTURES = _Captures()
+
+
+@contextlib.contextmanager
+def capturing() -> Iterator[None]:
+    """Held around the capture of a graph: no thread waits for an event meanwhile, which CUDA forbids."""
+    now = _CAPTURES
+    with now.changed:
+        now.changed.wait_for(lambda: not now.waiting and not now.capturing)
+        now.capturing = True
+    try:
+        yield
+    finally:
+        with now.changed:
+            now.capturing = False
+            now.changed.notify_all()
+
+
+def wait_for(event: Any) -> None:
+    """Wait until an event that has been recorded has come to pass on its CUDA device."""
+    now = _CAPTURES
+    with now.changed:
+        now.changed.wait_for(lambda: not now.capturing)
+        now.waiting += 1
+    try:
+        wp.synchronize_event(event)
+    finally:
+        with now.changed:
+            now.waiting -= 1
+            now.changed.notify_all()
+
+
 @contextlib.contextmanager
 def _native_stderr_silenced() -> Iterator[None]:
     """Keep what native code prints to stderr off the terminal.

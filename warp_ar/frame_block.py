@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_ar.device import wait_for
 from warp_ar.kernels.structs import FrameParams, Light, Shape
 
 _ALIGNMENT = 16
@@ -65,7 +66,7 @@ class FrameBlock:
             return
         buffer, view, done = self._pinned[self._uploads % _SLOTS]
         if self._uploads >= _SLOTS:
-            wp.synchronize_event(done)
+            wait_for(done)
         self._uploads += 1
         view[:] = self._bytes
         wp.copy(self._device_buffer, buffer, stream=self._stream)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy.typing as npt
 import warp as wp
 
+from warp_ar.device import wait_for
+
 
 class HostCopies:
     """The host's side of some device arrays: fetched from there, or sent there."""
@@ -54,13 +56,13 @@ class HostCopies:
     def fetched(self) -> Mapping[str, npt.NDArray[Any]]:
         """The host's arrays once ``fetch`` is done; the next one overwrites them."""
         if self._done is not None:
-            wp.synchronize_event(self._done)
+            wait_for(self._done)
         return self._views
 
     def send(self, values: Mapping[str, npt.NDArray[Any]], stream: Any) -> None:
         """Begin to copy ``values`` to the device on ``stream``."""
         if self._done is not None and self._used:
-            wp.synchronize_event(self._done)
+            wait_for(self._done)
         for name, value in values.items():
             self._views[name][...] = value
         if self._done is None:

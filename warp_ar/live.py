@@ -12,6 +12,7 @@ import os
 import secrets
 import signal
 import sys
+import time
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -306,10 +307,13 @@ def run(options: argparse.Namespace) -> int:
         try:
             with sink, _interruptible() as interrupted, progress:
                 for _, result in itertools.islice(session, options.frames):
-                    sink.write(result.image)
+                    image, decode_ms = result.image, session.decode_ms
+                    start = time.perf_counter()
+                    sink.write(image)
+                    encode_ms = (time.perf_counter() - start) * 1e3
                     if result.environment is not None:
                         write_environment(options.save_environment / f"{log.count:04d}.exr", result.environment)
-                    log.add(result)
+                    log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
                     progress.update(bar, advance=1, fps=log.fps)
                     if log.count == MARKER_PATIENCE:
                         _check_marker(log, session.scene, live=source.live)
@@ -327,6 +331,8 @@ def run(options: argparse.Namespace) -> int:
         print_plan(session.pipeline.plan, log)
         if isinstance(session.pipeline, AutoPipeline):
             _print_choice(session.pipeline)
+        steps = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in log.steps().items())
+        Console().print(f"side by side, in ms: {steps}", highlight=False)
         Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {output}", highlight=False)
     return EXIT_INTERRUPTED if stopped else EXIT_DONE
 

@@ -6,7 +6,7 @@ import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, cast
@@ -29,7 +29,7 @@ from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
 from warp_ar.stages.base import Arrays, Request
 from warp_ar.tracking import Pose, Tracker, TrackState
-from warp_ar.transfer import Image, Slot, Transfers
+from warp_ar.transfer import Image, Picture, Slot, Transfers
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the room's light from frame to frame."""
@@ -51,8 +51,10 @@ class Rendered:
     image_array: Any
     environment_array: Any
     stages: Mapping[str, StageTiming]
-    image: Callable[[], Image] | Image | None = None
-    """The picture, or how to wait for it, where it was sent ahead."""
+    render_ms: float = 0.0
+    """Of the host: running the stages on CPU, launching them on CUDA."""
+    image: Picture | Image | None = None
+    """The picture, or that it is on its way to the host, where it was sent ahead."""
     environment: npt.NDArray[np.float32] | None = None
     """The room's light where it was kept."""
 
@@ -84,12 +86,25 @@ class Result:
         """Milliseconds of every stage of the plan, and whether it was skipped."""
         return self._rendered.result().stages
 
+    @property
+    def steps(self) -> Mapping[str, float]:
+        """Milliseconds of the steps of the frame's way, which overlap those of other frames.
+
+        ``track`` and ``render`` (on CUDA: launching) on the host; of a frame that was submitted on CUDA also
+        ``upload``, ``kernels`` and ``download``, on the device.
+        """
+        rendered = self._rendered.result()
+        tracking = rendered.stages.get(TRACK)
+        steps = {TRACK: tracking.milliseconds} if tracking is not None else {}
+        steps["render"] = rendered.render_ms
+        return steps | rendered.image.steps() if isinstance(rendered.image, Picture) else steps
+
     @functools.cached_property
     def image(self) -> Image:
         """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
         rendered = self._rendered.result()
         if rendered.image is not None:
-            return rendered.image() if callable(rendered.image) else rendered.image
+            return rendered.image.result() if isinstance(rendered.image, Picture) else rendered.image
         lit = rendered.image_array
         if not isinstance(lit, wp.array):
             return np.array(lit)
@@ -359,9 +374,9 @@ class Pipeline:
         if self._renderer is None:
             self._renderer = ThreadPoolExecutor(1, "warp_ar-render")
         # The caller may write its picture anew before it is rendered.
-        if self._transfers is None or frame.lost:
+        if self._transfers is None or frame.lost or "image" not in self._arrays:
             frame = dataclasses.replace(frame, image=host_image.copy())
-        else:
+        if self._transfers is not None and not frame.lost:
             frame = dataclasses.replace(frame, slot=self._transfers.upload(host_image))
         self._ahead.append(self._renderer.submit(lambda: self._keep(self._render(frame))))
         return Result(frame.pose, state, self._ahead[-1])
@@ -441,6 +456,7 @@ class Pipeline:
     def _render(self, frame: _Frame) -> Rendered:
         """Run the stages on a frame."""
         timings = frame.timings
+        start = time.perf_counter()
         if not frame.lost:
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
@@ -451,7 +467,7 @@ class Pipeline:
             self._has_light = True
         # A lost marker says nothing about where things are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
-        return Rendered(self._shown, self._light(), timings)
+        return Rendered(self._shown, self._light(), timings, (time.perf_counter() - start) * 1e3)
 
     def _light(self) -> Any:
         return self._arrays["environment"] if self._has_light and "environment" in self.plan.request.outputs else None

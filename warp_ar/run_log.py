@@ -27,6 +27,7 @@ class RunLog:
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: dict[str, int] = {}
+        self._steps: list[dict[str, float]] = []
         self._first = 0.0
         self._last = 0.0
         self.never_posed = pipeline.plan.needs("pose")
@@ -42,8 +43,16 @@ class RunLog:
         """Frames per second since the first frame was done; 0 before the second."""
         return (self.count - 1) / (self._last - self._first) if self.count > 1 and self._last > self._first else 0.0
 
-    def add(self, result: Result) -> None:
-        """Note one frame's result."""
+    def add(self, result: Result, *, decode_ms: float | None = None, encode_ms: float | None = None) -> None:
+        """Note one frame's result.
+
+        Args:
+            result: What it became.
+            decode_ms: What its source took.
+            encode_ms: What its sink took.
+        """
+        around = {"decode": decode_ms, **result.steps, "encode": encode_ms}
+        self._steps.append({name: value for name, value in around.items() if value is not None})
         self._last = time.perf_counter()
         if not self._frames:
             self._first = self._last
@@ -64,6 +73,12 @@ class RunLog:
         """Frames in which ``stage`` was skipped because nothing that it reads had changed."""
         return self._skipped.get(stage, 0)
 
+    def steps(self) -> dict[str, float]:
+        """Median milliseconds of each step of a frame's way; different frames take different steps side by side."""
+        frames = self._steps[WARM_UP:] if len(self._steps) > 2 * WARM_UP else self._steps
+        names = dict.fromkeys(name for frame in frames for name in frame)
+        return {name: statistics.median(frame[name] for frame in frames if name in frame) for name in names}
+
     def _recovered(self) -> Any:
         """What the light's last estimate rests on; None where the plan has none."""
         status = self._pipeline.arrays.get("recover_status")
@@ -78,6 +93,8 @@ class RunLog:
             "quality": AUTO if isinstance(self._pipeline, AutoPipeline) else self._pipeline.quality.name,
             "fps": round(self.fps, 3),
             **({"auto": self._pipeline.status()} if isinstance(self._pipeline, AutoPipeline) else {}),
+            "steps_ms": {name: round(milliseconds, 3) for name, milliseconds in self.steps().items()},
+            "critical_path": max(self.steps(), key=self.steps().__getitem__, default=None),
             "frames": self._frames,
             "stages_run": stage_names(plan),
             "recovered": self._recovered(),

@@ -20,7 +20,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.device import exclusive, translating
+from warp_ar.device import capturing, exclusive, translating
 from warp_ar.graph import INPUTS, Plan
 from warp_ar.stages.base import Arrays, Pass, Rows, Stage
 
@@ -243,7 +243,7 @@ class Scheduler:
         with exclusive(self.device), wp.ScopedStream(self._stream, sync_enter=False):
             # Launched once outside the capture: that loads every module, which a capture must not do.
             self._launch_in_turn(segment.part)
-            with wp.ScopedCapture(device=self.device) as capture:
+            with capturing(), wp.ScopedCapture(device=self.device) as capture:
                 if self._marks is None:
                     self._launch_side_by_side(segment.part)
                 else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -72,6 +73,8 @@ class Session:
         own = self.scene.source if source is None else None
         fps, exposures = (own.fps, own.exposures or ()) if own is not None else (None, ())
         self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
+        self.decode_ms = 0.0
+        """Milliseconds that the source took for its last frame."""
         try:
             self.pipeline: Pipeline | AutoPipeline
             if quality == AUTO:
@@ -110,18 +113,29 @@ class Session:
         self.source.close()
         self.pipeline.close()
 
+    def _frames(self) -> Iterator[Frame]:
+        """The source's frames; notes what they are waited for."""
+        frames = iter(self.source)
+        while True:
+            start = time.perf_counter()
+            frame = next(frames, None)
+            self.decode_ms = (time.perf_counter() - start) * 1e3
+            if frame is None:
+                return
+            yield frame
+
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
         kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
-            for frame in self.source:
+            for frame in self._frames():
                 yield frame, pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
         try:
-            for frame in self.source:
+            for frame in self._frames():
                 result = pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
                 ready.append((frame, result))
                 if len(ready) > 1:

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import collections
 import weakref
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
+
+from warp_ar.device import exclusive, wait_for
 
 Image = npt.NDArray[np.uint8]
 
@@ -28,8 +29,24 @@ KEPT = 8
 """Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
 
 
+MARKED = 16
+"""Frames whose times on the device are remembered."""
+
+
+class Marks:
+    """When a frame took which step on the device."""
+
+    def __init__(self, device: Any) -> None:
+        self.frame = -1
+        self.sent, self.arrived, self.started, self.rendered, self.returned = (
+            wp.Event(device, enable_timing=True) for _ in range(5)
+        )
+
+
 class Slot:
     """Buffers of one frame under way."""
+
+    marks: Marks
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
         self.pinned = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
@@ -61,6 +78,8 @@ class Transfers:
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
+        self._marks = [Marks(device) for _ in range(MARKED)]
+        self._marking = self._marks[0]
         self._free: collections.deque[tuple[Any, Image, Any]] = collections.deque()
         for _ in range(SLOTS):
             self._free.append(self._new_buffer())
@@ -78,56 +97,80 @@ class Transfers:
         """
         slot = self._slots[self._uploads % SLOTS]
         if self._uploads >= SLOTS:
-            wp.synchronize_event(slot.uploaded)
+            wait_for(slot.uploaded)
             self._up.wait_event(slot.consumed)
+        slot.marks = self._marks[self._uploads % MARKED]
+        slot.marks.frame = self._uploads
         self._uploads += 1
         np.copyto(slot.host, image)
+        self._up.record_event(slot.marks.sent)
         wp.copy(slot.frame, slot.pinned, stream=self._up)
+        self._up.record_event(slot.marks.arrived)
         self._up.record_event(slot.uploaded)
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
         """Have kernels that are launched from now on see an uploaded picture in ``frame_out``."""
         self._compute.wait_event(slot.uploaded)
+        self._compute.record_event(slot.marks.started)
+        self._marking = slot.marks
         wp.copy(frame_out, slot.frame, stream=self._compute)
         self._compute.record_event(slot.consumed)
 
-    def download(self, image: Any) -> Callable[[], Image]:
-        """Send the device's picture to the host as soon as the kernels launched so far have written it.
-
-        Returns:
-            Waits for the picture and gives it; the array is the caller's for as long as he refers to it.
-        """
-        slot = self._slots[self._downloads % SLOTS]
+    def download(self, image: Any) -> Picture:
+        """Send the device's picture to the host as soon as the kernels launched so far have written it."""
+        slot, marks = self._slots[self._downloads % SLOTS], self._marking
         self._downloads += 1
         self._compute.wait_event(slot.downloaded)
         wp.copy(slot.image, image, stream=self._compute)
         self._compute.record_event(slot.rendered)
+        self._compute.record_event(marks.rendered)
         self._down.wait_event(slot.rendered)
         if not self._free and self._buffers < KEPT:
-            self._free.append(self._new_buffer())
+            with exclusive(self._device):
+                self._free.append(self._new_buffer())
             self._buffers += 1
         try:
             buffer = self._free.popleft()
         except IndexError:
-            kept = wp.empty(self._shape, dtype=wp.vec3ub, device="cpu")
-            wp.copy(kept, slot.image, stream=self._down)
-            self._down.record_event(slot.downloaded)
-            wp.synchronize_event(slot.downloaded)
-            ordinary: Image = kept.numpy()
-            return lambda: ordinary
-        pinned, host, done = buffer
-        wp.copy(pinned, slot.image, stream=self._down)
+            ordinary = wp.empty(self._shape, dtype=wp.vec3ub, device="cpu")
+            buffer = (ordinary, ordinary.numpy(), wp.Event(self._device))
+            kept: Image = buffer[1]
+        else:
+            holder = _Holder(buffer[1])
+            # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
+            weakref.finalize(holder, self._free.append, buffer)
+            kept = np.asarray(holder)
+        target, _, done = buffer
+        wp.copy(target, slot.image, stream=self._down)
         self._down.record_event(slot.downloaded)
+        self._down.record_event(marks.returned)
         self._down.record_event(done)
-        holder = _Holder(host)
-        # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
-        weakref.finalize(holder, self._free.append, buffer)
-        picture = np.asarray(holder)
-        del holder
+        return Picture(kept, done, marks)
 
-        def wait() -> Image:
-            wp.synchronize_event(done)
-            return picture
 
-        return wait
+class Picture:
+    """A picture on its way to the host."""
+
+    def __init__(self, image: Image, done: Any, marks: Marks) -> None:
+        """``image`` is there once the event ``done`` has come to pass."""
+        self._image, self._done, self._marks, self._frame = image, done, marks, marks.frame
+
+    def result(self) -> Image:
+        """Wait for the picture; the array is the caller's for as long as anything refers to it."""
+        wait_for(self._done)
+        return self._image
+
+    def steps(self) -> dict[str, float]:
+        """Milliseconds of its steps on the device; none where ``MARKED`` later frames have overwritten them."""
+        wait_for(self._done)
+        marks = self._marks
+        if marks.frame != self._frame:
+            return {}
+        pairs = {
+            "upload": (marks.sent, marks.arrived),
+            "kernels": (marks.started, marks.rendered),
+            "download": (marks.rendered, marks.returned),
+        }
+        times = {name: wp.get_event_elapsed_time(*pair, synchronize=False) for name, pair in pairs.items()}
+        return {name: float(milliseconds) for name, milliseconds in times.items()}
