@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import math
 import statistics
 import tempfile
 import threading
@@ -53,6 +54,8 @@ _CAMERA_LEAD_MS: Final = 40.0
 """How long a picture of a browser's camera is about to be packed, sent and unpacked."""
 _STILL_SECONDS: Final = 0.25
 """How often a held frame is looked at again, where nothing was edited."""
+_FOCAL_STEP: Final = 0.01
+"""Share by which a better estimate must differ to be worth another pipeline."""
 _LOOK_SECONDS: Final = 0.2
 """How often it is looked at meanwhile: finding the marker once more takes several milliseconds."""
 _ESTIMATE_SECONDS: Final = 30.0
@@ -255,6 +258,7 @@ class Host:
         self._stopped = False
         self._camera_owner: object | None = None
         self._estimator: FocalEstimator | None = None
+        self._estimated: float | None = None
         self._next: _Feed | None = None
         self._feed = _Feed(self._open(scene))
         self._builder = ThreadPoolExecutor(1, "warp-ar-build")
@@ -425,7 +429,7 @@ class Host:
         feed = self._next or self._feed
         if feed.is_browser and feed.owner is not owner:
             raise UsageError("another viewer's camera is the source; it must be switched off there first")
-        self._estimator = None
+        self._estimator = self._estimated = None
         if self._wanted.scene.marker.board is None:
             self._estimator = FocalEstimator(self._wanted.scene.marker, width, height)
             self._estimate_until = time.monotonic() + _ESTIMATE_SECONDS
@@ -473,17 +477,18 @@ class Host:
         if estimator is None or now < self._looked + _LOOK_SECONDS:
             return
         self._looked = now
-        found = estimator.estimate() if estimator.look(picture) else None
-        if found is not None:
-            self._estimator = None
+        found = estimator.estimate() if estimator.look(picture) and estimator.ripe else None
+        if found is not None and abs(found.focal / (self._estimated or math.inf) - 1.0) > _FOCAL_STEP:
+            self._estimated = found.focal
             camera = guessed_camera(picture.shape[1], picture.shape[0], focal=found.focal)
             with self._lock:
                 self._feed = dataclasses.replace(self._feed, camera=camera)
                 self._edits += 1
             self._notify({"type": "intrinsics", "focal": found.focal, "spread": found.spread, "views": found.views})
-        elif now > self._estimate_until:
+        if estimator.full or now > self._estimate_until:
             self._estimator = None
-            self._notify({"type": "intrinsics", "focal": None, "spread": None, "views": 0})
+            if self._estimated is None:
+                self._notify({"type": "intrinsics", "focal": None, "spread": None, "views": 0})
 
     # ------------------------------------------------------------------------------------------------------ the frames
 

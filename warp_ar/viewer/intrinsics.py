@@ -26,12 +26,12 @@ DEFAULT_FIELD_OF_VIEW: Final = 60.0
 
 _FIELDS: Final = (30.0, 100.0)
 _CANDIDATES: Final = 33
-_VIEWS: Final = 12
-_MOST_VIEWS: Final = 40
+_VIEWS: Final = 2
+_MOST_VIEWS: Final = 32
 _NOISE: Final = 0.3
 """Standard error of a corner in pixels, with which the spread of the estimate is judged."""
 _GOOD_ENOUGH: Final = 0.08
-_NEW_VIEW: Final = 0.04
+_NEW_VIEW: Final = 0.01
 """A view counts as another one when its corners have moved by this share of the picture's width."""
 
 
@@ -63,6 +63,16 @@ class FocalEstimator:
         self._square = np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
         self._views: list[npt.NDArray[np.float64]] = []
 
+    @property
+    def ripe(self) -> bool:
+        """Whether twice as many views have come as at the last time that was worth an estimate."""
+        return len(self._views) >= _VIEWS and len(self._views).bit_count() == 1
+
+    @property
+    def full(self) -> bool:
+        """Whether more views would hardly tell more."""
+        return len(self._views) >= _MOST_VIEWS
+
     def look(self, image: npt.NDArray[np.uint8]) -> bool:
         """Take a frame, uint8 RGB; True if it showed the marker from a new side."""
         found = [d for d in self._detector.detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) if d.id == self._marker.id]
@@ -70,7 +80,7 @@ class FocalEstimator:
 
     def add(self, corners: npt.NDArray[np.float64]) -> bool:
         """Take the marker's corners (4, 2) in pixels, clockwise from its top left; True if they show a new side."""
-        if len(self._views) >= _MOST_VIEWS:
+        if self.full:
             return False
         least = _NEW_VIEW * self._size[0]
         if any(np.abs(corners - view).max() < least for view in self._views):
