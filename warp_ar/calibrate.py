@@ -50,7 +50,7 @@ _MOST_VIEWS = 60
 """Views that are used at most: more cost time and add nothing."""
 _FEWEST_VIEWS = 4
 """Views without which the focal length is not determined with any certainty."""
-_GOOD_VIEWS = 12
+GOOD_VIEWS = 12
 """Views below which a warning is due."""
 _COVERAGE_CELLS = (4, 6)
 """Rows and columns into which the picture is cut to see where the board has been."""
@@ -174,8 +174,108 @@ class CameraReport:
     """What would make it better, one line each."""
 
 
+class BoardViews:
+    """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
+
+    def __init__(self, marker: Marker) -> None:
+        """Collect nothing yet.
+
+        Args:
+            marker: the board that was printed.
+
+        Raises:
+            UsageError: if it is no ChArUco board.
+        """
+        if not isinstance(marker.board, CharucoBoard):
+            raise UsageError('--board: the camera is calibrated with a ChArUco board, such as "charuco 7x5 0.03 0.022"')
+        self._marker = marker
+        self._board = make_board(marker)
+        self._detector = cv2.aruco.CharucoDetector(self._board)
+        self._size: tuple[int, int] | None = None
+        self._seen = 0
+        self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
+        """Corners in pixels, their numbers, and where they are on the board."""
+
+    def add(self, image: Image) -> bool:
+        """Take a picture, RGB or grey uint8; True if it shows the board as none before.
+
+        Raises:
+            UsageError: if its size is not the first one's.
+        """
+        size = (image.shape[1], image.shape[0])
+        self._size = self._size or size
+        if size != self._size:
+            first = f"{self._size[0]}x{self._size[1]}"
+            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}")
+        self._seen += 1
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        corners, ids, _, _ = self._detector.detectBoard(gray)
+        # Corners on one line, or fewer than six, leave a view's pose open.
+        if ids is None or len(ids) < 6 or self._board.checkCharucoCornersCollinear(ids):
+            return False
+        corners, ids = np.asarray(corners).reshape(-1, 2), np.ravel(ids)
+        least = _MOVED * math.hypot(*size)
+        if len(self.views) >= _MOST_VIEWS or any(_moved(corners, ids, *view[:2]) <= least for view in self.views):
+            return False
+        self.views.append((corners, ids, np.asarray(self._board.getChessboardCorners())[ids]))
+        return True
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Where in the picture the board has been, by rows and columns."""
+        return _covered(self.views, self._size or (1, 1))
+
+    def solve(self) -> CameraReport:
+        """Pinhole and distortion.
+
+        Raises:
+            UsageError: if too few views show the board.
+        """
+        size = self._size
+        if size is None or len(self.views) < _FEWEST_VIEWS:
+            raise UsageError(
+                f"{len(self.views)} different views of {self._marker.board} ({self._marker.dictionary}) in "
+                f"{self._seen} pictures; expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
+            )
+        result = _calibrate(self.views, size)
+        errors = np.ravel(result[-1])
+        # A blurred or bent view must not spoil the others.
+        kept = [view for view, error in zip(self.views, errors, strict=True) if error <= 3 * np.median(errors)]
+        if len(kept) < len(self.views) and len(kept) >= _FEWEST_VIEWS:
+            result = _calibrate(kept, size)
+            errors = np.ravel(result[-1])
+        error, matrix, distortion, rotations, _, deviations, _, _ = result
+        camera = Camera(
+            *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
+        )
+        covered = _covered(kept, size)
+        tilts = [math.degrees(math.acos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2])))) for r in rotations]
+        warnings = []
+        if len(kept) < GOOD_VIEWS:
+            warnings.append(f"only {len(kept)} views: take {GOOD_VIEWS} or more, from different sides and distances")
+        if covered.mean() < 0.8:
+            empty = [_place(row, column) for row, column in np.argwhere(~covered)]
+            warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
+        if max(tilts) - min(tilts) < 15:
+            warnings.append(
+                f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: "
+                "the focal length is uncertain"
+            )
+        if error > 1.0:
+            warnings.append(
+                f"reprojection error {error:.2f} pixels: is the print flat, the picture sharp, the board's text right?"
+            )
+        return CameraReport(
+            camera,
+            float(error),
+            tuple(map(float, errors)),
+            float(np.ravel(deviations)[:2].max()),
+            float(covered.mean()),
+            tuple(warnings),
+        )
+
+
 def calibrate_camera(images: Iterable[Image], marker: Marker) -> CameraReport:
-    """Pinhole and distortion from views of a ChArUco board [Z00].
+    """Pinhole and distortion from views of a ChArUco board.
 
     Args:
         images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
@@ -184,75 +284,21 @@ def calibrate_camera(images: Iterable[Image], marker: Marker) -> CameraReport:
     Raises:
         UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
     """
-    if not isinstance(marker.board, CharucoBoard):
-        raise UsageError('--board: the camera is calibrated with a ChArUco board, such as "charuco 7x5 0.03 0.022"')
-    board = make_board(marker)
-    detector = cv2.aruco.CharucoDetector(board)
-    size: tuple[int, int] | None = None
-    views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
-    seen = 0
+    views = BoardViews(marker)
     for image in images:
-        if size is None:
-            size = (image.shape[1], image.shape[0])
-        if size != (image.shape[1], image.shape[0]):
-            raise UsageError(
-                f"picture {seen}: {image.shape[1]}x{image.shape[0]}; expected the first one's {size[0]}x{size[1]}"
-            )
-        seen += 1
-        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        corners, ids, _, _ = detector.detectBoard(gray)
-        # Corners on one line, or fewer than six, leave a view's pose open.
-        if ids is None or len(ids) < 6 or board.checkCharucoCornersCollinear(ids):
-            continue
-        corners, ids = np.asarray(corners).reshape(-1, 2), np.ravel(ids)
-        if len(views) < _MOST_VIEWS and all(
-            _moved(corners, ids, *view[:2]) > _MOVED * math.hypot(*size) for view in views
-        ):
-            views.append((corners, ids, np.asarray(board.getChessboardCorners())[ids]))
-    if size is None or len(views) < _FEWEST_VIEWS:
-        raise UsageError(
-            f"{len(views)} different views of {marker.board} ({marker.dictionary}) in {seen} pictures; "
-            f"expected {_FEWEST_VIEWS} at the least, {_GOOD_VIEWS} for a good result"
-        )
-    result = _calibrate(views, size)
-    errors = np.ravel(result[-1])
-    # A blurred or bent view must not spoil the others.
-    kept = [view for view, error in zip(views, errors, strict=True) if error <= 3 * np.median(errors)]
-    if len(kept) < len(views) and len(kept) >= _FEWEST_VIEWS:
-        result = _calibrate(kept, size)
-        errors = np.ravel(result[-1])
-    error, matrix, distortion, rotations, _, deviations, _, _ = result
-    camera = Camera(
-        *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
-    )
+        views.add(image)
+    return views.solve()
+
+
+def _covered(
+    views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]
+) -> NDArray[np.bool_]:
     rows, columns = _COVERAGE_CELLS
-    points = np.concatenate([corners for corners, _, _ in kept])
-    cells = np.floor(points / size * (columns, rows)).astype(int).clip(0, (columns - 1, rows - 1))
     covered = np.zeros((rows, columns), bool)
-    covered[cells[:, 1], cells[:, 0]] = True
-    tilts = [math.degrees(math.acos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2])))) for r in rotations]
-    warnings = []
-    if len(kept) < _GOOD_VIEWS:
-        warnings.append(f"only {len(kept)} views: take {_GOOD_VIEWS} or more, from different sides and distances")
-    if covered.mean() < 0.8:
-        empty = [_place(row, column) for row, column in np.argwhere(~covered)]
-        warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
-    if max(tilts) - min(tilts) < 15:
-        warnings.append(
-            f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: the focal length is uncertain"
-        )
-    if error > 1.0:
-        warnings.append(
-            f"reprojection error {error:.2f} pixels: is the print flat, the picture sharp, the board's text right?"
-        )
-    return CameraReport(
-        camera,
-        float(error),
-        tuple(map(float, errors)),
-        float(np.ravel(deviations)[:2].max()),
-        float(covered.mean()),
-        tuple(warnings),
-    )
+    for corners, _, _ in views:
+        cells = np.floor(corners / size * (columns, rows)).astype(int).clip(0, (columns - 1, rows - 1))
+        covered[cells[:, 1], cells[:, 0]] = True
+    return covered
 
 
 def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other_ids: NDArray[Any]) -> float:

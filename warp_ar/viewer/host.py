@@ -21,12 +21,13 @@ import numpy.typing as npt
 
 from warp_ar.auto_quality import AUTO
 from warp_ar.bracket import bracket_ratios
+from warp_ar.calibrate import GOOD_VIEWS, BoardViews, CameraReport, write_camera, write_card
 from warp_ar.device import exclusive
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.run_log import left_out, stage_names
-from warp_ar.scene import Camera, Scene, SourceSpec, bundled_scenes, dumps_scene, load_scene
+from warp_ar.scene import Camera, CharucoBoard, Marker, Scene, SourceSpec, bundled_scenes, dumps_scene, load_scene
 from warp_ar.sinks import VideoSink, write_environment
 from warp_ar.sources import Frame, QueueSource, Source, open_source
 from warp_ar.stages import STAGES
@@ -50,6 +51,10 @@ _COST_FRAMES: Final = 30
 _SETTLED: Final = 10
 _MEASURING_REST: Final = 0.15
 """Seconds that the frames rest, one from the next, while rungs are timed: what runs beside them spoils the times."""
+BOARD: Final = Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022))
+"""What a camera is calibrated with: a sheet of A4."""
+_BOARD_SECONDS: Final = 0.4
+"""How often the board is looked for."""
 _CAMERA_LEAD_MS: Final = 40.0
 """How long a picture of a browser's camera is about to be packed, sent and unpacked."""
 _STILL_SECONDS: Final = 0.25
@@ -259,6 +264,11 @@ class Host:
         self._camera_owner: object | None = None
         self._estimator: FocalEstimator | None = None
         self._estimated: float | None = None
+        self._views: BoardViews | None = None
+        self._looking: Future[None] | None = None
+        self._looked_at_board = 0.0
+        self._report: CameraReport | None = None
+        self._calibrated: dict[tuple[int, int], Camera] = {}
         self._next: _Feed | None = None
         self._feed = _Feed(self._open(scene))
         self._builder = ThreadPoolExecutor(1, "warp-ar-build")
@@ -367,6 +377,8 @@ class Host:
                 self._use_camera(width, height, owner)
             case protocol.LeaveCamera():
                 self.leave_camera(owner)
+            case protocol.Calibrate(step):
+                self._calibrate(step)
             case protocol.Record(on):
                 with self._lock:
                     self._start_recording() if on else self._stop_recording()
@@ -430,11 +442,12 @@ class Host:
         if feed.is_browser and feed.owner is not owner:
             raise UsageError("another viewer's camera is the source; it must be switched off there first")
         self._estimator = self._estimated = None
-        if self._wanted.scene.marker.board is None:
+        known = self._calibrated.get((width, height))
+        if known is None and self._wanted.scene.marker.board is None:
             self._estimator = FocalEstimator(self._wanted.scene.marker, width, height)
             self._estimate_until = time.monotonic() + _ESTIMATE_SECONDS
         source = QueueSource((width, height), description="the browser's camera")
-        self._switch(_Feed(source, guessed_camera(width, height), owner=owner))
+        self._switch(_Feed(source, known or guessed_camera(width, height), owner=owner))
 
     def leave_camera(self, owner: object) -> None:
         """Back to the scene's own source, if ``owner``'s camera is the source."""
@@ -489,6 +502,82 @@ class Host:
             self._estimator = None
             if self._estimated is None:
                 self._notify({"type": "intrinsics", "focal": None, "spread": None, "views": 0})
+
+    # ----------------------------------------------------------------------------------------------------- calibration
+
+    def _calibrate(self, step: str) -> None:
+        if step == "finish":
+            if self._views is None:
+                raise UsageError("nothing was looked at yet: start the calibration first")
+            self._report = report = self._views.solve()
+            camera = dataclasses.replace(report.camera, transfer=self._wanted.scene.camera.transfer)
+            with self._lock:
+                self._calibrated[camera.width, camera.height] = camera
+                self._feed = dataclasses.replace(self._feed, camera=camera)
+                self._edits += 1
+            self._estimator = None
+        self._views = BoardViews(BOARD) if step == "start" else None
+        self._notify(self.calibration_message())
+
+    def _look_for_board(self, image: Image) -> None:
+        """Have a frame looked at beside the others; newer ones are left aside meanwhile."""
+        views, now = self._views, time.monotonic()
+        if views is None or now - self._looked_at_board < _BOARD_SECONDS:
+            return
+        if self._looking is not None and not self._looking.done():
+            return
+        self._looked_at_board = now
+
+        def look() -> None:
+            try:
+                new = views.add(image)
+            except UsageError as error:  # the source has changed
+                self._views, new = None, True
+                self._notify({"type": "notice", "text": str(error), "bad": True})
+            if new:
+                self._notify(self.calibration_message())
+
+        self._looking = self._builder.submit(look)
+
+    def calibration_message(self) -> dict[str, Any]:
+        """How far the calibration has come."""
+        views, report = self._views, self._report
+        return {
+            "type": "calibration",
+            "on": views is not None,
+            "views": 0 if views is None else len(views.views),
+            "wanted": GOOD_VIEWS,
+            "covered": [] if views is None else views.covered().tolist(),
+            "report": None
+            if report is None
+            else {
+                "focal": report.camera.fx,
+                "error": report.error,
+                "deviation": report.focal_deviation,
+                "coverage": report.coverage,
+                "warnings": list(report.warnings),
+            },
+        }
+
+    def camera_file(self) -> bytes:
+        """The calibrated camera as OpenCV's YAML.
+
+        Raises:
+            UsageError: None was calibrated.
+        """
+        if self._report is None:
+            raise UsageError("no camera was calibrated here")
+        with tempfile.TemporaryDirectory(dir=self._folder.name) as folder:
+            path = Path(folder) / "camera.yml"
+            write_camera(self._report, path)
+            return path.read_bytes()
+
+    def board_picture(self) -> bytes:
+        """The board to print, a PNG of a sheet of A4."""
+        with tempfile.TemporaryDirectory(dir=self._folder.name) as folder:
+            path = Path(folder) / "board.png"
+            write_card(BOARD, path, dpi=300.0)
+            return path.read_bytes()
 
     # ------------------------------------------------------------------------------------------------------ the frames
 
@@ -598,6 +687,7 @@ class Host:
             wait = max(self._busy_ms - _CAMERA_LEAD_MS, 0.0)
             self._notify({"type": "taken", "id": pushed.id, "wait": round(wait, 1)})
         begin = time.perf_counter()
+        self._look_for_board(frame.image)
         pipeline = self._follow()
         height, width = frame.image.shape[:2]
         if pipeline is None or pipeline.size != (width, height):

@@ -157,6 +157,13 @@ class LeaveCamera:
 
 
 @dataclasses.dataclass(frozen=True)
+class Calibrate:
+    """Look out for the printed board (``start``), leave it at that (``stop``), or use what was seen (``finish``)."""
+
+    step: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Record:
     """Start or stop recording."""
 
@@ -190,6 +197,7 @@ Command: TypeAlias = (
     | Reset
     | UseCamera
     | LeaveCamera
+    | Calibrate
     | Record
 )
 
@@ -274,6 +282,7 @@ _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callabl
         },
     ),
     "no_camera": (LeaveCamera, {}),
+    "calibrate": (Calibrate, {"step": _choice("start", "stop", "finish")}),
     "record": (Record, {"on": _flag}),
 }
 

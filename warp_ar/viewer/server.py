@@ -211,6 +211,8 @@ class Server:
                 lambda: self.host.scene_toml(full_paths=self.address.loopback).encode(),
             ),
             "recording.mp4": ("video/mp4", self.host.recording),
+            "camera.yml": ("application/yaml", self.host.camera_file),
+            "board.png": ("image/png", self.host.board_picture),
         }
         name = request.match_info["name"]
         if name not in makers:
@@ -342,6 +344,7 @@ class Server:
                 self.host.plan_message(),
                 self.host.scene_message(),
                 self.host.dial_message(),
+                self.host.calibration_message(),
                 self.host.state_message(),
             ):
                 viewer.tell(json.dumps(message))

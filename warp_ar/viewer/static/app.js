@@ -82,8 +82,24 @@ connection.addEventListener("notice", ({ detail }) => notice(detail.text, detail
 connection.addEventListener("intrinsics", ({ detail }) => {
   if (detail.focal) {
     const spread = Math.max(1, Math.round(100 * detail.spread));
-    notice(`Your camera's focal length was estimated from the marker: ${detail.focal.toFixed(0)} pixels, within about ${spread} %. For exact light, calibrate it: `, false, "python -m warp_ar.calibrate camera PHOTOS --output camera.yml");
-  } else notice("The marker was not seen from enough sides to tell your camera's focal length: 60 degrees are assumed. Move the camera around the marker, or calibrate it: ", false, "python -m warp_ar.calibrate camera PHOTOS --output camera.yml");
+    offer(`Your camera's focal length was estimated from the marker: ${detail.focal.toFixed(0)} pixels, within about ${spread} %. For exact light, calibrate it.`);
+  } else offer("The marker was not seen well enough to tell your camera's focal length: 60 degrees are assumed. Calibrate it, or move it around the marker.");
+});
+
+connection.addEventListener("calibration", ({ detail }) => {
+  const { on, views, wanted, covered, report } = detail;
+  $("calibrate").setAttribute("aria-pressed", String(on));
+  $("calibrate").textContent = on ? "Stop" : report ? "Calibrate again" : "Calibrate";
+  $("calibrate-finish").hidden = !on || views < 4;
+  $("camera-file").hidden = !report;
+  $("coverage").hidden = !on;
+  $("coverage").style.gridTemplate = `repeat(${covered.length}, 1fr) / repeat(${covered[0]?.length ?? 1}, 1fr)`;
+  $("coverage").replaceChildren(...covered.flat().map((seen) => Object.assign(document.createElement("i"), { className: seen ? "on" : "" })));
+  const lines = [];
+  if (on) lines.push(`${views} of ${wanted} views. Hold the printed board before the camera, tilted another way each time, until every field of the picture is green.`);
+  else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${report.deviation.toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
+  else lines.push("Print the board, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
+  $("calibration-note").textContent = lines.join(" ");
 });
 
 connection.addEventListener("open", () => ($("veil").hidden = view.stats.shown > 0));
@@ -113,7 +129,25 @@ setInterval(() => {
 
 // ------------------------------------------------------------------------------------------------------------- controls
 
-function notice(text, bad = false, code = "") {
+/** A notice that takes the place of the offer before it, and leads to the calibration. */
+function offer(text) {
+  for (const old of document.querySelectorAll(".notice.offer")) old.remove();
+  const box = notice(text);
+  box.classList.add("offer");
+  const button = document.createElement("button");
+  button.textContent = "Calibrate";
+  button.className = "go";
+  button.onclick = () => {
+    box.remove();
+    openTab($("tab-light"));
+    connection.send("calibrate", { step: "start" });
+    $("calibrate").scrollIntoView({ block: "nearest" });
+    $("calibrate").focus({ preventScroll: true });
+  };
+  box.lastElementChild.before(button);
+}
+
+function notice(text, bad = false) {
   const holder = $("notices");
   const old = [...holder.children].find((one) => one.dataset.text === text);
   old?.remove();
@@ -122,11 +156,6 @@ function notice(text, bad = false, code = "") {
   box.dataset.text = text;
   const line = document.createElement("p");
   line.textContent = text;
-  if (code) {
-    const command = document.createElement("code");
-    command.textContent = code;
-    line.append(command);
-  }
   const close = document.createElement("button");
   close.textContent = "×";
   close.setAttribute("aria-label", "Close");
@@ -135,6 +164,7 @@ function notice(text, bad = false, code = "") {
   holder.prepend(box);
   while (holder.children.length > 3) holder.lastElementChild.remove();
   if (bad) setTimeout(() => box.remove(), 9000);
+  return box;
 }
 
 function download(name) {
@@ -220,6 +250,8 @@ $("use-camera").addEventListener("click", async () => {
   }
 });
 $("use-clip").addEventListener("click", () => capture.stop());
+$("calibrate").addEventListener("click", (event) => connection.send("calibrate", { step: event.currentTarget.getAttribute("aria-pressed") === "true" ? "stop" : "start" }));
+$("calibrate-finish").addEventListener("click", () => connection.send("calibrate", { step: "finish" }));
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea, summary")) return;
