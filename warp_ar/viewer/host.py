@@ -745,7 +745,9 @@ class Host:
             self._light = None
             return
         with exclusive(pipeline.device):
-            self._light = np.array(light.numpy())
+            values = np.array(light.numpy())
+        # Black until the ball has been seen once.
+        self._light = values if values.any() else None
 
     def _watch_cost(self, pipeline: Pipeline, image: Image, result: Result, light_ms: float) -> None:
         """Learn what the preset costs; under a budget, turn the knobs that it asks for."""

@@ -25,7 +25,11 @@ export class Light {
     this.#note.textContent = message.known
       ? "Linear light, brought into range: what clips in the camera still shows. Left: as a mirror ball in the camera's view. Right: every direction, up at the top, the marker's right in the middle."
       : "Not captured: no stage of this scene reads it, or the marker has not been seen.";
-    if (!message.known) return;
+    if (!message.known) {
+      this.#map = null;
+      for (const canvas of [this.#latlong, this.#ball]) canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+      return;
+    }
     const picture = await createImageBitmap(new Blob([message.pictures[0]], { type: "image/png" }));
     this.#latlong.width = picture.width;
     this.#latlong.height = picture.height;
