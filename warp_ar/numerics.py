@@ -43,7 +43,9 @@ NUMERICS: dict[str, StageNumerics] = {
         1.3e-05,
         (1, 2, 3, 4, 5, 6, 13, 14, 17, 18),
     ),
-    "bracket": StageNumerics("float32; running means", 2e-6, "a dozen roundings of weights and means", 3e-08, (6, 17)),
+    "bracket": StageNumerics(
+        "float32; running means", 2e-6, "a dozen roundings of weights and means", 3e-08, (4, 6, 7, 17, 18)
+    ),
     "accumulate": StageNumerics(
         "float32; m + a (x - m), exact where x = m",
         1e-5,

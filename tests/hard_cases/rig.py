@@ -118,6 +118,8 @@ def make_quality(**rungs: str) -> Quality:
     return base.with_rungs(**{**switched, **rungs})
 
 
+BRACKET = (1.0, 1.0 / 16.0)
+"""Exposure times between which frames alternate, where a stage calls for it."""
 SOFT = "soft"
 """A way of two stages, tried as one more rung of each: lights with a size, and the most samples along edges."""
 LIGHT_RADIUS = 0.02
@@ -140,13 +142,14 @@ def request_for(stage: str, rung: str) -> Request | None:
         quality = dataclasses.replace(request.quality.with_rungs(light_shadow=SOFT), edge_samples=16)
         return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
     rungs = {} if rung == "default" else {stage: rung}
-    # Some stages run only where another one is on its best rung, some only without a change of exposure.
-    for others in ({}, {one.name: one.rungs[-1] for one in STAGES if len(one.rungs) > 1}):
-        for exposure in (0.7, 1.0):
-            quality = make_quality(**{**others, **rungs})
-            request = Request(make_scene(exposure=Exposure(exposure)), quality, SIZE, ("image", "environment"))
-            if stage in plan_names(make_plan(request)):
-                return request
+    # Some stages run only where another one is on its best rung, some only without a change of exposure, one only
+    # where the frames alternate between exposure times.
+    best = {one.name: one.rungs[-1] for one in STAGES if len(one.rungs) > 1}
+    for others, scale, times in itertools.product(({}, best), (0.7, 1.0), ((), BRACKET)):
+        quality = make_quality(**{**others, **rungs})
+        request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment"), times)
+        if stage in plan_names(make_plan(request)):
+            return request
     return None
 
 
@@ -199,7 +202,12 @@ class Rig:
             request = dataclasses.replace(request, scene=dataclasses.replace(request.scene, **changes))
         self.device = device
         self.pipeline = Pipeline(
-            request.scene, device=device, quality=request.quality, outputs=("image", "environment"), bands=bands
+            request.scene,
+            device=device,
+            quality=request.quality,
+            outputs=("image", "environment"),
+            bands=bands,
+            exposures=request.exposures,
         )
         self.tracker = FixedPose(pose)
         self.pipeline._tracker = self.tracker  # type: ignore[assignment]
@@ -213,8 +221,11 @@ class Rig:
         self.pipeline.close()
 
     def frame(self, image: np.ndarray) -> np.ndarray:
-        """One frame through all stages; returns the picture."""
-        result = self.pipeline(np.ascontiguousarray(image), time_seconds=self.count / 30.0)
+        """One frame through all stages, after one of every shorter exposure if there are any; returns the picture."""
+        image = np.ascontiguousarray(image)
+        for time in self.pipeline.plan.request.exposures[1:]:
+            self.pipeline(image, time_seconds=self.count / 30.0, exposure_time=time)
+        result = self.pipeline(image, time_seconds=self.count / 30.0)
         self.count += 1
         return result.image
 
