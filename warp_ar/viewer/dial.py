@@ -52,6 +52,7 @@ class Dial:
         self._controller: Controller | None = None
         self._key: str | None = None
         self._costs: Costs | None = None
+        self._offer: dict[str, Any] = {}
         self._progress: float | None = None
         self._failed: str | None = None
         self._knobs: tuple[Knob, ...] = ()
@@ -100,7 +101,7 @@ class Dial:
         # Edits change costs as load does; only another scene, its frames' size or an unknown knob ask for a new look.
         key = f"{scene.name} {size}"
         if key != self._key:
-            self._key, self._costs, self._controller = key, None, None
+            self._key = key
             self._knobs = relevant_knobs(scene, size)
             plan = make_plan(dataclasses.replace(pipeline.plan.request, quality=BASE))
             self._cache_key = cost_key(plan, pipeline.device, self._knobs)
@@ -131,7 +132,11 @@ class Dial:
 
     def _adopt(self, costs: Costs | None) -> None:
         self._costs = costs
-        self._controller = None if costs is None else Controller(costs, self._errors, self._last_budget)
+        if costs is None:
+            self._controller, self._offer = None, {}
+            return
+        controller = Controller(costs, self._errors, self._last_budget)
+        self._controller, self._offer = controller, self._list(controller, costs)
 
     def choose(self, milliseconds: float | None, now: float) -> Quality | None:
         """What to run under the budget, or None while that is not known or the dial is off.
@@ -168,14 +173,12 @@ class Dial:
 
     def record(self) -> dict[str, Any]:
         """All that can be bought, as a message for the page. From any thread."""
-        controller, costs = self._controller, self._costs
-        message: dict[str, Any] = {"type": "dial", "measuring": self._progress, "known": controller is not None}
-        if controller is None or costs is None:
-            return message
+        return {"type": "dial", "measuring": self._progress, "known": self._controller is not None, **self._offer}
+
+    def _list(self, controller: Controller, costs: Costs) -> dict[str, Any]:
         names = [knob.name for knob in self._knobs]
         ladders = {knob.name: list(knob.rungs) for knob in self._knobs}
         return {
-            **message,
             "base": costs.base,
             "ladders": ladders,
             "choices": [

@@ -141,6 +141,7 @@ class Server:
         self._viewers: set[_Viewer] = set()
         self._latest: Lit | None = None
         self._jpegs: dict[tuple[int, str], asyncio.Future[bytes]] = {}
+        self._packed_light: tuple[npt.NDArray[np.float32], asyncio.Future[bytes]] | None = None
         self._encode_ms = 0.0
         self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
         self._hands = ThreadPoolExecutor(2, "warp-ar-page")
@@ -323,9 +324,14 @@ class Server:
                 self._tell_all(await self._light_message(light))
 
     async def _light_message(self, light: npt.NDArray[np.float32] | None) -> bytes:
-        loop = asyncio.get_running_loop()
-        data = b"" if light is None else await loop.run_in_executor(self._encoder, encode_light, light)
-        return protocol.pack({"type": "light", "known": light is not None}, data)
+        """The room's light as a picture, packed once for all who ask."""
+        if light is None:
+            return protocol.pack({"type": "light", "known": False}, b"")
+        if self._packed_light is None or self._packed_light[0] is not light:
+            packing = asyncio.get_running_loop().run_in_executor(self._encoder, encode_light, light)
+            self._packed_light = (light, packing)
+        data = await asyncio.shield(self._packed_light[1])
+        return protocol.pack({"type": "light", "known": True}, data)
 
     # --------------------------------------------------------------------------------------------------------- viewers
 

@@ -28,8 +28,8 @@ connection.addEventListener("hello", ({ detail }) => {
   $("scene-name").replaceChildren(...detail.scenes.map((name) => new Option(name, name)));
   const group = document.createElement("optgroup");
   group.label = "another preset";
-  group.append(...detail.presets.map((name) => new Option(name, name)));
-  $("compare").replaceChildren(new Option("nothing", ""), new Option("camera", "camera"), group);
+  group.append(...detail.presets.map((name) => new Option(`Split: ${name}`, name)));
+  $("compare").replaceChildren(new Option("Split: off", ""), new Option("Split: camera", "camera"), group);
   quality.presets = detail.presets;
 });
 
