@@ -1,0 +1,347 @@
+"""Where a mirror ball stands, to a fraction of a millimetre, from what it mirrors of the desk around it.
+
+A ball's outline is a poor edge to measure by: at the rim a mirror reflects what lies right behind it, nearly at full
+strength, so that the outline is a step of some percent, and the reflections that crowd inside it are far stronger. The
+same reflections say more. A ray from the camera to the ball goes on to the desk, whose picture the same frame holds; so
+for a ball at c every pixel x of it that mirrors a visible point of a proxy has a prediction,
+
+    I(x) = reflectance * I(project(hit(x, c))),
+
+linear, for surfaces that scatter light alike to all sides. The printed card beside the ball is full of edges, and they
+move by some pixels per millimetre in every direction, height included. The centre is what makes the residuals e, taken
+between square roots of radiance, least under a cost that redescends (Geman-McClure, rho = e^2 / (e^2 + s^2)): clutter
+that the scene leaves out, shine and shadows are outvoted. Gauss-Newton with numerical derivatives, s and the steps
+shrinking. The camera sees the desk far larger than the ball does, so it is blurred before it is compared.
+
+Along the line of sight the centre is determined least: there, edges move slowly. But a ball stands on something, and
+its height is better known than its place; so the height as given has a say, ``HEIGHT_COST``.
+
+Confidence comes from the curvature at the end: (sigma^2 + ``UNMODELLED``^2) (J^T W J)^-1, times ``CORRELATED`` because
+neighbouring samples share pixels and errors of the model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.geometry import rotation_matrix
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Camera, Probe, Proxy
+from warp_ar.tracking import Pose
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+BLURS = ((2.0, 8.0), (0.0, 3.0))
+"""Pixels: standard deviations by which ball and desk are blurred, for the search and for the fit. The ball shows the
+desk about a tenth as large."""
+SEARCH_STEP = 2e-3
+"""Metres between places that are tried first; edges blurred by 8 pixels lead from there."""
+SEARCH_HEIGHT = 4e-3
+"""Metres up and down that are tried: a ball stands on something, so its height is better known."""
+SEARCH_ACROSS = 24
+"""Samples across the ball while searching."""
+STARTS = 4
+"""Places that the fit starts from."""
+SCALES = (0.1, 0.05)
+"""Residuals, in square roots of camera values, at which a sample has half its say; stage by stage."""
+STEPS = 8
+"""Most Gauss-Newton steps of one stage."""
+DONE = 2e-5
+"""Metres: a shorter step ends a stage."""
+LONGEST = 4e-3
+"""Metres: no step is longer, for the edges are thinner."""
+DIFFERENCE = 2e-4
+"""Metres by which the centre is moved for derivatives."""
+ACROSS = 60
+"""Samples across the ball at most."""
+RIM = 0.97
+"""Share of the ball's radius within which samples lie: beyond, what is behind it shines in."""
+FEWEST = 200
+"""Samples without which nothing is said."""
+HEIGHT_COST = 8e3
+"""Cost per square metre of leaving the height as given: 0.008 for 1 mm."""
+CORRELATED = 50.0
+"""How many neighbouring samples count as one."""
+MOST_DEVIATION = 6e-4
+"""Metres: a worse fit is no improvement on a ruler."""
+MOST_ERROR = 0.28
+"""Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 to 0.6 in wrong places."""
+DESK = Proxy("plane", size=(2.0, 2.0))
+"""What is taken to lie around the marker where a scene models nothing."""
+UNMODELLED = 0.02
+"""Square root of radiance: what even a perfect match may be off by, such as shine; a plain desk determines nothing."""
+_BOUND = 1e-4
+"""Metres, and share of the distance: tolerance of what hides a point from the camera."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BallFit:
+    """Where a ball was found."""
+
+    center: Array
+    """World, metres, (3,)."""
+    deviation: float
+    """Standard deviation along the worst axis, metres."""
+    error: float
+    """Mean cost there, 0 (all samples agree) to 1 (none does)."""
+    error_before: float
+    """The same where the search began."""
+    samples: int
+    """Pixels that had a say."""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether it is determined, and explains the frames."""
+        return self.deviation < MOST_DEVIATION and self.error < MOST_ERROR and self.error <= self.error_before
+
+
+class _View:
+    """One frame, prepared for looking things up."""
+
+    def __init__(self, image: Image, pose: Pose, camera: Camera, table: NDArray[np.float32]) -> None:
+        self.pose, self.camera = pose, camera
+        inverse = pose.inverse()
+        self.eye, self._world_from_camera = inverse.translation, inverse.rotation
+        linear = np.stack([table[image[..., channel], channel] for channel in range(3)], -1)
+        clipped = (image >= 254).any(-1).astype(np.float32)
+        linear = np.dstack([linear, clipped**2])
+        self.coarse, self.fine = (
+            tuple(np.sqrt(cv2.GaussianBlur(linear, (0, 0), blur) if blur else linear) for blur in blurs)
+            for blurs in BLURS
+        )
+
+    def sample(self, picture: Any, pixels: Array) -> Array:
+        """Square roots of radiance and of the share at clipping, (n, 4)."""
+        if not len(pixels):
+            return np.zeros((0, 4))
+        x, y = pixels.astype(np.float32).T
+        return np.asarray(
+            cv2.remap(picture, x[None], y[None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0], np.float64
+        )
+
+    def rays(self, pixels: Array) -> Array:
+        """Unit directions in the world, (n, 3)."""
+        camera = self.camera
+        flat = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        if any(camera.distortion):
+            flat = cv2.undistortPoints(pixels[:, None], camera.matrix(), np.array(camera.distortion))[:, 0]
+        d = np.column_stack([flat, np.ones(len(flat))])
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        return np.asarray(d @ self._world_from_camera.T, np.float64)
+
+    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (n, 2) of world points, and which of them lie inside the frame."""
+        camera = self.camera
+        local = self.pose.apply(points)
+        front = local[:, 2] > 1e-3
+        local[~front] = (0.0, 0.0, 1.0)
+        pixels = local[:, :2] / local[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        if any(camera.distortion):
+            origin = np.zeros(3)
+            pixels = cv2.projectPoints(local, origin, origin, camera.matrix(), np.array(camera.distortion))[0][:, 0]
+        inside = ((pixels > 2) & (pixels < (camera.width - 3, camera.height - 3))).all(1)
+        return np.asarray(pixels, np.float64), front & inside
+
+    def disc(self, center: Array, radius: float, across: int) -> Array:
+        """Pixels of samples on a ball, (n, 2)."""
+        c = self.pose.apply(center)
+        if c[2] < 2 * radius:
+            return np.zeros((0, 2))
+        middle, _ = self.project(center[None])
+        reach = self.camera.fx * radius / c[2]
+        grid = np.linspace(-RIM, RIM, int(np.clip(2 * reach, 8, across)))
+        x, y = np.meshgrid(grid, grid)
+        inside = x**2 + y**2 < RIM**2
+        pixels = middle + reach * np.column_stack([x[inside], y[inside]])
+        edge = (self.camera.width - 2, self.camera.height - 2)
+        return np.asarray(pixels[((pixels > 1) & (pixels < edge)).all(1)], np.float64)
+
+
+class _Desk:
+    """Planes and boxes that rays can meet, and the other balls, which hide them."""
+
+    def __init__(self, proxies: Sequence[Proxy], others: Sequence[Probe]) -> None:
+        known = [proxy for proxy in proxies if proxy.shape in ("plane", "box")]
+        self._shapes = [
+            (np.array(p.at), rotation_matrix(p.rotate), 0.5 * np.array([*p.size[:2], *(p.size[2:] or (0.0,))]))
+            for p in (known or [DESK])
+        ]
+        self._others = [(np.array(probe.center), probe.radius) for probe in others]
+
+    def trace(self, origin: Array, direction: Array) -> Array:
+        """Distance to the nearest plane or box, (n,), infinite where there is none or another ball is before it."""
+        nearest = np.full(len(direction), np.inf)
+        for at, rotation, half in self._shapes:
+            o, d = (origin - at) @ rotation, direction @ rotation
+            with np.errstate(divide="ignore", invalid="ignore"):
+                if half[2] == 0.0:
+                    t = -o[:, 2] / d[:, 2]
+                    p = o + t[:, None] * d
+                    hit = (np.abs(p[:, :2]) <= half[:2]).all(1)
+                else:
+                    a, b = (-half - o) / d, (half - o) / d
+                    t, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+                    hit = t <= leave
+            nearest = np.where(hit & (t > 1e-6) & (t < nearest), t, nearest)
+        for center, radius in self._others:
+            nearest[_meet_ball(center, radius, origin, direction) < nearest] = np.inf
+        return nearest
+
+
+def _meet_ball(center: Array, radius: float, origin: Array, direction: Array) -> Array:
+    """Distance along unit directions to a ball, infinite where it is missed."""
+    o = origin - center
+    b = (o * direction).sum(-1)
+    disc = b**2 - (o**2).sum(-1) + radius**2
+    t = -b - np.sqrt(np.maximum(disc, 0.0))
+    return np.where((disc > 0.0) & (t > 0.0), t, np.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is compared."""
+
+    views: Sequence[_View]
+    probe: Probe
+    desk: _Desk
+    is_coarse: bool = False
+
+    def pixels(self, view: _View, center: Array) -> Array:
+        """Samples on the ball in one view."""
+        return view.disc(center, self.probe.radius, SEARCH_ACROSS if self.is_coarse else ACROSS)
+
+    def residuals(self, view: _View, center: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Seen less predicted, (n, 3), and which pixels have a prediction."""
+        radius = self.probe.radius
+        direction = view.rays(pixels)
+        eye = np.broadcast_to(view.eye, direction.shape)
+        t = _meet_ball(center, radius, eye, direction)
+        told = np.isfinite(t)
+        point = eye + np.where(told, t, 1.0)[:, None] * direction
+        normal = (point - center) / radius
+        mirrored = direction - 2.0 * (direction * normal).sum(-1, keepdims=True) * normal
+        s = self.desk.trace(point, mirrored)
+        told &= np.isfinite(s)
+        hit = point + np.where(told, s, 1.0)[:, None] * mirrored
+        seen, inside = view.project(hit)
+        told &= inside
+        away = hit - eye
+        distance = np.linalg.norm(away, axis=1)
+        away /= np.maximum(distance, 1e-9)[:, None]
+        # The ball with a margin: it bleeds into what is blurred.
+        told &= _meet_ball(center, 1.1 * radius, eye, away) > distance
+        told &= self.desk.trace(eye, away) > distance * (1.0 - _BOUND) - _BOUND
+        of_ball, of_desk = view.coarse if self.is_coarse else view.fine
+        ball = view.sample(of_ball, pixels)
+        wanted = view.sample(of_desk, np.where(told[:, None], seen, 0.0))
+        told &= (ball[:, 3] < 0.1) & (wanted[:, 3] < 0.1)
+        return ball[:, :3] - wanted[:, :3] * np.sqrt(self.probe.reflectance), told
+
+    def cost(self, center: Array, scale: float) -> tuple[float, int]:
+        """Mean of rho over all samples, and how many there are."""
+        total, count = 0.0, 0
+        for view in self.views:
+            e, told = self.residuals(view, center, self.pixels(view, center))
+            squared = (e[told] ** 2).mean(1)
+            total += float((squared / (squared + scale**2)).sum())
+            count += len(squared)
+        height = center[2] - self.probe.center[2]
+        return (total / count if count else 1.0) + HEIGHT_COST * height**2, count
+
+    def normal_equations(self, center: Array, scale: float) -> tuple[Array, Array, float]:
+        """J^T W J (3, 3), J^T W e (3,), and the weighted variance of a residual."""
+        matrix, vector = np.zeros((3, 3)), np.zeros(3)
+        squares, weights, count = 0.0, 0.0, 0
+        for view in self.views:
+            pixels = self.pixels(view, center)
+            e, told = self.residuals(view, center, pixels)
+            columns = []
+            for axis in np.eye(3):
+                ahead, told_ahead = self.residuals(view, center + DIFFERENCE * axis, pixels)
+                behind, told_behind = self.residuals(view, center - DIFFERENCE * axis, pixels)
+                columns.append((ahead - behind) / (2.0 * DIFFERENCE))
+                told = told & told_ahead & told_behind
+            jacobian, e = np.stack(columns, -1)[told], e[told]
+            weight = (scale**2 / (scale**2 + (e**2).mean(1))) ** 2
+            matrix += np.einsum("n,nci,ncj->ij", weight, jacobian, jacobian)
+            vector += np.einsum("n,nci,nc->i", weight, jacobian, e)
+            squares += float((weight * (e**2).mean(1)).sum())
+            weights += float(weight.sum())
+            count += len(e)
+        matrix[2, 2] += count * scale**2 * HEIGHT_COST
+        vector[2] += count * scale**2 * HEIGHT_COST * (center[2] - self.probe.center[2])
+        return matrix, vector, squares / max(weights, 1e-12)
+
+    def descend(self, center: Array, scale: float) -> Array:
+        """Gauss-Newton, its steps shortened until they lower the cost."""
+        cost, count = self.cost(center, scale)
+        for _ in range(STEPS):
+            matrix, vector, _ = self.normal_equations(center, scale)
+            step = -np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(3), vector)
+            step *= min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-12))
+            for _ in range(4):
+                # Fewer samples are cheaper to explain: the ball must not turn its back on the desk.
+                better, left = self.cost(center + step, scale)
+                if better < cost and left >= 0.8 * count:
+                    break
+                step *= 0.4
+            else:
+                return center
+            center, cost = center + step, better
+            if np.linalg.norm(step) < DONE:
+                break
+        return center
+
+
+def fit_ball(
+    frames: Sequence[tuple[Image, Pose]],
+    camera: Camera,
+    probe: Probe,
+    proxies: Sequence[Proxy] = (),
+    others: Sequence[Probe] = (),
+    *,
+    search: float = 0.01,
+) -> BallFit | None:
+    """Find a ball near where it is said to be.
+
+    Args:
+        frames: uint8 RGB pictures with ``camera_from_world``; one is enough, several from different sides are better.
+        camera: The camera of all of them.
+        probe: The ball: a rough centre, the radius and the reflectance.
+        proxies: What stands on the desk; without planes or boxes a desk at the marker's height is assumed.
+        others: Other balls.
+        search: Metres around the rough centre, along x and y, in which the ball is looked for.
+
+    Returns:
+        The fit, or None where too little of the desk is mirrored; look at ``is_good`` before believing it.
+    """
+    table = decode_table(camera.transfer)
+    views = [_View(image, pose, camera, table) for image, pose in frames]
+    coarse = _Task(views, probe, _Desk(proxies, others), is_coarse=True)
+    fine = dataclasses.replace(coarse, is_coarse=False)
+    start: Array = np.array(probe.center, np.float64)
+    before, count = fine.cost(start, SCALES[-1])
+    if count < FEWEST:
+        return None
+    steps = np.arange(-round(search / SEARCH_STEP), round(search / SEARCH_STEP) + 1)
+    heights = np.arange(-round(SEARCH_HEIGHT / SEARCH_STEP), round(SEARCH_HEIGHT / SEARCH_STEP) + 1)
+    places = start + SEARCH_STEP * np.stack(np.meshgrid(steps, steps, heights), -1).reshape(-1, 3)
+    ranked = places[np.argsort([coarse.cost(place, SCALES[0])[0] for place in places])]
+    found: list[tuple[float, int, Array]] = []
+    for place in [start, *ranked[: STARTS - 1]]:
+        center = place if place is start else coarse.descend(place, SCALES[0])
+        for scale in SCALES:
+            center = fine.descend(center, scale)
+        found.append((*fine.cost(center, SCALES[-1]), center))
+    error, samples, center = min(found, key=lambda one: one[0])
+    matrix, _, variance = fine.normal_equations(center, SCALES[-1])
+    worst = float(np.linalg.eigvalsh(matrix)[0])
+    deviation = float(np.sqrt(CORRELATED * (variance + UNMODELLED**2) / worst)) if worst > 0.0 else np.inf
+    return BallFit(center, deviation, error, before, samples)
