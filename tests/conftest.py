@@ -37,6 +37,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     for item in items:
         item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
+    atlas.collected[:] = items
     if config.getoption("--atlas"):
         atlas.write_collection(items, config.getoption("--atlas"))
 

@@ -227,10 +227,19 @@ def cells_of(item: Any) -> list[Cell]:
     return found
 
 
-def write_collection(items: Iterable[Any], path: pathlib.Path) -> None:
-    """Write which tests cover which cells, as JSON {"row/stage/rung": [test, ...]}."""
+collected: list[Any] = []
+"""Tests of this run, before any is left out; ``tests/conftest.py`` notes them."""
+
+
+def coverage(items: Iterable[Any]) -> dict[str, list[str]]:
+    """Which tests cover which cells: {"row/stage/rung": [test, ...]}."""
     table: dict[str, list[str]] = {}
     for item in items:
         for row, stage, rung in cells_of(item):
             table.setdefault(f"{row}/{stage}/{rung}", []).append(item.nodeid)
-    path.write_text(json.dumps(table, indent=1))
+    return table
+
+
+def write_collection(items: Iterable[Any], path: pathlib.Path) -> None:
+    """Write ``coverage`` as JSON."""
+    path.write_text(json.dumps(coverage(items), indent=1))
