@@ -226,6 +226,8 @@ class Pipeline:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
         if self._renderer is not None:
             self._renderer.shutdown()
+        if self._transfers is not None:
+            self._transfers.close()
         self._scheduler.close()
 
     @property

@@ -11,7 +11,9 @@ takes the host longer than all the rest.
 from __future__ import annotations
 
 import collections
+import itertools
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,12 @@ SLOTS = 3
 KEPT = 8
 """Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
 
+
+COPY_THREADS = 4
+"""Threads that copy a large frame into pinned memory."""
+
+COPY_BYTES = 12_000_000
+"""From which on that pays for handing parts over; a smaller frame's copy is no longer than its kernels."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
@@ -78,6 +86,8 @@ class Transfers:
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
+        large = 3 * shape[0] * shape[1] >= COPY_BYTES
+        self._pool = ThreadPoolExecutor(COPY_THREADS - 1, "warp_ar-copy") if large else None
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
         self._free: collections.deque[tuple[Any, Image, Any]] = collections.deque()
@@ -88,6 +98,22 @@ class Transfers:
     def _new_buffer(self) -> tuple[Any, Image, Any]:
         pinned = wp.zeros(self._shape, dtype=wp.vec3ub, device="cpu", pinned=True)
         return pinned, pinned.numpy(), wp.Event(self._device)
+
+    def close(self) -> None:
+        """Stop the copying threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def _copy(self, target: Image, source: Image) -> None:
+        if self._pool is None:
+            np.copyto(target, source)
+            return
+        edges = [len(source) * part // COPY_THREADS for part in range(COPY_THREADS + 1)]
+        parts = [slice(*pair) for pair in itertools.pairwise(edges)]
+        others = [self._pool.submit(np.copyto, target[part], source[part]) for part in parts[1:]]
+        np.copyto(target[parts[0]], source[parts[0]])
+        for other in others:
+            other.result()
 
     def upload(self, image: Image) -> Slot:
         """Send a host picture on its way; when this returns, the caller may write it anew.
@@ -102,7 +128,7 @@ class Transfers:
         slot.marks = self._marks[self._uploads % MARKED]
         slot.marks.frame = self._uploads
         self._uploads += 1
-        np.copyto(slot.host, image)
+        self._copy(slot.host, image)
         self._up.record_event(slot.marks.sent)
         wp.copy(slot.frame, slot.pinned, stream=self._up)
         self._up.record_event(slot.marks.arrived)
