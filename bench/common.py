@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_ar.device import capturing
+
 WARM_UP = 3
 RUNS = 30
 
@@ -68,7 +70,7 @@ def measure(functions: Mapping[str, Callable[[], object]], device: Any, runs: in
 
 def _captured(function: Callable[[], object], device: Any) -> Callable[[], object]:
     function()
-    with wp.ScopedCapture(device=device) as capture:
+    with capturing(), wp.ScopedCapture(device=device) as capture:
         function()
     return lambda: wp.capture_launch(capture.graph)
 

@@ -293,6 +293,8 @@ def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
 
 GATHER_LANES = 8
 """Threads that share a texel's samples on CUDA; on CPU one has them all."""
+FEW_TEXELS = 16384
+"""Texels up to which they do; each of more is small in the frame, and has few samples."""
 
 
 @wp.func_native("""
@@ -482,8 +484,10 @@ def gather_probe(
     Raises:
         ValueError: There is no such rung.
     """
-    # A texel has one sample but at the rung that averages.
-    lanes = GATHER_LANES if rung == "area" and radiance_out.device.is_cuda else 1
+    # A texel has one sample but at the rung that averages. Many texels keep a device busy by themselves.
+    lanes = 1
+    if rung == "area" and radiance_out.device.is_cuda:
+        lanes = GATHER_LANES if radiance_out.size <= FEW_TEXELS else 2
     launch_rows(
         make_gather_probe_kernel(rung),
         (*radiance_out.shape, lanes),

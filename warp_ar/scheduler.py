@@ -8,6 +8,7 @@ order first, so that nobody waits for a pass that cannot be split, or for the la
 
 from __future__ import annotations
 
+import bisect
 import collections
 import dataclasses
 import itertools
@@ -318,7 +319,7 @@ class SideBySide:
         self._stages = {stage.name: _Running(stage, steps, counts[stage.name]) for stage, steps in scheduler._stages}
         self._timings: dict[str, StageTiming] = {}
         self._open = len(self._stages)
-        self._ready: list[_Running] = []
+        self._ready: list[_Running] = []  # in the stages' order
         self._error: BaseException | None = None
 
     def run(self) -> dict[str, StageTiming]:
@@ -349,7 +350,8 @@ class SideBySide:
             return
         running.versions = versions
         running.left.extend(_due_passes(running.stage, running.steps))
-        self._ready.append(running)
+        order = self._scheduler._order
+        bisect.insort(self._ready, running, key=lambda other: order[other.stage.name])
         self._advance(running)
 
     def _advance(self, running: _Running) -> None:
@@ -374,40 +376,36 @@ class SideBySide:
 
     def _work(self) -> None:
         """Take bands until no stage is left."""
-        while True:
-            with self._changed:
-                while (chosen := self._choose()) is None:
-                    if self._open == 0 or self._error is not None:
-                        return
+        clock = self._scheduler.clock
+        with self._changed:
+            while self._error is None and self._open:
+                chosen = next((running for running in self._ready if running.bands), None)
+                if chosen is None:
                     self._changed.wait()
-                rows = chosen.bands.popleft()
+                    continue
+                rows, step = chosen.bands.popleft(), chosen.step
                 chosen.out += 1
-                step = chosen.step
-            assert step is not None
-            start = self._scheduler.clock()
-            error: BaseException | None = None
-            try:
-                self._scheduler._launch_band(step, rows)
-            except BaseException as caught:  # handed to the thread that asked for the frame
-                error = caught
-            spent = self._scheduler.clock() - start
-            with self._changed:
-                chosen.out -= 1
+                assert step is not None
+                self._changed.release()
+                start = clock()
+                error: BaseException | None = None
+                try:
+                    self._scheduler._launch_band(step, rows)
+                except BaseException as caught:  # handed to the thread that asked for the frame
+                    error = caught
+                spent = clock() - start
+                self._changed.acquire()
                 chosen.seconds += spent
-                if error is None and self._error is None and not chosen.bands and chosen.out == 0:
+                chosen.out -= 1
+                if error is None and not chosen.bands and chosen.out == 0 and self._error is None:
                     try:
                         self._advance(chosen)
                     except BaseException as caught:
                         error = caught
-                self._error = self._error or error
-                self._changed.notify_all()
-
-    def _choose(self) -> _Running | None:
-        """The first stage in order that has a band left."""
-        if self._error is not None:
-            return None
-        order = self._scheduler._order
-        return min((r for r in self._ready if r.bands), key=lambda r: order[r.stage.name], default=None)
+                    self._changed.notify_all()
+                if error is not None:
+                    self._error = self._error or error
+                    self._changed.notify_all()
 
 
 def _make_marks(device: Any) -> tuple[Any, Any]:
