@@ -99,11 +99,16 @@ def test_what_clips_comes_from_a_shorter_exposure(device):
     assert (share == 0).all()
 
 
-def test_around_a_lamp_one_exposure_has_the_say(device):
-    """The short exposure shows the lamp a texel beside the place where the long one clips: its energy is kept."""
+@pytest.mark.parametrize("turn", [0, 32, 33])
+def test_around_a_lamp_one_exposure_has_the_say(device, turn):
+    """The short exposure shows the lamp a texel beside the place where the long one clips: its energy is kept.
+
+    In the middle of the map, and where the lamp lies on the seam or one of the two ends beside it.
+    """
     light = np.full((32, 64, 3), 0.1)
     beside = light.copy()
     light[16, 30:32], beside[16, 31:33] = 60.0, 60.0
+    light, beside = np.roll(light, turn, axis=1), np.roll(beside, turn, axis=1)
     values, clipped = expose(light)
     moved, moved_clipped = expose(beside)
     values[1:], clipped[1:] = moved[1:], moved_clipped[1:]

@@ -86,6 +86,14 @@ MUTATIONS = (
         "tests/test_pyramid.py::test_sampling_follows_a_ramp_without_a_shift",
     ),
     Mutation(
+        4,
+        "what clips beyond the seam is not seen from this side of it",
+        "kernels/bracket.py",
+        "(j + offset + width) % width",
+        "wp.clamp(j + offset, 0, width - 1)",
+        "tests/test_bracket.py::test_around_a_lamp_one_exposure_has_the_say",
+    ),
+    Mutation(
         5,
         "the frame of a normal at -z divides by zero",
         "kernels/sampling.py",
@@ -126,6 +134,14 @@ MUTATIONS = (
         "tests/test_environment.py::test_no_drift_over_ten_thousand_frames",
     ),
     Mutation(
+        7,
+        "a scale that became NaN stays NaN",
+        "kernels/exposure.py",
+        "    if before > 0.0:\n        aim = before",
+        "    if before != 0.0:\n        aim = before",
+        f"{HARD}test_row07_accumulation.py::test_an_automatic_exposure_that_was_spoilt_heals",
+    ),
+    Mutation(
         8,
         "1 - cos^2 instead of sin^2 at the peak of a mirror-like lobe",
         "kernels/materials.py",
@@ -150,6 +166,14 @@ MUTATIONS = (
         "tests/test_relight.py::test_paper_is_exact_at_its_three_cases",
     ),
     Mutation(
+        10,
+        "the strongest light of an even room dominates it",
+        "kernels/environment.py",
+        "light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)",
+        "light.dominance = alone",
+        "tests/test_environment.py::test_a_lamp_in_a_uniform_room_dominates_by_twice_its_share",
+    ),
+    Mutation(
         11,
         "boxes look one row too far up",
         "kernels/summed_area.py",
@@ -164,6 +188,14 @@ MUTATIONS = (
         "    scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)\n",
         "    scale_out[0] = wp.clamp(params[0].exposure_scale, 0.0, 1.0)\n",
         f"{HARD}test_rows11_12_exposure.py::test_exposures_at_their_ends",
+    ),
+    Mutation(
+        12,
+        "a clipped channel is estimated below clipping",
+        "kernels/declip.py",
+        "wp.clamp(k * hue[channel], radiance[channel], BRIGHTEST)",
+        "wp.min(k * hue[channel], BRIGHTEST)",
+        "tests/test_declip.py::test_never_below_clipping",
     ),
     Mutation(
         13,
