@@ -363,8 +363,46 @@ def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Pat
     assert np.abs(lit - tab.pixels(*place[:2])).mean() > UNCHANGED
     page.evaluate(split, 500)
     page.screenshot(path=artefacts / "camera.png")
+    page.click("#play")
+    # Its focal length was guessed, then estimated; the page offers to measure it.
+    tab.until("!!document.querySelector('.notice.offer .go')", "the offer to calibrate")
+    page.click(".notice.offer .go")
+    tab.until("!document.getElementById('coverage').hidden", "the fields that the board should reach")
+    page.screenshot(path=artefacts / "calibration.png")
+    page.click("#calibrate")
+    tab.until("document.getElementById('coverage').hidden")
     page.click("#use-clip")
     tab.until("warpAr.state.camera === false")
+
+
+# A camera whose pictures change their shape, as a phone's do.
+TURNING = """() => {
+  const canvas = document.createElement("canvas");
+  const shape = (width, height) => ([canvas.width, canvas.height] = [width, height]);
+  const context = canvas.getContext("2d");
+  setInterval(() => {
+    context.fillStyle = `hsl(${(performance.now() / 10) % 360} 50% 50%)`;
+    context.fillRect(0, 0, canvas.width, canvas.height);
+  }, 20);
+  shape(640, 480);
+  navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
+  window.turn = () => shape(480, 640);
+  window.lost = 0;
+  warpAr.connection.addEventListener("lost", () => (window.lost += 1));
+}"""
+
+
+def test_a_phone_that_is_turned(open_tab: Callable[..., Tab]) -> None:
+    tab = open_tab()
+    tab.page.evaluate(TURNING)
+    tab.page.click("#use-camera")
+    tab.until("warpAr.view.stats.stamped && warpAr.camera.width === 640 && warpAr.camera.height === 480")
+    tab.page.evaluate("turn()")
+    tab.until("warpAr.camera.width === 480 && warpAr.camera.height === 640", "upright pictures")
+    tab.shown(3)
+    canvas = tab.page.evaluate("[document.getElementById('canvas').width, document.getElementById('canvas').height]")
+    assert canvas == [480, 640]
+    assert tab.page.evaluate("lost") == 0, "a picture of the old shape cost the connection"
 
 
 @pytest.mark.parametrize("options", [["--tls", "--token", "abc123"]])
