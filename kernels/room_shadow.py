@@ -62,6 +62,10 @@ NOISE = wp.constant(wp.float32(1.0))
 """The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 """Change of the room's light that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+MAX_PARTS = 8
+"""Threads of a CUDA device that share the samples of a cell at most."""
+ENOUGH_THREADS = 1 << 20
+"""Threads from which more of them make a CUDA device no faster."""
 CPU_RUN = 32
 """Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 WARP_LANES = 32
@@ -100,6 +104,8 @@ class RoomShadowConfig:
     """Whether objects reflect light onto the desk."""
     near: bool = False
     """Whether some samples are lamps at a known distance."""
+    parts: int = 1
+    """Threads that share the samples of a cell: a divisor of count and of 64."""
 
 
 @wp.func
@@ -279,6 +285,26 @@ def make_seen_proxy(config: RoomConfig) -> wp.Function:
     return seen_proxy
 
 
+@wp.func
+def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
+    """Share of the room's light that is left, and the depth beside it."""
+    ratio = wp.vec4(1.0, 1.0, 1.0, depth)
+    for channel in range(3):
+        if without[channel] > MIN_IRRADIANCE:
+            ratio[channel] = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
+    return ratio
+
+
+@wp.func
+def bounced_of(without: wp.vec3, sent: wp.vec3) -> wp.vec3:
+    """What objects send, relative to the room's light."""
+    ratio = wp.vec3(0.0)
+    for channel in range(3):
+        if without[channel] > MIN_IRRADIANCE:
+            ratio[channel] = wp.min(sent[channel] / without[channel], MAX_RATIO)
+    return ratio
+
+
 @functools.cache
 def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
@@ -293,6 +319,9 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
     side = config.side
     chunk = min(config.count, CHUNK)
+    if chunk % config.parts:
+        raise ValueError(f"parts is {config.parts}; expected a divisor of {chunk}")
+    kinds = sum_kinds(config.bounce)
 
     @wp.kernel(module="unique", enable_backward=False)
     def room_shadow_kernel(
@@ -314,9 +343,14 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         bounced_out: wp.array2d[wp.vec3],
         surface_out: wp.array2d[wp.int32],
         shaded_out: wp.array2d[wp.int32],
+        sums_out: wp.array3d[wp.vec3],
     ):
         i, j = wp.tid()
         i += row_start
+        part = wp.int32(0)
+        if wp.static(config.parts > 1):
+            part = i / surface_out.shape[0]
+            i = i % surface_out.shape[0]
         # Neighbouring threads take the cells of one set, so that their rays go the same way.
         group = lanes * side
         place = j % group
@@ -338,6 +372,9 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
         if wp.static(config.bounce):
             bounced_out[i, j] = wp.vec3(0.0)
+        if wp.static(config.parts > 1):
+            for kind in range(wp.static(kinds)):
+                sums_out[part * wp.static(kinds) + kind, i, j] = wp.vec3(0.0)
 
         point = hit.point
         own = hit.shape
@@ -347,8 +384,8 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         sent = wp.vec3(0.0)
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = samples.shape[0] / wp.static(side * side) * ((i % side) * side + j % side)
-        for part in range(wp.static(config.count // chunk)):
-            at = first + part * wp.static(chunk)
+        for block in range(wp.static(config.count // chunk)):
+            at = first + block * wp.static(chunk)
             virtual_mask = wp.uint64(0)
             for index in range(scene.objects.shape[0]):
                 shape = scene.objects[index]
@@ -377,9 +414,10 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                     )
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | proxy_mask | ball_mask
-            bit = wp.uint64(1)
-            stop = wp.int32(wp.static(chunk))  # a loop: unrolled, the kernel would hold its rays many times over
-            for k in range(stop):
+            begin = part * wp.static(chunk // config.parts)
+            bit = wp.uint64(1) << wp.uint64(begin)
+            # Its end is no constant: unrolled, the kernel would hold its rays many times over.
+            for k in range(begin, begin + wp.int32(wp.static(chunk // config.parts))):
                 direction = directions[at + k]
                 reach = float(FAR)
                 grown = float(1.0)
@@ -435,18 +473,44 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
         if shaded_out.shape[0] > 0 and not unchanged:
             shaded_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
-        ratio = wp.vec4(1.0, 1.0, 1.0, hit.t)
-        for channel in range(3):
-            if without[channel] > MIN_IRRADIANCE:
-                ratio[channel] = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
-                sent[channel] = wp.min(sent[channel] / without[channel], MAX_RATIO)
-            else:
-                sent[channel] = 0.0
-        ratio_out[i, j] = ratio
-        if wp.static(config.bounce):
-            bounced_out[i, j] = sent
+        if wp.static(config.parts > 1):
+            sums_out[part * wp.static(kinds), i, j] = without
+            sums_out[part * wp.static(kinds) + 1, i, j] = hidden
+            if wp.static(config.bounce):
+                sums_out[part * wp.static(kinds) + 2, i, j] = sent
+        else:
+            ratio_out[i, j] = ratio_of(without, hidden, hit.t)
+            if wp.static(config.bounce):
+                bounced_out[i, j] = bounced_of(without, sent)
 
     return room_shadow_kernel
+
+
+@wp.kernel(enable_backward=False)
+def join_parts_kernel(
+    # In:
+    surface: wp.array2d[wp.int32],
+    sums: wp.array3d[wp.vec3],
+    kinds: wp.int32,
+    # Out:
+    ratio_out: wp.array2d[wp.vec4],
+    bounced_out: wp.array2d[wp.vec3],
+):
+    """Estimates of cells whose samples several threads shared."""
+    i, j = wp.tid()
+    if surface[i, j] < 0:
+        return
+    without = wp.vec3(0.0)
+    hidden = wp.vec3(0.0)
+    sent = wp.vec3(0.0)
+    for part in range(sums.shape[0] / kinds):
+        without += sums[part * kinds, i, j]
+        hidden += sums[part * kinds + 1, i, j]
+        if kinds > 2:
+            sent += sums[part * kinds + 2, i, j]
+    ratio_out[i, j] = ratio_of(without, hidden, ratio_out[i, j][3])
+    if kinds > 2:
+        bounced_out[i, j] = bounced_of(without, sent)
 
 
 @wp.func
@@ -637,6 +701,7 @@ def shade_room(
     surface_out: wp.array2d[wp.int32],
     *,
     shaded_out: wp.array2d[wp.int32] | None = None,
+    sums_out: wp.array3d[wp.vec3] | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
@@ -657,18 +722,41 @@ def shade_room(
         bounced_out: (the same) what objects send there, relative to the room's light; needed if ``config.bounce``.
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
+        sums_out: Scratch of ``sums_shape``; needed if ``config.parts`` is not 1, and then ``rows`` must be None.
         rows: Band of rows of the outputs; None means all.
     """
     # Few short rays gain less from it than they lose by writing far apart: 2.4 against 2.8 ms for a frame of 4K.
     lanes = WARP_LANES if config.bounce and not rays.device.is_cpu else 1
+    cells = ratio_out.shape
     launch_rows(
         make_room_shadow_kernel(config),
-        ratio_out.shape,
+        (cells[0] * config.parts, cells[1]),
         [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride, lanes],
-        [ratio_out, bounced_out, surface_out, shaded_out],
+        [ratio_out, bounced_out, surface_out, shaded_out, sums_out],
         rows=rows,
         device=rays.device,
     )
+    if config.parts > 1:
+        inputs = [surface_out, sums_out, sum_kinds(config.bounce)]
+        wp.launch(join_parts_kernel, cells, inputs, [ratio_out, bounced_out], device=rays.device)
+
+
+def sum_kinds(bounce: bool) -> int:
+    """Sums per part of a cell: light without the objects, light that they hide, light that they send."""
+    return 3 if bounce else 2
+
+
+def count_parts(rows: int, columns: int) -> int:
+    """Threads of a CUDA device per cell: as many as it takes to fill it."""
+    parts = MAX_PARTS
+    while parts > 1 and parts * rows * columns > ENOUGH_THREADS:
+        parts //= 2
+    return parts
+
+
+def sums_shape(parts: int, bounce: bool, rows: int, columns: int) -> tuple[int, int, int]:
+    """Shape of the array that holds the sums of all parts of so many cells."""
+    return parts * sum_kinds(bounce), rows, columns
 
 
 def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
@@ -744,6 +832,8 @@ def spread_ratio(
     """
     height, width = physical_ratio_out.shape
     run = CPU_RUN if rays.device.is_cpu else 1
+    if run == 1:
+        seen = None  # to look costs a thread as much as its pixel does
     launch_rows(
         make_spread_ratio_kernel(config),
         (height, -(-width // run)),

@@ -95,10 +95,11 @@ def run(
     filtered=True,
     out=None,
     near=False,
+    parts=1,
 ):
     kinds = tuple(tuple(sorted({thing["kind"] for thing in things})) for things in (objects, proxies))
     forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh" if bounce else "none", False, bool(probes))
-    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, near)
+    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, near, parts)
     params = records(
         FrameParams,
         {
@@ -141,6 +142,7 @@ def run(
         bounced,
         surface,
         shaded_out=shaded,
+        sums_out=wp.full(room_shadow.sums_shape(parts, bounce, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
         rows=rows,
     )
     if not filtered:
@@ -430,6 +432,15 @@ def test_bands_of_rows_and_rectangles(device, stride):
     np.testing.assert_array_equal(part[inside], whole[inside])
     assert (part[~inside] == 1).all()
     assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
+
+
+@pytest.mark.parametrize("bounce", [False, True])
+def test_threads_that_share_a_cell_find_the_same(device, bounce):
+    drawn = draw(with_sun(6, 20, 100.0))
+    item, balls = [sphere((0, 0, 0.05), 0.05)], [{"center": (0.1, 0, 0.03), "radius": 0.03}]
+    one, eight = (run(drawn, item, probes=balls, stride=2, bounce=bounce, parts=parts) for parts in (1, 8))
+    assert one.min() < 0.7
+    np.testing.assert_allclose(eight, one, atol=SUM_ERROR)
 
 
 def test_half_resolution_agrees(device):

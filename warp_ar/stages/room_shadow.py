@@ -138,6 +138,10 @@ class RoomShadow(Stage):
         }
         if RUNGS[self.rung].bounce:
             specs["room_shadow_bounced"] = ArraySpec(cells, wp.vec3)
+        parts = room_shadow.count_parts(*cells)
+        specs["room_shadow_sums"] = ArraySpec(
+            room_shadow.sums_shape(parts, RUNGS[self.rung].bounce, *cells) if parts > 1 else (0, 0, 0), wp.vec3
+        )
         if METALLIC_ROUGHNESS in room_config(self.request).models:
             specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
         return specs
@@ -149,7 +153,8 @@ class RoomShadow(Stage):
         if not rung.bounce:
             forms = dataclasses.replace(forms, diffuse="none", specular=False)
         near = knows_lamps(self.request)
-        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, near)
+        parts = 1 if device.is_cpu else room_shadow.count_parts(*arrays["room_shadow_ratio"].shape)
+        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, near, parts)
         room_shadow.make_room_shadow_kernel(config)
         room_shadow.make_filter_ratio_kernel(rung.side, rung.bounce)
         room_shadow.make_spread_ratio_kernel(forms)
@@ -185,6 +190,7 @@ class RoomShadow(Stage):
                 bounced,
                 surface,
                 shaded_out=shaded,
+                sums_out=arrays["room_shadow_sums"],
                 rows=rows,
             )
 
