@@ -65,7 +65,7 @@ NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
 MAX_PARTS = 8
 """Threads of a CUDA device that share the samples of a cell at most."""
 ENOUGH_THREADS = 1 << 20
-"""Threads from which more of them make a CUDA device no faster."""
+"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
 CPU_RUN = 32
 """Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 WARP_LANES = 32
@@ -725,8 +725,7 @@ def shade_room(
         sums_out: Scratch of ``sums_shape``; needed if ``config.parts`` is not 1, and then ``rows`` must be None.
         rows: Band of rows of the outputs; None means all.
     """
-    # Few short rays gain less from it than they lose by writing far apart: 2.4 against 2.8 ms for a frame of 4K.
-    lanes = WARP_LANES if config.bounce and not rays.device.is_cpu else 1
+    lanes = 1 if rays.device.is_cpu else WARP_LANES
     cells = ratio_out.shape
     launch_rows(
         make_room_shadow_kernel(config),
