@@ -62,10 +62,11 @@ MUTATIONS = (
         3,
         "samples outside the frame count",
         "kernels/probe.py",
-        "                        if inside >= 0.0 and ramp > 0.0:\n",
-        "                        if at[2] > rim_start:\n                            ramp = 1.0\n"
-        "                            at[0] = wp.clamp(at[0], 0.0, last_column)\n"
-        "                            at[1] = wp.clamp(at[1], 0.0, last_row)\n",
+        "                    if inside >= 0.0 and ramp > 0.0:\n",
+        "                    if at[2] > rim_start:\n"
+        "                        ramp = 1.0\n"
+        "                        at[0] = wp.clamp(at[0], 0.0, last_column)\n"
+        "                        at[1] = wp.clamp(at[1], 0.0, last_row)\n",
         "tests/test_probe.py::test_partly_outside_the_frame",
     ),
     Mutation(

@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 
-from tests.hard_cases import atlas, measure_errors, table
+from tests.hard_cases import atlas, measure_errors, mutations, table
 from tests.hard_cases.rig import RUNGS, SIZE, make_quality, make_scene
 from warp_ar import explain
 from warp_ar.graph import make_plan
@@ -74,6 +74,16 @@ def test_tests_that_stand_elsewhere_exist() -> None:
         assert f"def {function}(" in (ROOT / "tests" / file).read_text(), (
             f"{name} is named in the atlas and does not exist"
         )
+
+
+def test_every_row_has_a_break_that_still_applies() -> None:
+    """What ``python -m tests.hard_cases.mutations`` would replace stands there once, and the test it names exists."""
+    assert {mutation.row for mutation in mutations.MUTATIONS} == set(atlas.ROWS)
+    for mutation in mutations.MUTATIONS:
+        count = (ROOT / mutation.file).read_text().count(mutation.old)
+        assert count == 1, f"{mutation.what!r}: its text occurs {count} times in {mutation.file}; expected once"
+        file, function = mutation.test.split("[")[0].split("::")
+        assert f"def {function}(" in (ROOT / file).read_text(), f"{mutation.test} does not exist"
 
 
 REPORT = """<testsuites><testsuite><testcase classname="a" name="test_one[{device}-bilinear]"><properties>
