@@ -537,14 +537,14 @@ def spied_estimates(monkeypatch, seconds=0.0):
     monkeypatch.setattr(recovery.Recovery, "update", update)
 
 
-def shown_estimates(scene, device, count, turns=1):
+def shown_estimates(scene, device, count, turns=1, waits=False):
     """Number of the estimate that each of ``count`` frames, 30 a second, was lit by; pipelines take turns."""
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     rng = np.random.default_rng(6)
     shown = []
     with contextlib.ExitStack() as stack:
         quality = PRESETS["low"].with_rungs(recover="white_card")
-        arguments = {"device": device, "quality": quality, "outputs": ("environment",)}
+        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "waits": waits}
         pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
         for index in range(count):
             now, before = pipelines[index % turns], pipelines[(index - 1) % turns]
@@ -563,6 +563,12 @@ def test_estimates_take_effect_a_fixed_number_of_frames_later(scene, device, mon
     # Begun in frames 0, 1, 2, 8 and 14.
     expected = [1, 2, *[3] * (8 + LATENCY - 2), *[4] * 6, 5, 5]
     assert shown_estimates(scene, device, len(expected), turns) == expected
+
+
+def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monkeypatch):
+    spied_estimates(monkeypatch, 0.05)
+    expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
+    assert shown_estimates(scene, device, len(expected), waits=True) == expected
 
 
 def test_a_failing_estimate_is_reported_with_its_frame(scene, monkeypatch):

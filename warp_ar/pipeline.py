@@ -171,6 +171,7 @@ class Pipeline:
         exposures: Sequence[float] = (),
         bands: int | None = None,
         profile: bool = False,
+        waits: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -184,6 +185,8 @@ class Pipeline:
                 shown; the others tell what clips in it.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
+            waits: Whether a frame waits for the light that is estimated from it. A camera's frames should not: that
+                light then takes effect some frames later.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -196,7 +199,7 @@ class Pipeline:
         self.quality = resolve_quality(quality)
         self._longest = max(exposures, default=1.0)
         ratios = bracket_ratios(exposures)
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios))
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, waits))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
         self._last_time = 0.0

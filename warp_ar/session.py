@@ -95,6 +95,7 @@ class Session:
                     size=self.source.size,
                     outputs=outputs,
                     exposures=self.source.exposures,
+                    waits=not self.source.live,
                 )
         except BaseException:
             self.source.close()

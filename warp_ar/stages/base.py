@@ -32,6 +32,8 @@ class Request:
     """Names of the resources that the caller wants: ``image``, ``environment``, ``pose``."""
     exposures: tuple[float, ...] = ()
     """Exposures between which frames alternate, as ratios to the longest, which comes first; empty: only one."""
+    waits: bool = False
+    """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,8 +25,8 @@ EVERY_FRAME = 3
 EVERY_SECONDS = 0.2
 """Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched lamp."""
 LATENCY = 3
-"""Frames after which an estimate takes effect, those at the start excepted: it is solved for beside them. The number is
-fixed, so that the same frames give the same pictures; where it is not solved for in time, the frame waits."""
+"""Frames after which an estimate takes effect, unless the request is to wait for it: it is solved for beside them. The
+number is fixed, so that the same frames give the same pictures; where it is not solved for in time, the frame waits."""
 MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
 
 
@@ -205,7 +205,7 @@ class Recover(Stage):
             now.waited, now.last = 0, seconds
 
     def _ask(self, rows: Rows | None) -> None:
-        """Begin to solve; at a stream's start wait for it."""
+        """Begin to solve, and wait for it where it takes effect at once."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
             if self.rung == "shading":
@@ -215,8 +215,12 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.pending, now.age = self._worker.submit(self._solve, now.solver), 0
-        if now.frames <= EVERY_FRAME:
+        if self._at_once():
             self._take(None)
+
+    def _at_once(self) -> bool:
+        """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
+        return self.request.waits or self._progress.frames <= EVERY_FRAME
 
     def _solve(self, solver: recovery.Recovery) -> _Solution:
         """In the worker. Nothing writes the equations before this is done: it takes effect before the next begins."""
@@ -279,7 +283,7 @@ class Recover(Stage):
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``; lamps change where an estimate takes effect."""
         if name == "lamps":
-            return self._arrives or (self._asks and self._progress.frames <= EVERY_FRAME)
+            return self._arrives or (self._asks and self._at_once())
         if not self._device.is_cpu:
             return True
         if not self._arrays["recover_difference"].numpy().max() > 1.0:
