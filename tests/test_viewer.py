@@ -53,7 +53,7 @@ from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.host import BOARD, Host, Lit
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
-from warp_ar.viewer.server import Address, Server, encode_jpeg
+from warp_ar.viewer.server import Address, Server, encode_jpeg, own_address
 
 SIZE = (320, 240)
 PATIENCE = 60.0  # seconds that anything may take on a busy machine
@@ -1069,6 +1069,14 @@ def test_address() -> None:
     assert Address("0.0.0.0", 80, "abc").url == "http://localhost:80/?token=abc"
     assert Address("::1", 80).url == "http://[::1]:80/"
     assert not Address("0.0.0.0").loopback
+    # What a phone can open is no name of this machine for itself.
+    outside = Address("0.0.0.0", 80, "abc").outside_url
+    if own_address() is None:
+        assert outside is None
+    else:
+        assert outside == f"http://{own_address()}:80/?token=abc"
+        assert not own_address().startswith("127.")
+    assert Address("127.0.0.1").outside_url is None
 
 
 @pytest.mark.parametrize(
@@ -1079,6 +1087,9 @@ def test_address() -> None:
         (["--token", ""], "--token"),
         (["--tls", "/no/such.pem"], "/no/such.pem"),
         (["--report", "run.json"], "--report needs"),
+        (["--quality", "auto", "--budget-ms", "-5"], "--budget-ms -5"),
+        (["--quality", "auto", "--budget-ms", "inf"], "--budget-ms inf"),
+        (["--budget-ms", "20"], "needs --quality auto"),
         (["--host", "no.such.host.invalid", "--device", "cpu", "--quality", "low"], "cannot serve"),
     ],
 )

@@ -185,7 +185,7 @@ def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
     from warp_ar.viewer.host import Host
-    from warp_ar.viewer.server import LOOPBACK, Address, Server
+    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
     for name in ("save_environment", "report"):
@@ -203,7 +203,7 @@ def serve_page(options: argparse.Namespace) -> int:
     tls = (
         None
         if options.tls is None
-        else make_context(options.host)
+        else make_context((options.host in EVERYWHERE and own_address()) or options.host)
         if options.tls is True
         else load_context(Path(options.tls))
     )
@@ -222,6 +222,8 @@ def serve_page(options: argparse.Namespace) -> int:
 
     def ready(address: Address) -> None:
         print(f"warp_ar: {scene.name} is at {address.url} (Ctrl-C ends it)", flush=True)
+        if (outside := address.outside_url) is not None:
+            print(f"warp_ar: from other machines, {outside}", flush=True)
         if not options.no_browser and local and _has_display():
             webbrowser.open(address.url)
 
@@ -261,6 +263,8 @@ def run(options: argparse.Namespace) -> int:
         return EXIT_DONE
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
+    if options.budget_ms is not None and not 0.0 < options.budget_ms < float("inf"):
+        raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
     if options.output is None and not options.headless:

@@ -13,6 +13,7 @@ import dataclasses
 import hmac
 import importlib.resources
 import json
+import socket
 import ssl
 import time
 from collections.abc import Awaitable, Callable
@@ -31,6 +32,8 @@ from warp_ar.viewer import protocol
 from warp_ar.viewer.host import Host, Lit
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
+EVERYWHERE: Final = ("0.0.0.0", "::", "")
+"""Not an address, but all that this machine has."""
 JPEG_QUALITY: Final = 85
 """At 640x480 a desk takes 60 KB; at 95 it takes twice that."""
 MOST_VIEWERS: Final = 8
@@ -77,6 +80,16 @@ def encode_light(light: npt.NDArray[np.float32]) -> bytes:
     return bytes(cv2.imencode(".png", np.uint8(np.round(encoded[..., ::-1] * 255.0)))[1])
 
 
+def own_address() -> str | None:
+    """Address of this machine on its network; None without one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # an address for documentation: it finds the way out and sends nothing
+        except OSError:
+            return None
+        return str(probe.getsockname()[0])
+
+
 @dataclasses.dataclass(frozen=True)
 class Address:
     """Where the page is served, and what it takes to see it."""
@@ -96,12 +109,18 @@ class Address:
     @property
     def url(self) -> str:
         """The page's address as it is printed."""
-        host = (
-            "localhost" if self.host in ("0.0.0.0", "::", "") else f"[{self.host}]" if ":" in self.host else self.host
-        )
-        return f"http{'s' * (self.tls is not None)}://{host}:{self.port}/" + (
-            f"?token={self.token}" if self.token else ""
-        )
+        return self._url("localhost" if self.host in EVERYWHERE else self.host)
+
+    @property
+    def outside_url(self) -> str | None:
+        """The same for other machines, where the page is served at all of this one's addresses and one is known."""
+        own = own_address() if self.host in EVERYWHERE else None
+        return None if own is None else self._url(own)
+
+    def _url(self, host: str) -> str:
+        host = f"[{host}]" if ":" in host else host
+        token = f"?token={self.token}" if self.token else ""
+        return f"http{'s' * (self.tls is not None)}://{host}:{self.port}/{token}"
 
 
 class _Viewer:

@@ -186,7 +186,7 @@ function showSplit() {
 function showCamera() {
   if (!camera) return;
   const field = (2 * Math.atan((0.5 * camera.width) / camera.fx) * 180) / Math.PI;
-  const guess = state.estimating ? " Guessed for now: show the marker from several sides." : "";
+  const guess = state.estimating ? " Still being estimated: show the marker from several sides." : "";
   $("camera-note").textContent = `${state.source}. ${camera.width}×${camera.height}, focal length ${camera.fx.toFixed(0)} pixels (${field.toFixed(0)}° across).${guess}`;
 }
 
