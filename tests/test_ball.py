@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from warp_ar.ball import fit_ball
-from warp_ar.scene import Camera, Probe, Proxy
+from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene, load_scene
+from warp_ar.session import Session
 from warp_ar.tracking import Pose
 
 FOUND_MM = 0.4
@@ -153,3 +154,22 @@ def test_a_ball_that_is_not_in_the_picture(clip):
     assert fit_ball(clip, camera, dataclasses.replace(rough((0, 0, 0)), center=(0.0, -1.5, 0.9))) is None
     nothing = (Proxy("plane", at=(5.0, 5.0, 0.0), size=(0.1, 0.1)),)
     assert fit_ball(clip, camera, rough((0, 0, 0)), nothing) is None
+
+
+def test_a_session_moves_its_ball_first(shared):
+    scene = load_scene(shared / "truth" / "gold_torus_interior" / "scene_object.toml")
+    truth = np.array(scene.probes[0].center)
+    moved = dataclasses.replace(scene.probes[0], center=tuple(truth + np.array([0.004, -0.003, 0.0])))
+    with Session(dataclasses.replace(scene, probes=(moved,)), quality="paper", refine_ball=True) as session:
+        assert session.ball_fits[0].is_good
+        assert 1e3 * np.linalg.norm(session.scene.probes[0].center - truth) < FOUND_HARD_MM
+        assert session.pipeline.scene.probes == session.scene.probes
+        assert next(iter(session))[0].index == 0  # the clip starts anew
+
+
+def test_a_session_without_a_marker_leaves_its_ball():
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    scene = Scene(camera=camera, marker=Marker(size=0.08), probes=(rough((0, 0, 0)),))
+    with Session(scene, source="synthetic:checker", quality="paper", refine_ball=True) as session:
+        assert session.ball_fits == (None,)
+        assert session.scene.probes == scene.probes

@@ -23,6 +23,7 @@ neighbouring samples share pixels and errors of the model.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,8 +33,9 @@ from numpy.typing import NDArray
 
 from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, Probe, Proxy
-from warp_ar.tracking import Pose
+from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene
+from warp_ar.sources import Source
+from warp_ar.tracking import Pose, Tracker, TrackState
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -71,10 +73,17 @@ CORRELATED = 50.0
 """How many neighbouring samples count as one."""
 MOST_DEVIATION = 6e-4
 """Metres: a worse fit is no improvement on a ruler."""
-MOST_ERROR = 0.28
-"""Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 to 0.6 in wrong places."""
+MOST_ERROR = 0.36
+"""Mean cost up to which the frames are explained: 0.1 to 0.2 on path-traced desks, 0.3 where a small ball is seen
+through a video codec, 0.3 to 0.6 in wrong places."""
+RIVAL_DISTANCE = 4e-3
+RIVAL_SHARE = 0.75
+"""Four millimetres away, metres, the cost must be so much higher: a wrong place is not that much better than others."""
 DESK = Proxy("plane", size=(2.0, 2.0))
 """What is taken to lie around the marker where a scene models nothing."""
+REFINE_VIEWS = 3
+REFINE_SEARCH = 0.006
+"""Metres: a ruler is no worse, and less takes less time."""
 UNMODELLED = 0.02
 """Square root of radiance: what even a perfect match may be off by, such as shine; a plain desk determines nothing."""
 _BOUND = 1e-4
@@ -95,11 +104,14 @@ class BallFit:
     """The same where the search began."""
     samples: int
     """Pixels that had a say."""
+    rival: float
+    """Least cost ``RIVAL_DISTANCE`` away."""
 
     @property
     def is_good(self) -> bool:
         """Whether it is determined, and explains the frames."""
-        return self.deviation < MOST_DEVIATION and self.error < MOST_ERROR and self.error <= self.error_before
+        distinct = self.error < RIVAL_SHARE * self.rival and self.error <= self.error_before + 0.01
+        return self.deviation < MOST_DEVIATION and self.error < MOST_ERROR and distinct
 
 
 class _View:
@@ -344,4 +356,53 @@ def fit_ball(
     matrix, _, variance = fine.normal_equations(center, SCALES[-1])
     worst = float(np.linalg.eigvalsh(matrix)[0])
     deviation = float(np.sqrt(CORRELATED * (variance + UNMODELLED**2) / worst)) if worst > 0.0 else np.inf
-    return BallFit(center, deviation, error, before, samples)
+    around = [center + sign * RIVAL_DISTANCE * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    rival = min(fine.cost(place, SCALES[-1])[0] for place in around)
+    return BallFit(center, deviation, error, before, samples, rival)
+
+
+def posed_frames(source: Source, marker: Marker, camera: Camera, most: int) -> list[tuple[Image, Pose]]:
+    """Frames of a source in which the marker is seen well, with their poses; of alternating exposures the longest.
+
+    Args:
+        source: It is read from its start, if it has one.
+        marker: What to look for.
+        camera: Of the source's size.
+        most: Frames to look at.
+    """
+    tracker = Tracker(marker, camera)
+    found = []
+    for frame in itertools.islice(source, most):
+        if frame.exposure_time not in (None, *source.exposures[:1]):
+            continue
+        track = tracker.track(frame.image, frame.time)
+        if track.state is TrackState.TRACKED and track.pose is not None and track.quality > 0.5:
+            found.append((frame.image, track.pose))
+    return found
+
+
+def refine_balls(scene: Scene, source: Source, *, frames: int = 24) -> tuple[Scene, tuple[BallFit | None, ...]]:
+    """The scene with its balls where the source shows them, as far as that is certain.
+
+    Args:
+        scene: Its balls within 6 mm of where they are.
+        source: The frames; those of a device are gone afterwards.
+        frames: How many to look at; of those that show the marker, ``REFINE_VIEWS`` are compared.
+
+    Returns:
+        The scene, and what was found for each ball; a fit that is not ``is_good`` has moved nothing.
+    """
+    camera = scene.camera.scaled_to(*source.size)
+    views = posed_frames(source, scene.marker, camera, frames)
+    views = views[:: max(-(-len(views) // REFINE_VIEWS), 1)]
+    fits: list[BallFit | None] = []
+    probes = []
+    for probe in scene.probes:
+        others = [other for other in scene.probes if other is not probe]
+        fit = fit_ball(views, camera, probe, scene.proxies, others, search=REFINE_SEARCH) if views else None
+        fits.append(fit)
+        if fit is not None and fit.is_good:
+            x, y, z = (float(v) for v in fit.center)
+            probe = dataclasses.replace(probe, center=(x, y, z))
+        probes.append(probe)
+    return dataclasses.replace(scene, probes=tuple(probes)), tuple(fits)

@@ -31,12 +31,12 @@ import imageio.v3
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.ball import fit_ball
+from warp_ar.ball import fit_ball, posed_frames
 from warp_ar.errors import SinkError, UsageError, WarpArError
 from warp_ar.live import EXIT_DONE, EXIT_INTERRUPTED, EXIT_USAGE, Parser
 from warp_ar.scene import Camera, CharucoBoard, Marker, Probe, Proxy, load_scene, loads_scene
 from warp_ar.sources import open_source
-from warp_ar.tracking import Pose, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.tracking import Pose, find_dictionary, make_board
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -630,16 +630,9 @@ def _run_ball(options: argparse.Namespace) -> None:
         spec = scene.source.path or scene.source.camera if scene.source is not None else None
     if spec is None:
         raise UsageError(f"{options.scene}: names no frames; give --source")
-    views: list[tuple[Image, Pose]] = []
-    tracker: Tracker | None = None
-    camera = scene.camera
     with open_source(spec) as source:
-        camera = camera.scaled_to(*source.size)
-        tracker = Tracker(scene.marker, camera)
-        for frame in itertools.islice(source, options.frames):
-            track = tracker.track(frame.image, frame.time)
-            if track.state is TrackState.TRACKED and track.pose is not None and track.quality > 0.5:
-                views.append((frame.image, track.pose))
+        camera = scene.camera.scaled_to(*source.size)
+        views = posed_frames(source, scene.marker, camera, options.frames)
     if not views:
         raise UsageError(f"{spec}: no marker in the first {options.frames} frames; see [marker] in {options.scene}")
     views = views[:: -(-len(views) // 12)]

@@ -102,6 +102,11 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
+    add(
+        "--refine-ball",
+        action="store_true",
+        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
+    )
     add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
     page = parser.add_argument_group("the page")
     page.add_argument(
@@ -191,6 +196,8 @@ def serve_page(options: argparse.Namespace) -> int:
     for name in ("save_environment", "report"):
         if getattr(options, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
+    if options.refine_ball:
+        raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
     if options.port is not None and not 0 <= options.port <= 65535:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     scene = load_scene(options.scene)
@@ -250,6 +257,19 @@ def _print_choice(pipeline: AutoPipeline) -> None:
     )
 
 
+def _ball_report(scene: str | Path, session: Session) -> dict[str, Any]:
+    """Say how far from where the scene has them the mirror balls were found."""
+    given = load_scene(scene).probes
+    found = []
+    for index, (fit, before, after) in enumerate(zip(session.ball_fits, given, session.scene.probes, strict=False)):
+        offset = [round(1e3 * (b - a), 2) for a, b in zip(before.center, after.center, strict=True)]
+        good = fit is not None and fit.is_good
+        found.append({"offset_mm": offset, "deviation_mm": round(1e3 * fit.deviation, 2) if fit and good else None})
+        what = f"moved by {offset} mm" if good else "left where the scene has it: too little of the desk shows in it"
+        print(f"warp_ar: mirror ball {index} {what}", file=sys.stderr)
+    return {"balls": found} if found else {}
+
+
 def _has_display() -> bool:
     """Whether a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -289,8 +309,10 @@ def run(options: argparse.Namespace) -> int:
                 budget_ms=options.budget_ms,
                 outputs=tuple(outputs),
                 loop=options.loop,
+                refine_ball=options.refine_ball,
             )
         )
+        balls = _ball_report(options.scene, session)
         source = session.source
         sink = NullSink() if output is None else open_sink(output, fps=source.fps, size=session.pipeline.size)
         log = RunLog(session.pipeline)
@@ -330,7 +352,7 @@ def run(options: argparse.Namespace) -> int:
             raise RunError(f"{error} ({log.count} frames were written)") from error
         finally:
             if options.report is not None:
-                options.report.write_text(json.dumps(log.report(), indent=1))
+                options.report.write_text(json.dumps({**log.report(), **balls}, indent=1))
     if not options.headless:
         print_plan(session.pipeline.plan, log)
         if isinstance(session.pipeline, AutoPipeline):

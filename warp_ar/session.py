@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.ball import BallFit, refine_balls
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.pipeline import Pipeline, Result
 from warp_ar.quality import DEFAULT_PRESET, Quality
@@ -40,6 +41,7 @@ class Session:
         budget_ms: float | None = None,
         outputs: tuple[str, ...] = ("image",),
         loop: bool = False,
+        refine_ball: bool = False,
     ) -> None:
         """Open everything.
 
@@ -52,6 +54,8 @@ class Session:
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
             loop: Start a clip again when it ends.
+            refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
+                was found is in ``ball_fits``.
 
         Raises:
             SceneError: The scene or the calibration cannot be used.
@@ -75,7 +79,10 @@ class Session:
         self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
         self.decode_ms = 0.0
         """Milliseconds that the source took for its last frame."""
+        self.ball_fits: tuple[BallFit | None, ...] = ()
         try:
+            if refine_ball:
+                self.scene, self.ball_fits = refine_balls(self.scene, self.source)
             self.pipeline: Pipeline | AutoPipeline
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
