@@ -448,6 +448,7 @@ export class QualityPanel {
     if (typeof measuring === "number") return `Measuring what each rung costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
     if (!bought) return "The program then chooses the rungs that err least within this time. What each costs on this device is measured once, in about half a minute.";
     const { choice, took, fits } = bought;
+    if (this.#dial.choices.every((one) => one.error === 0)) return "What these rungs err is not in the price list, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
     const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];
     if (!fits) parts.push("Nothing cheaper is left.");
     const { difference, compare } = this.#state ?? {};
