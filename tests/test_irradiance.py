@@ -412,6 +412,6 @@ def test_a_scene_without_diffuse_material_leaves_the_stage_out():
     assert isinstance(left_out, LeftOut)
     assert "no virtual object is diffuse" in left_out.reason
     wiring = Diffuse.wire(Request(loads_scene(SCENE), PRESETS["medium"], (64, 48)))
-    assert wiring.writes == ("irradiance_sh",)
+    assert wiring.writes == ("irradiance_map",)
     wiring = Diffuse.wire(Request(loads_scene(SCENE), PRESETS["paper"], (64, 48)))
     assert wiring.writes == ("irradiance_map",)

@@ -71,7 +71,7 @@ SETTLE = 2
 """Frames after a change that are not counted."""
 GAIN = 0.03
 """Share of the predicted error that a change must save."""
-PATIENCE = 1.0
+PATIENCE = 2.0
 """Seconds within the budget before more is tried, at first."""
 MOST_PATIENCE = 32.0
 REGRET = 5.0
@@ -82,13 +82,15 @@ KNOB_SECONDS = 0.5
 BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""
 _MEASURED_FRAMES = 6
-_WARM_UP = 2
+_WARM_UP = 1
 NOW_AND_THEN = "recover"
-"""Stage that works some times a second, so that its mean counts and not its median."""
+"""Stage that works some times a second on a thread of its own: what it takes is shown by all that the process works."""
 _SPREAD_FRAMES = 12
-"""Frames over which that mean is taken where its own rungs are compared: two of its turns."""
-_ENOUGH_MS = 300.0
+"""Frames over which that is taken: two of its turns."""
+_ENOUGH_MS = 200.0
 """Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
+WORK = time.thread_time
+"""Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
 _KEPT_PIPELINES = 6
 _CACHE_FILE = "costs.json"
 
@@ -319,11 +321,13 @@ def _time_stages(
     spent = 0.0
     warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, _MEASURED_FRAMES)
     shown_at = light_only(quality) if spread else quality
-    with Pipeline(scene, device=device, quality=shown_at, size=size, profile=True) as pipeline:
-        pipeline.scheduler.clock = clock
+    with open_profiled(scene, device, shown_at, size, clock) as pipeline:
+        begun = 0.0
         for index in range(warm_up + count):
             # Brighter and darker by an eighth, else stages would be skipped.
             shown = image if index % 2 == 0 else image - image // 8
+            if index == warm_up:
+                begun = time.process_time()
             result = pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
             if index < warm_up:
                 continue
@@ -332,11 +336,28 @@ def _time_stages(
             spent += sum(timing.milliseconds for timing in result.stages.values())
             if spent > _ENOUGH_MS and not spread:
                 break
+        worked = time.process_time() - begun
+        on_cpu = pipeline.device.is_cpu
     times.pop(TRACK, None)
-    return {
-        name: statistics.fmean(own or [0.0]) if spread and name == NOW_AND_THEN else statistics.median(own or [0.0])
-        for name, own in times.items()
-    }
+    if spread and on_cpu:
+        return {NOW_AND_THEN: worked_ms(worked / count, clock)}
+    return {name: statistics.median(own or [0.0]) for name, own in times.items()}
+
+
+def open_profiled(
+    scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
+) -> Pipeline:
+    """A pipeline whose stages are timed by a clock; by ``WORK`` one thread does them, one after another."""
+    bands = 1 if clock is WORK else None
+    pipeline = Pipeline(scene, device=device, quality=quality, size=size, bands=bands, profile=True)
+    pipeline.scheduler.clock = clock
+    return pipeline
+
+
+def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
+    """Milliseconds that the process's work takes: by ``WORK`` all of it, by the time its share on every core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return seconds * 1e3 / (1 if clock is WORK else cores)
 
 
 def cache_folder() -> Path:

@@ -1,0 +1,66 @@
+"""What every rung costs: the times of the price list, on ``desk`` at its own size, all else on ``medium``.
+
+``python -m bench prices --device cpu > bench/results/cpu_prices.jsonl``, then ``python -m bench.write_prices`` puts
+these lines and the errors of ``warp_ar/price_list.json`` into ``docs/prices.md`` and the README.
+
+Rows: ``rung KNOB RUNG``, the stages that a knob turns, at each of its rungs; ``preset SCENE NAME``, whole frames of the
+presets in turn. On CUDA a frame is the sum of its stages, each alone: stages that run side by side take less.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+import warp as wp
+
+from bench.common import report
+from warp_ar.auto_quality import BASE, NOW_AND_THEN, WORK
+from warp_ar.ladder import Knob, light_only, relevant_knobs, setting, turn
+from warp_ar.quality import PRESETS
+from warp_ar.scene import bundled_scenes
+from warp_ar.tradeoff import Case, count_work, open_scene, run, run_in_turn, sized_lamp
+
+FRAMES = 12
+TIMED = 6
+RUNS = ("paper", "low", "medium", "high")
+
+
+def main(device: str) -> None:
+    # Other programs: who works on a busy machine says so, and counts processor time.
+    by_work = os.environ.get("WARP_AR_CLOCK") == "processor"
+    clock = WORK if by_work else time.perf_counter
+    more = {"clock": "processor" if by_work else "wall", "load": round(os.getloadavg()[0], 1)}
+    desk = open_scene("desk", FRAMES)
+    darken = open_scene("darken", FRAMES)
+    lamp = sized_lamp(desk)
+    for knob in knobs_of(lamp):
+        price(lamp if knob.name == "light_shadow" else desk, knob, device, clock, more)
+    price(darken, next(knob for knob in knobs_of(darken) if knob.name == "expose"), device, clock, more)
+    for scene in bundled_scenes():
+        case = {"desk": desk, "darken": darken}.get(scene) or open_scene(scene, FRAMES)
+        times, _ = run_in_turn(case, {name: PRESETS[name] for name in RUNS}, device, clock)
+        for name in RUNS:
+            report(f"preset {scene} {name}", times[name], device, scene=scene, preset=name, **more)
+
+
+def knobs_of(case: Case) -> tuple[Knob, ...]:
+    return relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
+
+
+def price(case: Case, knob: Knob, device: str, clock: Any, more: dict[str, Any]) -> None:
+    """One line per rung: its own stages, and those that run only for it."""
+    outcomes = {}
+    for rung in knob.rungs:
+        quality = turn(BASE, {knob.name: rung})
+        timed = 1 if rung == "brute_force" else TIMED
+        outcomes[rung] = run(case, quality, device, knob, between=light_only(quality), timed=timed, clock=clock)
+    if knob.name == NOW_AND_THEN and wp.get_device(device).is_cpu:
+        count_work(case, outcomes, device, clock)
+    common = set.intersection(*(set(outcome.stages) for outcome in outcomes.values())) - set(knob.stages)
+    base = outcomes[setting(BASE, knob)]
+    for rung, outcome in outcomes.items():
+        own = sum(ms for name, ms in outcome.stages.items() if name not in common)
+        frame = {"frame_ms": round(outcome.milliseconds, 4), "base_ms": round(base.milliseconds, 4)}
+        report(f"rung {knob.name} {rung}", [own], device, scene=case.name, knob=knob.name, rung=rung, **frame, **more)

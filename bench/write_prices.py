@@ -1,0 +1,162 @@
+"""``python -m bench.write_prices``: the measured price list into ``docs/prices.md`` and the README.
+
+It reads ``bench/results/*_prices.jsonl``, which ``python -m bench prices`` prints, and the errors of
+``warp_ar/price_list.json``, and replaces what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It
+prints for every preset what the rule of ``quality.BUDGETS`` would choose.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from warp_ar.auto_quality import BASE
+from warp_ar.ladder import KNOBS, WORDS, Choice, Price, choose, frontier, load_errors, setting
+from warp_ar.quality import BUDGETS, PRESETS, SHARE
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "bench" / "results"
+OVERLAP = 1.65
+"""Processor time over time by the clock of a frame on two cores, measured with nothing else running (78 over 47 ms)."""
+TRACKING_MS = 3.0
+"""Of a frame: the marker, found before the stages run."""
+
+
+def read(pattern: str) -> list[dict[str, Any]]:
+    """Lines of the newest file that matches; none where there is none."""
+    files = sorted(RESULTS.glob(pattern))
+    return [json.loads(line) for line in files[-1].read_text().splitlines() if line.startswith("{")] if files else []
+
+
+def rungs(lines: list[dict[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(line["knob"], line["rung"]): line for line in lines if "rung" in line}
+
+
+def table(head: list[str], rows: list[list[str]], left: int) -> str:
+    marks = ["---"] * left + ["--:"] * (len(head) - left)
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, marks, *rows])
+
+
+def milliseconds(line: dict[str, Any] | None, key: str = "median_ms") -> str:
+    if line is None:
+        return ""
+    value = line[key]
+    return f"{value:.3f}" if value < 0.995 else f"{value:.1f}" if value < 99.5 else f"{value:,.0f}"
+
+
+def device_of(lines: list[dict[str, Any]]) -> str:
+    if not lines:
+        return "not measured"
+    if lines[0]["device"] != "CPU":
+        return str(lines[0]["device"])
+    return "CPU, processor ms" if lines[0].get("clock") == "processor" else "two CPU cores"
+
+
+def rung_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any]) -> str:
+    errors, arrays = load_errors(), listed.get("stage_errors", {})
+    rows = []
+    ours, theirs = rungs(cpu), rungs(cuda)
+    for knob in KNOBS:
+        if knob.name not in listed["errors"]:
+            continue
+        what, words = WORDS.get(knob.name, ("", {}))
+        rows.append([f"**{knob.name.replace('_', ' ')}**", what, "", "", "", ""])
+        for rung in knob.rungs:
+            known = rung in listed["errors"][knob.name]
+            apart = arrays.get(knob.name, {}).get(rung)
+            rows.append(
+                [
+                    f"`{rung}`",
+                    words.get(rung, ""),
+                    f"{errors[knob.name][rung]:.4f}" if known else "0",
+                    f"{apart:.1%}" if apart else "",
+                    milliseconds(ours.get((knob.name, rung))),
+                    milliseconds(theirs.get((knob.name, rung))),
+                ]
+            )
+    head = ["rung", "what it does", "error (FLIP)", "rel. RMSE", f"ms, {device_of(cpu)}", f"ms, {device_of(cuda)}"]
+    return table(head, rows, 2)
+
+
+def preset_table(
+    cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any], scenes: list[str]
+) -> str:
+    rows = []
+    for scene in scenes:
+        for name in ("paper", "low", "medium", "high"):
+            found = [
+                next((line for line in lines if line.get("preset") == name and line["scene"] == scene), None)
+                for lines in (cpu, cuda)
+            ]
+            flip = listed.get("wholes", {}).get(scene, {}).get(name)
+            cells = ["" if flip is None else f"{flip:.3f}", *(milliseconds(line) for line in found)]
+            rows.append([f"`{scene}`" if name == "paper" else "", f"`{name}`", *cells])
+    head = ["scene", "preset", "error (FLIP)", f"ms, {device_of(cpu)}", f"ms, {device_of(cuda)}"]
+    return table(head, rows, 2)
+
+
+def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tuple[str, str], Price]]:
+    """Choices by what ``desk`` calls for, milliseconds relative to the base; the base's; the prices."""
+    errors = load_errors()
+    found = rungs([line for line in lines if line["scene"] == "desk"])
+    prices = []
+    for knob in KNOBS:
+        own = {rung: found[knob.name, rung] for rung in knob.rungs if (knob.name, rung) in found}
+        if not own:
+            continue
+        start = own[setting(BASE, knob)]["median_ms"]
+        prices += [
+            Price(knob.name, rung, line["median_ms"] - start, errors[knob.name][rung])
+            for rung, line in own.items()
+            if rung != "brute_force"
+        ]
+    frame = next(line["base_ms"] for line in lines if line.get("knob") == "diffuse")
+    return frontier(prices), frame, {(price.knob, price.rung): price for price in prices}
+
+
+def rule_table(cpu: list[dict[str, Any]]) -> str:
+    """Every preset beside what its budget would buy at best."""
+    front, base, prices = front_of(cpu)
+    scale = OVERLAP if cpu[0].get("clock") == "processor" else 1.0
+    rows = []
+    for name, budget in BUDGETS.items():
+        best = choose(front, (SHARE * budget - TRACKING_MS) * scale - base)
+        own = {knob: setting(PRESETS[name], next(k for k in KNOBS if k.name == knob)) for knob, _ in prices}
+        milliseconds_ = (base + sum(prices[pair].milliseconds for pair in own.items())) / scale + TRACKING_MS
+        error = sum(prices[pair].error for pair in own.items())
+        rows.append([f"`{name}`", f"{budget:.0f}", f"{milliseconds_:.0f}", f"{error:.4f}", f"{best.error:.4f}"])
+        other = {knob: rung for knob, rung in best.settings if own[knob] != rung}
+        print(
+            f"{name}: {milliseconds_:.1f} of {budget:.0f} ms, error {error:.4f}; the best errs {best.error:.4f} in "
+            f"{(base + best.milliseconds) / scale + TRACKING_MS:.1f} ms with {other or 'the same rungs'}"
+        )
+    return table(["preset", "budget, ms", "expected ms", "expected error", "the budget's least"], rows, 1)
+
+
+def replace(path: Path, name: str, text: str) -> None:
+    old = path.read_text(encoding="utf-8")
+    block = f"<!-- prices:{name} -->\n{text}\n<!-- /prices:{name} -->"
+    new, count = re.subn(rf"<!-- prices:{name} -->.*?<!-- /prices:{name} -->", lambda _: block, old, flags=re.S)
+    if count != 1:
+        sys.exit(f"write_prices: {path.name} has {count} blocks {name!r}; expected 1")
+    path.write_text(new, encoding="utf-8")
+
+
+def main() -> None:
+    cpu, cuda = read("cpu_prices.jsonl"), read("h*_prices.jsonl")
+    listed = json.loads((ROOT / "warp_ar" / "price_list.json").read_text(encoding="utf-8"))
+    if not cpu:
+        sys.exit("write_prices: no bench/results/cpu_prices.jsonl; make it with python -m bench prices --device cpu")
+    page = ROOT / "docs" / "prices.md"
+    scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
+    replace(page, "presets", preset_table(cpu, cuda, listed, scenes))
+    replace(page, "rungs", rung_table(cpu, cuda, listed))
+    replace(page, "rule", rule_table(cpu))
+    replace(ROOT / "README.md", "extract", preset_table(cpu, cuda, listed, ["desk"]))
+
+
+if __name__ == "__main__":
+    main()
