@@ -90,7 +90,7 @@ def test_folder_report_and_environment(tmp_path: Path) -> None:
     )
     assert sorted(path.name for path in out.iterdir()) == [f"{index:04d}.png" for index in range(FRAMES)]
     assert sorted(path.name for path in light.iterdir()) == [f"{index:04d}.exr" for index in range(FRAMES)]
-    assert read_environment(light / "0000.exr").shape == (32, 64, 3)
+    assert read_environment(light / "0000.exr").shape == (64, 128, 3)
     data = json.loads(report.read_text())
     assert {"decode", "track", "render", "encode"} <= set(data["steps_ms"])
     assert data["steps_ms"][data["critical_path"]] == max(data["steps_ms"].values())
