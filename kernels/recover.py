@@ -188,6 +188,13 @@ def condense_cells(
     )
 
 
+@wp.func
+def lacking(confidence: wp.float32, clipped: wp.vec3, unseen: wp.float32) -> wp.vec3:
+    """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
+    seen = trust(confidence)
+    return seen * clipped + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
+
+
 @wp.kernel(enable_backward=False)
 def add_excess_kernel(
     # In:
@@ -200,18 +207,33 @@ def add_excess_kernel(
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
-    """Texel plus its share of its cell's excess."""
-    band_row, j = wp.tid()
-    i = row_start + band_row
-    # The cell r whose texels begin at or before i: r h // R <= i.
-    row = ((i + 1) * excess.shape[0] - 1) // radiance.shape[0]
-    column = ((j + 1) * excess.shape[1] - 1) // radiance.shape[1]
+    """Every texel of a cell plus its share of the cell's excess."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    height = radiance.shape[0]
+    width = radiance.shape[1]
+    top = row * height // excess.shape[0]
+    bottom = (row + 1) * height // excess.shape[0]
+    left = column * width // excess.shape[1]
+    right = (column + 1) * width // excess.shape[1]
+    unseen = wp.where(cells[row, column].hidden > 0.0, 1.0, 0.0)
+    now = wp.vec3(0.0, 0.0, 0.0)
+    solid_angle = wp.float32(0.0)
+    for i in range(top, bottom):
+        area = texel_solid_angle(i, height, width)
+        for j in range(left, right):
+            now += area * lacking(confidence[i, j], clipped[i, j], unseen)
+            solid_angle += area
+    now /= solid_angle
     more = excess[row, column]
-    seen = trust(confidence[i, j])
-    share = seen * clipped[i, j]
-    if cells[row, column].hidden > 0.0:
-        share += (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
-    recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
+    then = cells[row, column].clipped
+    for c in range(3):
+        if now[c] > then[c]:
+            more[c] *= then[c] / now[c]
+    for i in range(top, bottom):
+        for j in range(left, right):
+            share = lacking(confidence[i, j], clipped[i, j], unseen)
+            recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
 
 def add_excess(
@@ -226,18 +248,21 @@ def add_excess(
 ) -> None:
     """Give texels back what they lost.
 
+    Where more of a cell clips than when its excess was found, the energy stays what was found: a thousandth that clips
+    can have a high excess, and in the next frame be half of the cell.
+
     Args:
         radiance: As captured and completed, ``wp.vec3`` (h, w).
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        cells: ``Cell``, ``cell_shape(h, w)``: whether what is not seen takes part.
+        cells: ``Cell``, ``cell_shape(h, w)``, of when the excess was found.
         excess: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
         recovered_out: ``wp.vec3`` (h, w).
-        rows: Band of rows, None for all.
+        rows: Band of rows of cells, None for all.
     """
     launch_rows(
         add_excess_kernel,
-        radiance.shape,
+        excess.shape,
         [radiance, confidence, clipped, cells, excess],
         [recovered_out],
         rows=rows,

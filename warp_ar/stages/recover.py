@@ -188,7 +188,7 @@ class Recover(Stage):
             Pass(observe, rows=points, due=lambda: self._asks),
             Pass(transfer, rows=points, due=lambda: self._asks),
             Pass(self._ask, on_host=True, due=lambda: self._asks),
-            Pass(add, rows=height),
+            Pass(add, rows=cells.shape[0]),
         ]
         return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
 
