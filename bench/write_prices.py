@@ -36,6 +36,9 @@ def rungs(lines: list[dict[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
 
 
 def table(head: list[str], rows: list[list[str]], left: int) -> str:
+    # A device that was not measured has no column.
+    if all(not row[-1] for row in rows):
+        head, rows = head[:-1], [row[:-1] for row in rows]
     marks = ["---"] * left + ["--:"] * (len(head) - left)
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, marks, *rows])
 
@@ -52,7 +55,7 @@ def device_of(lines: list[dict[str, Any]]) -> str:
         return "not measured"
     if lines[0]["device"] != "CPU":
         return str(lines[0]["device"])
-    return "CPU, processor ms" if lines[0].get("clock") == "processor" else "two CPU cores"
+    return "one CPU core's work" if lines[0].get("clock") == "processor" else "two CPU cores"
 
 
 def rung_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any]) -> str:

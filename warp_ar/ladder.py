@@ -109,7 +109,7 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "shadows of virtual things in the room's light, and the light that they reflect onto the desk",
         {
             "none": "none (the paper)",
-            "coarse": "16 rays per estimate, every second pixel",
+            "coarse": "32 rays per estimate, every fourth pixel",
             "bounce": "64 rays, every second pixel, and reflected light",
             "fine": "the same at every pixel",
             "brute_force": "every texel of the room at every pixel",
