@@ -738,7 +738,7 @@ def test_downloads_of_the_light_and_the_picture(tmp_path: Path) -> None:
         running.until(lambda: running.host.light() is not None)
         path = tmp_path / "light.exr"
         path.write_bytes(running.host.environment_exr())
-        assert read_environment(path).shape == (32, 64, 3)
+        assert read_environment(path).shape == (64, 128, 3)
         picture = cv2.imdecode(np.frombuffer(running.host.snapshot(), np.uint8), cv2.IMREAD_COLOR)
         assert picture.shape == running.frames[-1].image.shape
 
