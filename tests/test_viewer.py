@@ -53,7 +53,7 @@ from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.host import BOARD, Host, Lit
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
-from warp_ar.viewer.server import Address, Server, encode_jpeg, own_address
+from warp_ar.viewer.server import MOST_VIEWERS, Address, Server, encode_jpeg, own_address
 
 SIZE = (320, 240)
 PATIENCE = 60.0  # seconds that anything may take on a busy machine
@@ -979,6 +979,25 @@ async def test_too_many_messages_close_their_sender() -> None:
         code, reason = await bad.closed()
         assert code == 1008 or "messages" in reason
         await good.until("frame")
+
+
+@run
+async def test_an_address_that_comes_too_often_waits_and_keeps_no_other_out() -> None:
+    async with served() as site:
+        server = site.server
+        server._arrivals["often"] = Bucket(rate=0.0, burst=0.0)
+        waiting = [asyncio.create_task(server._may_come("often")) for _ in range(MOST_VIEWERS - 1)]
+        await asyncio.sleep(0.1)
+        assert not any(task.done() for task in waiting)
+        assert await server._may_come("seldom")
+        waiting.append(asyncio.create_task(server._may_come("often")))
+        await asyncio.sleep(0.1)
+        assert not await server._may_come("often"), "waiting connections pile up"
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+        async with site.page() as page:
+            await page.until("frame")
 
 
 @run

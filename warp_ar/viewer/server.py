@@ -43,6 +43,9 @@ SEND_SECONDS: Final = 20.0
 """A viewer that takes nothing for so long is dropped."""
 STATE_SECONDS: Final = 0.5
 MESSAGES_PER_SECOND: Final = 240.0
+CONNECTIONS_PER_SECOND: Final = 50.0
+"""From one address; each takes about a millisecond."""
+_MOST_ADDRESSES: Final = 256
 BYTES_PER_SECOND: Final = 8e6
 """Thirty pictures a second of a camera at 1920x1080."""
 LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
@@ -161,6 +164,8 @@ class Server:
         self._latest: Lit | None = None
         self._jpegs: dict[tuple[int, str], asyncio.Future[bytes]] = {}
         self._packed_light: tuple[npt.NDArray[np.float32], asyncio.Future[bytes]] | None = None
+        self._arrivals: dict[str, protocol.Bucket] = {}
+        self._waiting = 0
         self._encode_ms = 0.0
         self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
         self._hands = ThreadPoolExecutor(2, "warp-ar-page")
@@ -357,6 +362,8 @@ class Server:
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if len(self._viewers) >= MOST_VIEWERS:
             return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n", headers=_HEADERS)
+        if not await self._may_come(request.remote or ""):
+            return web.Response(status=429, text="too many connections\n", headers=_HEADERS)
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30.0, compress=False)
         await socket.prepare(request)
         viewer = _Viewer(socket)
@@ -385,6 +392,23 @@ class Server:
                 viewer.picture.cancel()
             await asyncio.get_running_loop().run_in_executor(self._hands, self.host.leave_camera, viewer)
         return socket
+
+    async def _may_come(self, address: str) -> bool:
+        """Let an address connect now and then: whoever is dropped and comes back at once takes the frames' time."""
+        if address not in self._arrivals:
+            while len(self._arrivals) >= _MOST_ADDRESSES:
+                del self._arrivals[next(iter(self._arrivals))]
+            self._arrivals[address] = protocol.Bucket(CONNECTIONS_PER_SECOND, 2 * CONNECTIONS_PER_SECOND)
+        bucket = self._arrivals[address]
+        if self._waiting >= MOST_VIEWERS:
+            return False
+        self._waiting += 1
+        try:
+            while not bucket.take(1.0, time.monotonic()):
+                await asyncio.sleep(1.0 / CONNECTIONS_PER_SECOND)
+        finally:
+            self._waiting -= 1
+        return True
 
     def _hello(self) -> dict[str, Any]:
         return {
