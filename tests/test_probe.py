@@ -490,6 +490,15 @@ def test_clipped_share(device, code, share):
     assert (clipped[confidence > 0] == [0.0, share, 0.0]).all()
 
 
+@pytest.mark.parametrize(("codes", "shares"), [((255, 248, 247), (1.0, 1.0, 0.0)), ((253, 250, 248), (0.0, 0.0, 0.0))])
+def test_a_channel_that_chroma_lowered_counts_beside_one_that_clips(device, codes, shares):
+    view = look(0.4)
+    frame = constant_frame(view, 10)
+    frame[:] = codes
+    _, confidence, clipped = unwrap(view, frame)
+    assert (clipped[confidence > 0] == shares).all()
+
+
 def test_a_lens_that_folds_over_shows_nothing_twice(device):
     """Barrel distortion of k1 = -0.5 turns back at 55 degrees; a ball beyond that is not in the frame, whatever the
     formula says."""

@@ -118,7 +118,7 @@ def gather(frame, table, reflectance, corner, rung, rim_start, rim_width, half_d
     radiance, clipped = np.zeros((height, width, 3)), np.zeros((height, width, 3))
     confidence = np.zeros((height, width))
     linear = np.stack([table[frame[..., c], c] for c in range(3)], -1).astype(np.float64)
-    full = (frame >= 254).astype(np.float64)
+    full = (frame >= np.where((frame >= 254).any(-1, keepdims=True), 248, 254)).astype(np.float64)
 
     def fetch(image, x, y):
         i, j = int(y), int(x)
