@@ -12,6 +12,9 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
 
+MOST_PROCESSES = 4
+"""Processes that a run of a folder is spread over at most: each takes 1 to 2 GB."""
+
 # Every run tries the same few examples; ``--hypothesis-profile deep`` searches for new ones.
 _PROFILE = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
 hypothesis.settings.register_profile("ci", derandomize=True, max_examples=15, **_PROFILE)
@@ -31,6 +34,29 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "atlas(row, stage, rung): hard case that a test covers; see hard_cases")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Run a folder of tests in one process per core.
+
+    Single files and tests stay in this process, where starting others would take longer than they save, and a debugger
+    works; so does everything where there is a GPU, which the processes would share. ``-n`` says otherwise.
+    """
+    option = config.option
+    if not config.pluginmanager.hasplugin("xdist") or option.numprocesses is not None or option.dist != "no":
+        return
+    if hasattr(config, "workerinput") or option.usepdb or option.capture == "no" or option.collectonly:
+        return
+    if len(_devices()) > 1 or not all(pathlib.Path(argument).is_dir() for argument in config.args):
+        return
+    option.numprocesses = min(MOST_PROCESSES, _cores())
+    # Tests differ in length by a factor of a thousand: whoever is done takes from the others.
+    option.dist = "worksteal"
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Note in every report which hard cases a test covers."""
     from tests.hard_cases import atlas
@@ -38,7 +64,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
     atlas.collected[:] = items
-    if config.getoption("--atlas"):
+    if config.getoption("--atlas") and os.environ.get("PYTEST_XDIST_WORKER", "gw0") == "gw0":
         atlas.write_collection(items, config.getoption("--atlas"))
 
 

@@ -228,22 +228,24 @@ def clip():
     return frames()
 
 
-def irradiance(light):
-    """On 200 directions all around."""
+def irradiance(light, rows=None):
+    """On 200 directions all around; of a band of the map's rows, all if left out."""
     height, width = light.shape[:2]
-    rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
-    toward = latlong_reference.directions(height, width, rows, columns).reshape(-1, 3)
+    rows = np.arange(height) if rows is None else rows
+    at = np.meshgrid(rows + 0.5, np.arange(width) + 0.5, indexing="ij")
+    toward = latlong_reference.directions(height, width, *at).reshape(-1, 3)
     normals = np.random.default_rng(0).normal(size=(200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    weight = latlong_reference.solid_angles(height, width).reshape(-1, 1)
-    return np.maximum(normals @ toward.T, 0.0) @ (weight * light.reshape(-1, 3))
+    weight = latlong_reference.solid_angles(height, width)[rows].reshape(-1, 1)
+    return np.maximum(normals @ toward.T, 0.0) @ (weight * light[rows].reshape(-1, 3))
 
 
 def true_irradiance():
     height = 1024
     rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(2 * height) + 0.5, indexing="ij")
     light = room_light(latlong_reference.directions(height, 2 * height, rows, columns))
-    return irradiance(light)
+    # Band by band: cosines of all texels with all directions at once are gigabytes.
+    return sum(irradiance(light, band) for band in np.split(np.arange(height), 128))
 
 
 def captured(clip, device, exposures, quality, lit=3):

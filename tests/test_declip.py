@@ -186,6 +186,26 @@ def test_ball_pixel_shows_what_it_mirrors(device):
     assert (run(frame, BALL, environment(), looking_at_ball())[32, 32] == 1.0).all()
 
 
+@pytest.mark.parametrize("pixel", [(32, 34), (30, 32), (33, 30), (34, 33)])
+def test_ball_pixel_off_the_middle_shows_what_it_mirrors(device, pixel):
+    """A lamp where the pixel's ray is mirrored to is found; one along the ball's normal there, or behind it, is not."""
+    frame = np.full((65, 65, 3), 60, np.uint8)
+    frame[pixel] = 255
+    x, y = rays(65, 65)[pixel]
+    direction, eye = np.array([x, 1.0, -y]) / np.linalg.norm([x, 1.0, y]), np.array([0.0, -DISTANCE, 0.0])
+    along = direction @ eye
+    normal = (eye + (-along - np.sqrt(along**2 - DISTANCE**2 + RADIUS**2)) * direction) / RADIUS
+    mirrored = direction - 2.0 * (direction @ normal) * normal
+
+    def lit_from(d):
+        room = environment(spots=[(np.arccos(d[2]), np.arctan2(d[1], d[0]), 0.2, 30.0)])
+        return run(frame, BALL, room, looking_at_ball())[pixel]
+
+    assert (lit_from(mirrored) >= 24.0**0.5).all()
+    for elsewhere in (normal, direction, -mirrored):
+        assert (lit_from(elsewhere) == 1.0).all()
+
+
 @pytest.mark.parametrize("distance", [0.45, 1.0, 1e4])
 def test_lamp_beyond_the_scene_is_found_at_its_distance(device, distance):
     """A lamp seen up left of the ball: the ball sees it elsewhere the nearer it is."""

@@ -91,6 +91,9 @@ def test_coordinates_of_poles_and_of_more_than_unit_length(device):
     np.testing.assert_allclose(at[:4, 0], [0, 64, 0, 64], atol=TEXEL)
     np.testing.assert_allclose(at[5:, 0], 32, atol=TEXEL)
     assert set(np.round(at[5:, 1]).tolist()) <= {0.0, 128.0}
+    # A hundredth of a milliradian from a pole, where the cosine is 1: atan2's own rounding, no more.
+    beside = run(coordinates_kernel, [64, 128], np.array([[1e-5, 0, 1], [0, 3e-5, 1]], np.float32), wp.vec3, wp.vec2)
+    np.testing.assert_allclose(beside[:, 0], 64 / np.pi * np.array([1e-5, 3e-5]), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)

@@ -158,8 +158,7 @@ class _View:
         if any(camera.distortion):
             origin = np.zeros(3)
             pixels = cv2.projectPoints(local, origin, origin, camera.matrix(), np.array(camera.distortion))[0][:, 0]
-        inside = ((pixels > 2) & (pixels < (camera.width - 3, camera.height - 3))).all(1)
-        return np.asarray(pixels, np.float64), front & inside
+        return np.asarray(pixels, np.float64), front & _within(pixels, 2.0, (camera.width - 3, camera.height - 3))
 
     def disc(self, center: Array, radius: float, across: int) -> Array:
         """Pixels of samples on a ball, (n, 2)."""
@@ -173,7 +172,21 @@ class _View:
         inside = x**2 + y**2 < RIM**2
         pixels = middle + reach * np.column_stack([x[inside], y[inside]])
         edge = (self.camera.width - 2, self.camera.height - 2)
-        return np.asarray(pixels[((pixels > 1) & (pixels < edge)).all(1)], np.float64)
+        return np.asarray(pixels[_within(pixels, 1.0, edge)], np.float64)
+
+
+# Sums and maxima over two or three columns are written out: NumPy is several times slower along a short last axis.
+
+
+def _within(pixels: Array, low: float, high: tuple[float, float]) -> NDArray[np.bool_]:
+    """Which pixels (n, 2) lie inside a rectangle."""
+    x, y = pixels[:, 0], pixels[:, 1]
+    return np.asarray((x > low) & (x < high[0]) & (y > low) & (y < high[1]))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products of rows, (n,)."""
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
 
 
 class _Desk:
@@ -196,10 +209,12 @@ class _Desk:
                 if half[2] == 0.0:
                     t = -o[:, 2] / d[:, 2]
                     p = o + t[:, None] * d
-                    hit = (np.abs(p[:, :2]) <= half[:2]).all(1)
+                    hit = (np.abs(p[:, 0]) <= half[0]) & (np.abs(p[:, 1]) <= half[1])
                 else:
                     a, b = (-half - o) / d, (half - o) / d
-                    t, leave = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+                    first, last = np.minimum(a, b), np.maximum(a, b)
+                    t = np.maximum(np.maximum(first[:, 0], first[:, 1]), first[:, 2])
+                    leave = np.minimum(np.minimum(last[:, 0], last[:, 1]), last[:, 2])
                     hit = t <= leave
             nearest = np.where(hit & (t > 1e-6) & (t < nearest), t, nearest)
         for center, radius in self._others:
@@ -210,8 +225,8 @@ class _Desk:
 def _meet_ball(center: Array, radius: float, origin: Array, direction: Array) -> Array:
     """Distance along unit directions to a ball, infinite where it is missed."""
     o = origin - center
-    b = (o * direction).sum(-1)
-    disc = b**2 - (o**2).sum(-1) + radius**2
+    b = _dot(o, direction)
+    disc = b**2 - _dot(o, o) + radius**2
     t = -b - np.sqrt(np.maximum(disc, 0.0))
     return np.where((disc > 0.0) & (t > 0.0), t, np.inf)
 
@@ -238,14 +253,14 @@ class _Task:
         told = np.isfinite(t)
         point = eye + np.where(told, t, 1.0)[:, None] * direction
         normal = (point - center) / radius
-        mirrored = direction - 2.0 * (direction * normal).sum(-1, keepdims=True) * normal
+        mirrored = direction - 2.0 * _dot(direction, normal)[:, None] * normal
         s = self.desk.trace(point, mirrored)
         told &= np.isfinite(s)
         hit = point + np.where(told, s, 1.0)[:, None] * mirrored
         seen, inside = view.project(hit)
         told &= inside
         away = hit - eye
-        distance = np.linalg.norm(away, axis=1)
+        distance = np.sqrt(_dot(away, away))
         away /= np.maximum(distance, 1e-9)[:, None]
         # The ball with a margin: it bleeds into what is blurred.
         told &= _meet_ball(center, 1.1 * radius, eye, away) > distance
@@ -261,7 +276,7 @@ class _Task:
         total, count = 0.0, 0
         for view in self.views:
             e, told = self.residuals(view, center, self.pixels(view, center))
-            squared = (e[told] ** 2).mean(1)
+            squared = _dot(e, e)[told] / 3.0
             total += float((squared / (squared + scale**2)).sum())
             count += len(squared)
         height = center[2] - self.probe.center[2]
@@ -281,10 +296,10 @@ class _Task:
                 columns.append((ahead - behind) / (2.0 * DIFFERENCE))
                 told = told & told_ahead & told_behind
             jacobian, e = np.stack(columns, -1)[told], e[told]
-            weight = (scale**2 / (scale**2 + (e**2).mean(1))) ** 2
+            weight = (scale**2 / (scale**2 + _dot(e, e) / 3.0)) ** 2
             matrix += np.einsum("n,nci,ncj->ij", weight, jacobian, jacobian)
             vector += np.einsum("n,nci,nc->i", weight, jacobian, e)
-            squares += float((weight * (e**2).mean(1)).sum())
+            squares += float((weight * _dot(e, e) / 3.0).sum())
             weights += float(weight.sum())
             count += len(e)
         matrix[2, 2] += count * scale**2 * HEIGHT_COST

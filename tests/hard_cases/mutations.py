@@ -1,4 +1,4 @@
-"""Would the suite notice? For every row of the atlas one deliberate break, and the test that must turn red.
+"""Would the suite notice? For every row of the atlas two deliberate breaks or more, and the test that must turn red.
 
     python -m tests.hard_cases.mutations [ROW ...] [--jobs N]
 
@@ -51,12 +51,28 @@ MUTATIONS = (
         f"{HARD}test_rows01_03_probe.py::test_light_straight_back_along_an_axis",
     ),
     Mutation(
+        1,
+        "the ball shows what lies along its normals",
+        "kernels/declip.py",
+        "mirrored = direction - 2.0 * wp.dot(direction, normal) * normal",
+        "mirrored = normal",
+        "tests/test_declip.py::test_ball_pixel_off_the_middle_shows_what_it_mirrors",
+    ),
+    Mutation(
         2,
         "orthographic unwrapping: the reflected ray of a camera at infinity",
         "kernels/probe.py",
         "        toward = wp.vec2(distance - n[0], -n[1])\n",
         "        toward = wp.vec2(1.0e6, 0.0)\n",
         "tests/test_probe.py::test_normals_reflect_every_direction_to_the_camera",
+    ),
+    Mutation(
+        2,
+        "what the camera sees is infinitely far from the ball",
+        "kernels/declip.py",
+        "share = NEAREST * wp.float32(step) / wp.float32(STEPS)",
+        "share = wp.float32(0.0)",
+        "tests/test_declip.py::test_lamp_beyond_the_scene_is_found_at_its_distance",
     ),
     Mutation(
         3,
@@ -101,6 +117,14 @@ MUTATIONS = (
         "    if normal[2] < 0.0:\n        sign = wp.float32(-1.0)\n",
         "",
         f"{HARD}test_rows04_05_directions.py::test_directions_an_ulp_beyond_unit_length",
+    ),
+    Mutation(
+        5,
+        "the angle to the pole by acos",
+        "kernels/latlong.py",
+        "    theta = wp.atan2(radial, direction[2])\n",
+        "    theta = wp.acos(direction[2])\n",
+        "tests/test_latlong.py::test_coordinates_of_poles_and_of_more_than_unit_length",
     ),
     Mutation(
         6,
@@ -151,12 +175,29 @@ MUTATIONS = (
         "tests/test_materials.py::test_ggx_matches_reference",
     ),
     Mutation(
+        8,
+        "a mirror's level by the logarithm of its width",
+        "kernels/prefilter.py",
+        "    if alpha < narrowest:\n        return wp.max(alpha, 0.0) / narrowest\n",
+        "",
+        "tests/test_prefilter.py::test_levels_grow_with_roughness_and_fall_with_shininess",
+    ),
+    Mutation(
         9,
         "1 / d^2 without a nearest distance",
         "kernels/shadow.py",
         "                d = wp.max(distance, wp.max(light.radius, MIN_DISTANCE))\n",
         "                d = distance\n",
         "tests/test_shadow.py::test_at_the_light_itself",
+    ),
+    Mutation(
+        9,
+        "a cone whose angles are equal divides by their difference",
+        "kernels/shadow.py",
+        "    if angle <= light.inner_angle:\n        return 1.0\n"
+        "    if angle >= light.outer_angle:\n        return 0.0\n",
+        "",
+        "tests/test_shadow.py::test_cone_angles_at_their_ends",
     ),
     Mutation(
         10,
@@ -181,6 +222,14 @@ MUTATIONS = (
         "        total -= table[r0 - 1, c1 - 1]\n",
         "        total -= table[r0, c1 - 1]\n",
         f"{HARD}test_rows11_12_exposure.py::test_any_box_of_any_frame",
+    ),
+    Mutation(
+        11,
+        "what lies beyond the frame counts as black",
+        "kernels/summed_area.py",
+        "wp.float32(wp.max((r1 - r0) * (c1 - c0), 1))",
+        "wp.float32(size * size)",
+        f"{HARD}test_rows11_12_exposure.py::test_a_white_frame_of_any_size_fades_evenly",
     ),
     Mutation(
         12,
@@ -248,6 +297,22 @@ MUTATIONS = (
         f"{HARD}test_rows15_16_input.py::test_lost_and_found_every_frame",
     ),
     Mutation(
+        15,
+        "of a plane's two poses the one that fits this frame better",
+        "warp_ar/tracking.py",
+        "        if guess is None or len(fits) < 2:\n",
+        "        if True:\n",
+        "tests/test_tracking.py::test_pose_does_not_flip",
+    ),
+    Mutation(
+        15,
+        "of two markers with one number the first in the list",
+        "warp_ar/tracking.py",
+        "for d in sorted(found, key=rank):",
+        "for d in found:",
+        "tests/test_tracking.py::test_two_with_one_id",
+    ),
+    Mutation(
         16,
         "any array is a frame",
         "warp_ar/pipeline.py",
@@ -256,12 +321,36 @@ MUTATIONS = (
         f"{HARD}test_rows15_16_input.py::test_what_is_no_frame_is_refused_and_the_next_one_works",
     ),
     Mutation(
+        16,
+        "frames of a folder may have any size",
+        "warp_ar/sources.py",
+        "            _check_size(image, self.size, str(path), index)\n",
+        "",
+        "tests/test_sources.py::test_size_that_changes_is_named",
+    ),
+    Mutation(
+        16,
+        "of 16 bits the upper 8",
+        "warp_ar/sources.py",
+        "((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)",
+        "(picture >> 8).astype(np.uint8)",
+        "tests/test_sources.py::test_grey_alpha_and_16_bit_become_rgb",
+    ),
+    Mutation(
         17,
         "bands start one row late",
         "kernels/launch.py",
         "inputs=[start, *inputs]",
         "inputs=[start + (1 if start else 0), *inputs]",
         f"{HARD}test_row17_same_answer.py::test_run_to_run_and_in_any_bands[cpu-visibility-default]",
+    ),
+    Mutation(
+        17,
+        "the last band ends a row early",
+        "warp_ar/scheduler.py",
+        "start + (stop - start) * band // bands for band",
+        "start + (stop - start - (bands > 1)) * band // bands for band",
+        f"{HARD}test_row17_same_answer.py::test_bands_of_threads",
     ),
     Mutation(
         18,
@@ -295,7 +384,7 @@ CAUGHT = "caught"
 
 def passes(folder: pathlib.Path, test: str) -> bool:
     """Whether a test of the copy passes; a crash is red, an error of collection is no answer."""
-    command = [sys.executable, "-m", "pytest", test, "-x", "-q", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", test, "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     run = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     if run.returncode > 1:
