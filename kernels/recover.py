@@ -44,8 +44,9 @@ BALL_MARGIN = wp.constant(wp.float32(1.08))
 """How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
 FULL_TRUST = wp.constant(wp.float32(0.5))
 """Confidence above which a texel counts as seen; as for filling."""
-LIT = wp.constant(wp.float32(0.02))
-"""Clipped share from which a cell's light is where it clips, and not where nothing is seen."""
+LOST = 0.02
+"""Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
+_LOST = wp.constant(wp.float32(LOST))
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
@@ -140,7 +141,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
         cell.hidden /= cell.solid_angle
-        if wp.max(cell.clipped) > LIT:
+        if wp.max(cell.clipped) > _LOST:
             cell.hidden = 0.0
         else:
             cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)

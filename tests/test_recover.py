@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import itertools
@@ -535,12 +536,13 @@ def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
 
 
 def spied_estimates(monkeypatch, seconds=0.0):
-    """Let the n-th estimate, from 1 on, put n into every cell; it takes ``seconds``."""
-    numbers = itertools.count(1)
+    """Let a solver's n-th estimate, from 1 on, put n into every cell; it takes ``seconds``."""
+    # By solver: that of a pipeline which is closed already may still be at its last one.
+    numbers = collections.defaultdict(lambda: itertools.count(1))
 
     def update(self, cells, *_):
         time.sleep(seconds)
-        return recovery.Estimate(np.full((*cells.shape, 3), next(numbers), np.float32), (False,) * 3)
+        return recovery.Estimate(np.full((*cells.shape, 3), next(numbers[self]), np.float32), (False,) * 3)
 
     monkeypatch.setattr(recovery.Recovery, "update", update)
 

@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.geometry import rotation_matrix
-from warp_ar.kernels.recover import SurfacePoint
+from warp_ar.kernels.recover import LOST, SurfacePoint
 from warp_ar.scene import Scene
 from warp_ar.tracking import printed_cells
 
@@ -94,8 +94,6 @@ MIRROR_TRUST: Final = 0.5
 """Relative standard deviation of light that comes by way of a ball: dents, scratches and dust scatter it."""
 ITERATIONS: Final = 6
 WARM_ITERATIONS: Final = 3
-LOST: Final = 0.02
-"""Clipped share of a cell from which it belongs to a region."""
 DARK: Final = 0.005
 """pi times radiance below which a point says nothing: quantisation."""
 
