@@ -19,13 +19,13 @@ def main(device: str) -> None:
         values = np.random.default_rng(0).integers(0, 256, (height, width), dtype=np.uint8)
         frame = wp.array(np.repeat(values[..., None], 3, axis=2), dtype=wp.vec3ub, device=device)
         table = wp.zeros((height, width), wp.uint32, device=device)
-        sums = [wp.zeros(shape, wp.uint32, device=device) for shape in summed_area.tiled_shapes(height, width)]
+        sums = [wp.zeros(shape, wp.uint32, device=device) for shape in summed_area.strip_shapes(height, width)]
 
         def ours(frame=frame, sums=sums, table=table):
             if frame.device.is_cpu:
                 summed_area.sum_area(frame, table)
             else:
-                summed_area.sum_area_tiled(frame, *sums, table)
+                summed_area.sum_area_by_strips(frame, *sums, table)
 
         ours()
         exact = values.cumsum(0, dtype=np.uint32).cumsum(1, dtype=np.uint32)

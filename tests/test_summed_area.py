@@ -54,14 +54,29 @@ def test_intensity_of_grey_is_its_value(device):
     np.testing.assert_array_equal(make_table(grey).numpy()[0], np.arange(256).cumsum())
 
 
-# Widths: one tile, several, a whole number of them; rows aligned to words (multiples of 4) and not; several strips.
-@pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 3), (64, 128), (33, 132), (130, 4400), (1600, 257)])
-def test_tiled_form_matches_twin(device, size):
-    frame = random_frame(*size)
-    table = wp.zeros(size, wp.uint32)
-    sums = [wp.full(shape, 7, dtype=wp.uint32) for shape in summed_area.tiled_shapes(*size)]
-    summed_area.sum_area_tiled(wp.array(frame, dtype=wp.vec3ub), *sums, table)
-    np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
+# One warp and many, columns to spare and none; rows aligned to words (multiples of 4) and not; one strip, several
+# groups of strips, strips of one row and of several, the last one cut short; more columns than a block has threads for.
+@pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 3), (64, 128), (333, 132), (130, 4400), (1600, 257)])
+def test_strips_match_twin(device, size):
+    """And again over what the launch before left, whose marks must not count."""
+    shapes = summed_area.strip_shapes(*size)
+    sums, state = [wp.full(shape, 7, dtype=wp.uint32) for shape in shapes[:2]], wp.zeros(shapes[2], wp.uint32)
+    for seed in range(3):
+        frame = random_frame(*size, seed)
+        table = wp.full(size, 7, dtype=wp.uint32)
+        summed_area.sum_area_by_strips(wp.array(frame, dtype=wp.vec3ub), *sums, state, table)
+        np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
+
+
+def test_strips_of_white_are_exact(device):
+    """The largest sums that halves of words must hold, and a table that overflows."""
+    height, width = 4320, 7680 if device != "cpu" else 64
+    shapes = summed_area.strip_shapes(height, width)
+    scratch = [wp.zeros(shape, wp.uint32) for shape in shapes]
+    table = wp.zeros((height, width), wp.uint32)
+    summed_area.sum_area_by_strips(wp.array(white(height, width), dtype=wp.vec3ub), *scratch, table)
+    counts = np.outer(np.arange(1, height + 1, dtype=np.int64), np.arange(1, width + 1))
+    np.testing.assert_array_equal(table.numpy(), (255 * counts) % 2**32)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 1), (63, 64), (130, 257)])

@@ -31,20 +31,21 @@ class SummedArea(Stage):
         return Wiring(("frame",), ("summed_area",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The table, and the sums on the way to it by tiles."""
+        """The table, and the sums on the way to it by strips."""
         width, height = self.request.size
-        names = ("summed_area_row_sums", "summed_area_column_sums", "summed_area_totals")
-        shapes = zip(names, summed_area.tiled_shapes(height, width), strict=True)
+        names = ("summed_area_sums", "summed_area_group_sums", "summed_area_state")
+        shapes = zip(names, summed_area.strip_shapes(height, width), strict=True)
         sums = {name: ArraySpec(shape, wp.uint32) for name, shape in shapes}
         return {"summed_area": ArraySpec((height, width), wp.uint32), **sums}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """On CPU rows in bands of rows, then columns in bands of columns; on CUDA by tiles."""
+        """On CPU rows in bands of rows, then columns in bands of columns; on CUDA by strips."""
         width, height = self.request.size
         frame, table = arrays["frame"], arrays["summed_area"]
         if not device.is_cpu:
-            sums = [arrays[f"summed_area_{name}"] for name in ("row_sums", "column_sums", "totals")]
-            return [Pass(lambda rows: summed_area.sum_area_tiled(frame, *sums, table))]
+            sums = [arrays[f"summed_area_{name}"] for name in ("sums", "group_sums", "state")]
+            summed_area.make_sum_strips_kernel(summed_area.strip_config(height, width, device))
+            return [Pass(lambda rows: summed_area.sum_area_by_strips(frame, *sums, table))]
         return [
             Pass(lambda rows: summed_area.sum_along_rows(frame, table, rows=rows), rows=height),
             Pass(lambda columns: summed_area.sum_along_columns(table, columns=columns), rows=width),
