@@ -4,7 +4,7 @@
 
 in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
 the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
-an earlier frame left elsewhere is not seen.
+an earlier frame left elsewhere is not seen, and not read.
 """
 
 from __future__ import annotations
@@ -14,6 +14,16 @@ import functools
 
 import warp as wp
 
+from warp_ar.kernels.codes import (
+    WARP_LANES,
+    WARP_PIXELS,
+    by_warps,
+    get_code,
+    load_codes,
+    set_code,
+    store_codes,
+    warp_threads,
+)
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
@@ -43,71 +53,58 @@ def in_rect(rect: wp.vec4i, row: wp.int32, col: wp.int32) -> wp.bool:
 
 
 @functools.cache
-def make_is_changed(config: CompositeConfig) -> wp.Function:
-    """Whether a layer touches a pixel: ``is_changed(params, virtual, added, ratio, row, col) -> bool``."""
+def make_read_layers(config: CompositeConfig) -> wp.Function:
+    """What lies over a pixel: ``virtual, added, ratio = read_layers(params, virtual, added, ratio, row, col)``.
+
+    A layer that is not there, or does not reach the pixel, changes nothing: it is 0, or a ratio of 1. All are read
+    before any is looked at: one after another would be as many times the memory's latency.
+    """
 
     @wp.func(module="unique")
-    def is_changed(
+    def read_layers(
         params: wp.array[FrameParams],
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
         row: wp.int32,
         col: wp.int32,
-    ) -> wp.bool:
+    ):
+        virtual = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        added = wp.vec3(0.0, 0.0, 0.0)
+        ratio = wp.vec3(1.0, 1.0, 1.0)
         if wp.static(config.virtual):
             if in_rect(params[0].object_rect, row, col):
-                neutral = virtual_layer[row, col] == wp.vec4(0.0, 0.0, 0.0, 0.0)
-                if not neutral:  # NaN is a change
-                    return True
+                virtual = virtual_layer[row, col]
         if wp.static(config.added):
             if in_rect(params[0].light_rect, row, col):
-                neutral = physical_added[row, col] == wp.vec3(0.0, 0.0, 0.0)
-                if not neutral:  # NaN is a change
-                    return True
+                added = physical_added[row, col]
         if wp.static(config.ratio):
-            neutral = physical_ratio[row, col] == wp.vec3(1.0, 1.0, 1.0)
-            if not neutral:  # NaN is a change
-                return True
-        return False
+            if in_rect(params[0].shadow_rect, row, col):
+                ratio = physical_ratio[row, col]
+        return virtual, added, ratio
 
-    return is_changed
+    return read_layers
+
+
+@wp.func
+def is_changed(virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3) -> wp.bool:
+    """Whether layers touch a pixel; NaN does."""
+    neutral = virtual == wp.vec4(0.0, 0.0, 0.0, 0.0) and added == wp.vec3(0.0, 0.0, 0.0)
+    neutral = neutral and ratio == wp.vec3(1.0, 1.0, 1.0)
+    return not neutral
+
+
+@wp.func
+def compose(radiance: wp.vec3, virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3) -> wp.vec3:
+    """All layers over the frame's radiance."""
+    physical = wp.cw_mul(radiance, ratio) + added
+    return (1.0 - virtual[3]) * physical + wp.vec3(virtual[0], virtual[1], virtual[2])
 
 
 @functools.cache
-def make_compose(config: CompositeConfig) -> wp.Function:
-    """All layers over the frame's radiance: ``compose(radiance, params, virtual, added, ratio, row, col) -> vec3``."""
-
-    @wp.func(module="unique")
-    def compose(
-        frame_radiance: wp.vec3,
-        params: wp.array[FrameParams],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        row: wp.int32,
-        col: wp.int32,
-    ) -> wp.vec3:
-        radiance = frame_radiance
-        if wp.static(config.ratio):
-            radiance = wp.cw_mul(radiance, physical_ratio[row, col])
-        if wp.static(config.added):
-            if in_rect(params[0].light_rect, row, col):
-                radiance += physical_added[row, col]
-        if wp.static(config.virtual):
-            if in_rect(params[0].object_rect, row, col):
-                layer = virtual_layer[row, col]
-                radiance = (1.0 - layer[3]) * radiance + wp.vec3(layer[0], layer[1], layer[2])
-        return radiance
-
-    return compose
-
-
-@functools.cache
-def make_composite_kernel(config: CompositeConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
-    is_changed = make_is_changed(config)
-    compose = make_compose(config)
+def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
+    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
+    read_layers = make_read_layers(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def composite_kernel(
@@ -126,13 +123,26 @@ def make_composite_kernel(config: CompositeConfig) -> wp.Kernel:
     ):
         i, part = wp.tid()
         i += row_start
-        for j in range(part * run, wp.min(part * run + run, frame.shape[1])):
-            code = frame[i, j]
-            if is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
-                radiance = decode(decode_table, code)
-                radiance = compose(radiance, params, virtual_layer, physical_added, physical_ratio, i, j)
-                code = encode(encode_table, radiance)
-            image_out[i, j] = code
+        if wp.static(warps):
+            first = part // WARP_LANES * WARP_PIXELS
+            codes = load_codes(frame, i, first)
+            k = part % WARP_LANES
+            while k < WARP_PIXELS:
+                j = first + k
+                if j < frame.shape[1]:
+                    virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
+                    if is_changed(virtual, added, ratio):
+                        radiance = compose(decode(decode_table, get_code(codes, k)), virtual, added, ratio)
+                        set_code(codes, k, encode(encode_table, radiance))
+                k += WARP_LANES
+            store_codes(codes, image_out, i, first)
+        else:
+            for j in range(part * run, wp.min(part * run + run, frame.shape[1])):
+                code = frame[i, j]
+                virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
+                if is_changed(virtual, added, ratio):
+                    code = encode(encode_table, compose(decode(decode_table, code), virtual, added, ratio))
+                image_out[i, j] = code
 
     return composite_kernel
 
@@ -155,20 +165,21 @@ def composite(
     Args:
         config: Layers; those that it leaves out may be None.
         params: (1,) FrameParams; its rectangles bound the layers.
-        frame: (H, W) vec3ub, the camera's frame, RGB.
+        frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
         decode_table: (256,) vec3 of ``color.decode_table``.
         encode_table: Table of ``color.encode_table``.
         virtual: (H, W) vec4, premultiplied linear radiance and coverage.
         physical_added: (H, W) vec3, linear radiance.
         physical_ratio: (H, W) vec3, factor on the frame's linear radiance.
-        image_out: (H, W) vec3ub; values above clipping give 255, NaN gives 0.
+        image_out: (H, W) vec3ub, contiguous; values above clipping give 255, NaN gives 0.
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
     run = CPU_RUN if frame.device.is_cpu else 1
+    warps = by_warps(frame.device, width)
     launch_rows(
-        make_composite_kernel(config),
-        (height, -(-width // run)),
+        make_composite_kernel(config, warps),
+        (height, warp_threads(width) if warps else -(-width // run)),
         [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio, run],
         [image_out],
         rows=rows,

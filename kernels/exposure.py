@@ -53,8 +53,18 @@ from typing import Literal
 
 import warp as wp
 
+from warp_ar.kernels.codes import (
+    WARP_LANES,
+    WARP_PIXELS,
+    by_warps,
+    get_code,
+    load_codes,
+    set_code,
+    store_codes,
+    warp_threads,
+)
 from warp_ar.kernels.color import decode, encode
-from warp_ar.kernels.composite import CompositeConfig, in_rect, make_compose, make_is_changed
+from warp_ar.kernels.composite import CompositeConfig, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.probe import is_clipped
 from warp_ar.kernels.structs import FrameParams
@@ -164,7 +174,7 @@ def level_of(peak: wp.float32) -> wp.int32:
 @functools.cache
 def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
     """Kernel that counts, per sampled row, how many pixels under virtual light fall into each level."""
-    compose = make_compose(layers)
+    read_layers = make_read_layers(layers)
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_levels_kernel(
@@ -189,15 +199,10 @@ def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
         for j in range(rect[2], rect[3], _AUTO_STRIDE):
             code = frame[i, j]
             clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
-            hidden = bool(False)
-            if wp.static(layers.virtual):
-                if in_rect(params[0].object_rect, i, j):
-                    hidden = virtual_layer[i, j][3] > 0.5
-            dark = physical_added[i, j] == wp.vec3(0.0, 0.0, 0.0)
-            if not clipped and not hidden and not dark:
-                radiance = compose(
-                    decode(decode_table, code), params, virtual_layer, physical_added, physical_ratio, i, j
-                )
+            virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
+            dark = added == wp.vec3(0.0, 0.0, 0.0)
+            if not clipped and not virtual[3] > 0.5 and not dark:
+                radiance = compose(decode(decode_table, code), virtual, added, ratio)
                 level = level_of(wp.max(radiance))
                 levels_out[strip, level] = levels_out[strip, level] + 1
 
@@ -234,10 +239,44 @@ def adapt_scale_kernel(
 
 
 @functools.cache
-def make_expose_kernel(config: ExposureConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
-    is_changed = make_is_changed(config.layers)
-    compose = make_compose(config.layers)
+def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
+    """Kernel specialised to ``config``, by warps (see ``codes``) or by pixels; equal ones share one kernel."""
+    read_layers = make_read_layers(config.layers)
+
+    @wp.func(module="unique")
+    def exposed(
+        code: wp.vec3ub,
+        i: wp.int32,
+        j: wp.int32,
+        params: wp.array[FrameParams],
+        decode_table: wp.array[wp.vec3],
+        encode_table: wp.array[wp.vec3],
+        virtual_layer: wp.array2d[wp.vec4],
+        physical_added: wp.array2d[wp.vec3],
+        physical_ratio: wp.array2d[wp.vec3],
+        table: wp.array2d[wp.uint32],
+        max_box: wp.int32,
+        declipped: wp.array2d[wp.vec3],
+        s: wp.float32,
+        codes: wp.array[wp.vec3ub],
+    ) -> wp.vec3ub:
+        gain = float(1.0)
+        if wp.static(config.rung == "box"):
+            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
+            if least > KNEE and s < 1.0:
+                clipped = (least - KNEE) / (255.0 - KNEE)
+                gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
+        guessed = bool(gain != 1.0)
+        if wp.static(config.rung == "declipped"):
+            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
+        virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
+        if not guessed and not is_changed(virtual, added, ratio):
+            return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
+        radiance = gain * decode(decode_table, code)
+        if wp.static(config.rung == "declipped"):
+            if guessed:
+                radiance = declipped[i, j]
+        return encode(encode_table, s * compose(radiance, virtual, added, ratio))
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(
@@ -260,28 +299,49 @@ def make_expose_kernel(config: ExposureConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
-        code = frame[i, j]
-        s = scale[0]
-        gain = float(1.0)
-        if wp.static(config.rung == "box"):
-            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
-            if least > KNEE and s < 1.0:
-                clipped = (least - KNEE) / (255.0 - KNEE)
-                gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
-        guessed = bool(gain != 1.0)
-        if wp.static(config.rung == "declipped"):
-            guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
-        if not guessed and not is_changed(params, virtual_layer, physical_added, physical_ratio, i, j):
-            image_out[i, j] = wp.vec3ub(
-                codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2]
-            )
+        if wp.static(warps):
+            k = j % WARP_LANES
+            first = j // WARP_LANES * WARP_PIXELS
+            run = load_codes(frame, i, first)
+            while k < WARP_PIXELS:
+                j = first + k
+                if j < frame.shape[1]:
+                    code = exposed(
+                        get_code(run, k),
+                        i,
+                        j,
+                        params,
+                        decode_table,
+                        encode_table,
+                        virtual_layer,
+                        physical_added,
+                        physical_ratio,
+                        table,
+                        max_box,
+                        declipped,
+                        scale[0],
+                        codes,
+                    )
+                    set_code(run, k, code)
+                k += WARP_LANES
+            store_codes(run, image_out, i, first)
         else:
-            radiance = gain * decode(decode_table, code)
-            if wp.static(config.rung == "declipped"):
-                if guessed:
-                    radiance = declipped[i, j]
-            radiance = compose(radiance, params, virtual_layer, physical_added, physical_ratio, i, j)
-            image_out[i, j] = encode(encode_table, s * radiance)
+            image_out[i, j] = exposed(
+                frame[i, j],
+                i,
+                j,
+                params,
+                decode_table,
+                encode_table,
+                virtual_layer,
+                physical_added,
+                physical_ratio,
+                table,
+                max_box,
+                declipped,
+                scale[0],
+                codes,
+            )
 
     return expose_kernel
 
@@ -363,7 +423,7 @@ def expose(
     Args:
         config: Rung and layers; layers that it leaves out may be None.
         params: (1,) FrameParams; its rectangles bound the layers.
-        frame: (H, W) vec3ub, the camera's frame, RGB.
+        frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
         decode_table: (256,) vec3 of ``color.decode_table``.
         encode_table: Table of ``color.encode_table``.
         virtual: (H, W) vec4, premultiplied linear radiance and coverage.
@@ -372,13 +432,15 @@ def expose(
         table: (H, W) uint32, the frame's summed-area table; needed by ``box``.
         scale: (1,) float32, not negative.
         codes: (256,) vec3ub of ``expose_codes`` for this ``scale``.
-        image_out: (H, W) vec3ub.
+        image_out: (H, W) vec3ub, contiguous.
         declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
         rows: Band of rows; None means all.
     """
+    height, width = frame.shape
+    warps = by_warps(frame.device, width)
     launch_rows(
-        make_expose_kernel(config),
-        frame.shape,
+        make_expose_kernel(config, warps),
+        (height, warp_threads(width) if warps else width),
         [
             params,
             frame,
@@ -388,7 +450,7 @@ def expose(
             physical_added,
             physical_ratio,
             table,
-            largest_box(frame.shape[0]),
+            largest_box(height),
             declipped,
             scale,
             codes,

@@ -13,9 +13,9 @@ H, W = 24, 40
 CONFIGS = [composite.CompositeConfig(v, a, r) for v in (False, True) for a in (False, True) for r in (False, True)]
 
 
-def make_params(object_rect=(0, H, 0, W), light_rect=(0, H, 0, W), scale=1.0, time_step=0.0):
+def make_params(object_rect=(0, H, 0, W), light_rect=(0, H, 0, W), shadow_rect=(0, H, 0, W), scale=1.0, time_step=0.0):
     params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-    params["object_rect"], params["light_rect"] = object_rect, light_rect
+    params["object_rect"], params["light_rect"], params["shadow_rect"] = object_rect, light_rect, shadow_rect
     params["exposure_scale"], params["time_step"] = scale, time_step
     return wp.array(params, dtype=FrameParams)
 
@@ -90,17 +90,18 @@ def test_matches_twin(device, config):
 
 
 def test_layers_count_only_inside_their_rectangles(device):
-    frame, virtual, added, _ = make_layers(2)
-    object_rect, light_rect = (3, 15, 5, 21), (10, 24, 0, 33)
-    got = run(CONFIGS[6], frame, virtual, added, params=make_params(object_rect, light_rect))
-    inside_object, inside_light = reference.within(object_rect, (H, W)), reference.within(light_rect, (H, W))
+    frame, virtual, added, ratio = make_layers(2)
+    rects = (3, 15, 5, 21), (10, 24, 0, 33), (7, 20, 11, 39)
+    got = run(CONFIGS[7], frame, virtual, added, ratio, params=make_params(*rects))
+    inside_object, inside_light, inside_shadow = (reference.within(rect, (H, W)) for rect in rects)
     linear = reference.compose(
         reference_color.decode(color.decode_table("srgb"), frame),
         virtual * inside_object[..., None],
         added * inside_light[..., None],
+        np.where(inside_shadow[..., None], ratio, 1.0),
     )
     assert_codes(got, linear)
-    outside = ~(inside_object | inside_light)
+    outside = ~(inside_object | inside_light | inside_shadow)
     np.testing.assert_array_equal(got[outside], frame[outside])
 
 

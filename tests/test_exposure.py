@@ -18,7 +18,7 @@ def run(frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, r
     frame_array = wp.array(frame, dtype=wp.vec3ub)
     shape = frame.shape[:2]
     height, width = shape
-    params = make_params((0, height, 0, width), (0, height, 0, width), scale)
+    params = make_params(*3 * [(0, height, 0, width)], scale)
     decode, encode = tables(transfer)
     table, scale_array = wp.zeros(shape, wp.uint32), wp.zeros(1, wp.float32)
     codes, image = wp.zeros(256, wp.vec3ub), wp.zeros(shape, wp.vec3ub)
@@ -167,7 +167,7 @@ def test_impossible_scale_is_black(device, scale):
 def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None):
     frame = np.zeros((*added.shape[:2], 3), np.uint8) if frame is None else frame
     height, width = frame.shape[:2]
-    params = make_params((0, height, 0, width), (0, height, 0, width), time_step=time_step)
+    params = make_params(*3 * [(0, height, 0, width)], time_step=time_step)
     levels = wp.zeros((-(-height // exposure.AUTO_STRIDE), exposure.LEVELS), wp.int32)
     scale = wp.array([start], dtype=wp.float32)
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels import composite
+from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 
 
@@ -36,8 +37,8 @@ class Composite(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
         config = composite_config(layer_names(self.request))
-        composite.make_composite_kernel(config)
-        height = self.request.size[1]
+        width, height = self.request.size
+        composite.make_composite_kernel(config, by_warps(device, width))
         image, frame = arrays["image"], arrays["frame"]
 
         def launch(rows: Rows | None) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels import exposure
+from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import composite_config, exposes, layer_names
 from warp_ar.stages.declip import declips
@@ -58,7 +59,7 @@ class Expose(Stage):
         config = exposure.ExposureConfig(
             "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", layers
         )
-        exposure.make_expose_kernel(config)
+        exposure.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         virtual, added, ratio = (arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio"))
