@@ -1,7 +1,8 @@
 """Side by side with other programs in one run; what is not installed is left out and said so.
 
 Summed-area table: OpenCV (CPU), PyTorch and CuPy (CUDA) get the intensities ready-made, ours computes them from RGB.
-Resampling: PyTorch's ``grid_sample`` gets ready-made coordinates. Rays: Embree, one thread each.
+Resampling: PyTorch's ``grid_sample`` gets ready-made coordinates. Rays: Embree, one thread each; OptiX through
+Mitsuba's ``cuda_ad_rgb``, whose kernels are timed on the device. Unwrapping: skylibs on the host's processor.
 """
 
 from __future__ import annotations
@@ -17,14 +18,22 @@ import cv2
 import numpy as np
 import warp as wp
 
+from bench.bench_probe import empty_scene
 from bench.common import measure, paired_ratio, report
 from warp_ar.geometry import torus_mesh
-from warp_ar.kernels import summed_area
+from warp_ar.kernels import probe, summed_area
+from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.ray_scene import make_ray_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}
 RAYS = (480, 640)
 RUNS = 50
+BALL_RADIUS = 128
+"""Pixels from the centre of the ball that is unwrapped to its edge."""
+SAME_MAP = 0.02
+"""Mean difference of two unwrapped maps of one smooth picture, of values up to 1: ours sees a ball at a distance of
+500 radii, skylibs one from infinitely far; they round positions in a picture differently."""
 
 
 def optional(name: str) -> Any | None:
@@ -115,14 +124,14 @@ def bench_table_cuda(device: str) -> None:
         exact = values.cumsum(0, dtype=np.uint32).cumsum(1, dtype=np.uint32)
         frame = wp.array(np.repeat(values[..., None], 3, axis=2), dtype=wp.vec3ub, device=device)
         table = wp.zeros((height, width), wp.uint32, device=device)
-        scratch = [wp.zeros(s, wp.uint32, device=device) for s in summed_area.tiled_shapes(height, width)]
-        summed_area.sum_area_tiled(frame, *scratch, table)
+        scratch = [wp.zeros(s, wp.uint32, device=device) for s in summed_area.strip_shapes(height, width)]
+        summed_area.sum_area_by_strips(frame, *scratch, table)
         np.testing.assert_array_equal(table.numpy(), exact)
         # A plain copy that reads and writes as many bytes as the table must: 3 + 4 per pixel.
         half = height * width * 7 // 2
         source, target = (wp.zeros(half, wp.uint8, device=device) for _ in range(2))
         contenders = {
-            "tiled": with_warp(functools.partial(summed_area.sum_area_tiled, frame, *scratch, table), device),
+            "strips": with_warp(functools.partial(summed_area.sum_area_by_strips, frame, *scratch, table), device),
             "copy": with_warp(functools.partial(wp.copy, target, source), device),
             "rows_columns": with_warp(functools.partial(summed_area.sum_area, frame, table), device),
         }
@@ -226,7 +235,83 @@ def trace_kernel(mesh: wp.uint64, origin: wp.vec3, directions: wp.array2d[wp.vec
     depth_out[i, j] = wp.where(query.result, query.t, -1.0)
 
 
+def bench_unwrap(device: str) -> None:
+    envmap = optional("envmap")
+    if envmap is None:
+        return
+    size, distance = 2 * BALL_RADIUS, 500.0
+    focal = BALL_RADIUS * np.sqrt(distance**2 - 1.0)
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(0, 256, (8, 8, 3), dtype=np.uint8), (size, size), interpolation=cv2.INTER_CUBIC)
+    params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
+    params["camera_position"], params["world_from_camera"] = (distance, 0, 0), [[0, 0, -1], [1, 0, 0], [0, -1, 0]]
+    params["focal"], params["principal"] = focal, (size - 1) / 2
+    ball = np.zeros(1, np.dtype(Probe.numpy_dtype()))
+    ball["radius"], ball["reflectance"] = 1.0, 1.0
+    x, y = np.meshgrid(*2 * [np.arange(size) - (size - 1) / 2])
+    with wp.ScopedDevice(device):
+        scene, config = empty_scene(0), probe.ProjectConfig(())
+        params, ball = wp.array(params, dtype=FrameParams), wp.array(ball, dtype=Probe)
+        rays = wp.array(np.stack([x, y], -1) / focal, dtype=wp.vec2)
+        table, frame = wp.array(decode_table("linear"), dtype=wp.vec3), wp.array(smooth, dtype=wp.vec3ub)
+        for height in (64, 128):
+            shape = (height, 2 * height)
+            corners = wp.zeros((shape[0] + 1, shape[1] + 1, 1), dtype=wp.vec3)
+            radiance, clipped = (wp.zeros(shape, dtype=wp.vec3) for _ in range(2))
+            confidence = wp.zeros(shape, dtype=wp.float32)
+
+            def ours(corners=corners, radiance=radiance, confidence=confidence, clipped=clipped) -> None:
+                probe.project_corners(params, ball, rays, scene, corners, config=config)
+                probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, rung="bilinear")
+
+            def theirs(height=height) -> Any:
+                return envmap.EnvironmentMap(smooth / np.float32(255), "sphere").convertTo("latlong", height).data
+
+            ours()
+            known = confidence.numpy() > 0.5
+            assert known.mean() > 0.5
+            assert np.abs(radiance.numpy() - theirs())[known].mean() < SAME_MAP
+            times = measure({"ours": ours}, device)["ours"]
+            hosts = []
+            for _ in range(RUNS):
+                start = time.perf_counter()
+                theirs()
+                hosts.append((time.perf_counter() - start) * 1e3)
+            label = f"unwrap {height}x{2 * height}"
+            report(f"{label} ours", times, device)
+            ratio = round(statistics.median(hosts) / statistics.median(times), 1)
+            report(f"{label} skylibs_host", hosts, device, over_ours=ratio)
+
+
+def optix_rays(mitsuba: Any, mesh: Any, center: Any, directions: np.ndarray) -> tuple[np.ndarray, list[float]]:
+    """Which rays hit, and milliseconds of the kernel that traces them, by Mitsuba's own clock of the device."""
+    drjit = importlib.import_module("drjit")
+    shape = mitsuba.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
+    parameters = mitsuba.traverse(shape)
+    parameters["vertex_positions"] = (mesh.vertices - np.asarray(center)).astype(np.float32).ravel()
+    parameters["faces"] = mesh.faces.astype(np.uint32).ravel()
+    parameters.update()
+    scene = mitsuba.load_dict({"type": "scene", "mesh": shape})
+    flat = np.ascontiguousarray(directions.reshape(-1, 3).T)
+    ray = mitsuba.Ray3f(mitsuba.Point3f(0.0, 0.0, -1.2), mitsuba.Vector3f(*(mitsuba.Float(axis) for axis in flat)))
+    drjit.eval(ray)
+    times = []
+    with drjit.scoped_set_flag(drjit.JitFlag.KernelHistory, True):
+        for run in range(RUNS + 5):
+            drjit.kernel_history_clear()
+            depth = scene.ray_intersect_preliminary(ray, coherent=True).t
+            drjit.eval(depth)
+            drjit.sync_thread()
+            kernels = [entry for entry in drjit.kernel_history() if entry["type"] == drjit.KernelType.JIT]
+            if run >= 5:
+                times.append(sum(entry["execution_time"] for entry in kernels))
+    return np.isfinite(np.array(depth)), times
+
+
 def bench_rays(device: str) -> None:
+    mitsuba = None if wp.get_device(device).is_cpu else optional("mitsuba")
+    if mitsuba is not None:
+        mitsuba.set_variant("cuda_ad_rgb")
     embree = optional("embreex") if wp.get_device(device).is_cpu else None
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, RAYS[1]), np.linspace(-0.375, 0.375, RAYS[0]))
     directions = np.stack([x, y, np.ones_like(x)], -1).astype(np.float32)
@@ -254,7 +339,10 @@ def bench_rays(device: str) -> None:
             found = scene.run(start, flat).reshape(RAYS) >= 0
             assert (found == hit).mean() > 0.999
             contenders["embree"] = lambda scene=scene, start=start, flat=flat: scene.run(start, flat)
-        times = measure(contenders, device)
+        times = measure(contenders, device, RUNS)
+        if mitsuba is not None:
+            found, times["optix"] = optix_rays(mitsuba, torus, mesh.center, directions)
+            assert (found == hit.ravel()).mean() > 0.999
         for name, measured in times.items():
             rate = directions.size / 3 / statistics.median(measured) / 1e3
             ratio = round(paired_ratio(times, name, "ours"), 2)
@@ -268,4 +356,5 @@ def main(device: str) -> None:
     else:
         bench_table_cuda(device)
         bench_resample_cuda(device)
+    bench_unwrap(device)
     bench_rays(device)
