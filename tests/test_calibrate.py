@@ -173,14 +173,15 @@ def test_outline_of_a_ball():
 
 def test_ball_stands_where_it_was_drawn():
     camera, center, frames = make_camera(), np.array([0.05, 0.04, 0.035]), []
+    # Area-sampled 4 x 4: a pixel sees the ball where its ray passes the centre within a radius.
+    y, x = (np.mgrid[0:1920, 0:2560] + 0.5) / 4 - 0.5
+    rays = np.stack([(x - 319.5) / 640, (y - 239.5) / 640, np.ones_like(x)], -1)
+    rays /= np.sqrt(np.einsum("ijk,ijk->ij", rays, rays))[..., None]
     for k in range(4):
         pose = look(50, 15 * k - 20)
         c = pose.apply(center)
-        # Area-sampled 4 x 4: a pixel sees the ball where its ray passes the centre within a radius.
-        y, x = (np.mgrid[0:1920, 0:2560] + 0.5) / 4 - 0.5
-        rays = np.stack([(x - 319.5) / 640, (y - 239.5) / 640, np.ones_like(x)], -1)
-        along = rays @ c / np.sqrt((rays**2).sum(-1))
-        hit = cv2.resize((c @ c - along**2 < 0.035**2).astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
+        passes = c @ c - (rays @ c) ** 2 < 0.035**2
+        hit = cv2.resize(passes.astype(np.float32), (640, 480), interpolation=cv2.INTER_AREA)
         image = np.round(120 + hit[..., None] * (80, 70, 60)).astype(np.uint8)
         frames.append((image, pose))
     probe = Probe(tuple(center + np.array([0.006, -0.004, 0])), 0.035)

@@ -32,7 +32,7 @@ def knob(name):
     return next(knob for knob in KNOBS if knob.name == name)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def case(frames: Frames) -> tradeoff.Case:
     scene = make_scene()
     tracker = Tracker(scene.marker, scene.camera)

@@ -1073,9 +1073,9 @@ async def test_a_thousand_messages_from_hostile_pages_change_nothing_for_the_goo
         async with site.page() as last:
             await last.say(type="play", on=True)
         before = good.frames
-        await asyncio.sleep(2.0)
-        assert not watching.done(), watching.exception()
-        assert good.frames > before
+        while good.frames < before + 10:  # bounded by the time that the whole test has
+            await asyncio.sleep(0.02)
+            assert not watching.done(), watching.exception()
         stop.set()
         await watching
 
