@@ -48,9 +48,10 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         return
     if len(_devices()) > 1 or not all(pathlib.Path(argument).is_dir() for argument in config.args):
         return
-    option.numprocesses = min(MOST_PROCESSES, _cores())
-    # Tests differ in length by a factor of a thousand: whoever is done takes from the others.
-    option.dist = "worksteal"
+    processes = min(MOST_PROCESSES, _cores())
+    if processes > 1:
+        # Tests differ in length by a factor of a thousand: whoever is done takes from the others.
+        option.numprocesses, option.dist = processes, "worksteal"
 
 
 def _cores() -> int:
@@ -64,7 +65,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         item.user_properties += [("atlas", "/".join(map(str, cell))) for cell in atlas.cells_of(item)]
     atlas.collected[:] = items
-    if config.getoption("--atlas") and os.environ.get("PYTEST_XDIST_WORKER", "gw0") == "gw0":
+    # Every process of a run that is spread has collected the same.
+    if config.getoption("--atlas") and getattr(config, "workerinput", {}).get("workerid", "gw0") == "gw0":
         atlas.write_collection(items, config.getoption("--atlas"))
 
 
