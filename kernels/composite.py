@@ -1,6 +1,6 @@
 """The picture: the camera's frame, what virtual light adds to it, and the virtual objects over it.
 
-    radiance = (1 - alpha) (frame * physical_ratio + physical_added) + virtual
+    radiance = (1 - alpha) (frame * physical_ratio + physical_added + mirrored) + virtual
 
 in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
 the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
@@ -44,6 +44,8 @@ class CompositeConfig:
     """Virtual light on the desk."""
     ratio: bool = False
     """Shadows of the room's light, a factor on the frame."""
+    mirrored: bool = False
+    """What mirror balls show of what is virtual, a change of the frame."""
 
 
 @wp.func
@@ -54,7 +56,8 @@ def in_rect(rect: wp.vec4i, row: wp.int32, col: wp.int32) -> wp.bool:
 
 @functools.cache
 def make_read_layers(config: CompositeConfig) -> wp.Function:
-    """What lies over a pixel: ``virtual, added, ratio = read_layers(params, virtual, added, ratio, row, col)``.
+    """What lies over a pixel: four layers from
+    ``read_layers(params, virtual, added, ratio, mirrored, row, col)``, in this order.
 
     A layer that is not there, or does not reach the pixel, changes nothing: it is 0, or a ratio of 1. All are read
     before any is looked at: one after another would be as many times the memory's latency.
@@ -66,12 +69,14 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec3],
         row: wp.int32,
         col: wp.int32,
     ):
         virtual = wp.vec4(0.0, 0.0, 0.0, 0.0)
         added = wp.vec3(0.0, 0.0, 0.0)
         ratio = wp.vec3(1.0, 1.0, 1.0)
+        change = wp.vec3(0.0, 0.0, 0.0)
         if wp.static(config.virtual):
             if in_rect(params[0].object_rect, row, col):
                 virtual = virtual_layer[row, col]
@@ -81,23 +86,26 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
         if wp.static(config.ratio):
             if in_rect(params[0].shadow_rect, row, col):
                 ratio = physical_ratio[row, col]
-        return virtual, added, ratio
+        if wp.static(config.mirrored):
+            if in_rect(params[0].ball_rect, row, col):
+                change = mirrored[row, col]
+        return virtual, added, ratio, change
 
     return read_layers
 
 
 @wp.func
-def is_changed(virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3) -> wp.bool:
+def is_changed(virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3, mirrored: wp.vec3) -> wp.bool:
     """Whether layers touch a pixel; NaN does."""
     neutral = virtual == wp.vec4(0.0, 0.0, 0.0, 0.0) and added == wp.vec3(0.0, 0.0, 0.0)
-    neutral = neutral and ratio == wp.vec3(1.0, 1.0, 1.0)
+    neutral = neutral and ratio == wp.vec3(1.0, 1.0, 1.0) and mirrored == wp.vec3(0.0, 0.0, 0.0)
     return not neutral
 
 
 @wp.func
-def compose(radiance: wp.vec3, virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3) -> wp.vec3:
-    """All layers over the frame's radiance."""
-    physical = wp.cw_mul(radiance, ratio) + added
+def compose(radiance: wp.vec3, virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3, mirrored: wp.vec3) -> wp.vec3:
+    """All layers over the frame's radiance; no more is taken from it than there is."""
+    physical = wp.max(wp.cw_mul(radiance, ratio) + added + mirrored, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - virtual[3]) * physical + wp.vec3(virtual[0], virtual[1], virtual[2])
 
 
@@ -117,6 +125,7 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec3],
         run: wp.int32,
         # Out:
         image_out: wp.array2d[wp.vec3ub],
@@ -130,18 +139,22 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
             while k < WARP_PIXELS:
                 j = first + k
                 if j < frame.shape[1]:
-                    virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
-                    if is_changed(virtual, added, ratio):
-                        radiance = compose(decode(decode_table, get_code(codes, k)), virtual, added, ratio)
+                    virtual, added, ratio, change = read_layers(
+                        params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
+                    )
+                    if is_changed(virtual, added, ratio, change):
+                        radiance = compose(decode(decode_table, get_code(codes, k)), virtual, added, ratio, change)
                         set_code(codes, k, encode(encode_table, radiance))
                 k += WARP_LANES
             store_codes(codes, image_out, i, first)
         else:
             for j in range(part * run, wp.min(part * run + run, frame.shape[1])):
                 code = frame[i, j]
-                virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
-                if is_changed(virtual, added, ratio):
-                    code = encode(encode_table, compose(decode(decode_table, code), virtual, added, ratio))
+                virtual, added, ratio, change = read_layers(
+                    params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
+                )
+                if is_changed(virtual, added, ratio, change):
+                    code = encode(encode_table, compose(decode(decode_table, code), virtual, added, ratio, change))
                 image_out[i, j] = code
 
     return composite_kernel
@@ -158,6 +171,7 @@ def composite(
     physical_ratio: wp.array | None,
     image_out: wp.array,
     *,
+    mirrored: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the picture.
@@ -172,6 +186,7 @@ def composite(
         physical_added: (H, W) vec3, linear radiance.
         physical_ratio: (H, W) vec3, factor on the frame's linear radiance.
         image_out: (H, W) vec3ub, contiguous; values above clipping give 255, NaN gives 0.
+        mirrored: (H, W) vec3, change of linear radiance.
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
@@ -180,7 +195,7 @@ def composite(
     launch_rows(
         make_composite_kernel(config, warps),
         (height, warp_threads(width) if warps else -(-width // run)),
-        [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio, run],
+        [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio, mirrored, run],
         [image_out],
         rows=rows,
         device=frame.device,

@@ -186,6 +186,7 @@ def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec3],
         # Out:
         levels_out: wp.array2d[wp.int32],
     ):
@@ -199,10 +200,12 @@ def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
         for j in range(rect[2], rect[3], _AUTO_STRIDE):
             code = frame[i, j]
             clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
-            virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
+            virtual, added, ratio, change = read_layers(
+                params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
+            )
             dark = added == wp.vec3(0.0, 0.0, 0.0)
             if not clipped and not virtual[3] > 0.5 and not dark:
-                radiance = compose(decode(decode_table, code), virtual, added, ratio)
+                radiance = compose(decode(decode_table, code), virtual, added, ratio, change)
                 level = level_of(wp.max(radiance))
                 levels_out[strip, level] = levels_out[strip, level] + 1
 
@@ -254,6 +257,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec3],
         table: wp.array2d[wp.uint32],
         max_box: wp.int32,
         declipped: wp.array2d[wp.vec3],
@@ -269,14 +273,16 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         guessed = bool(gain != 1.0)
         if wp.static(config.rung == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
-        virtual, added, ratio = read_layers(params, virtual_layer, physical_added, physical_ratio, i, j)
-        if not guessed and not is_changed(virtual, added, ratio):
+        virtual, added, ratio, change = read_layers(
+            params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
+        )
+        if not guessed and not is_changed(virtual, added, ratio, change):
             return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
         radiance = gain * decode(decode_table, code)
         if wp.static(config.rung == "declipped"):
             if guessed:
                 radiance = declipped[i, j]
-        return encode(encode_table, s * compose(radiance, virtual, added, ratio))
+        return encode(encode_table, s * compose(radiance, virtual, added, ratio, change))
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(
@@ -289,6 +295,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         virtual_layer: wp.array2d[wp.vec4],
         physical_added: wp.array2d[wp.vec3],
         physical_ratio: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec3],
         table: wp.array2d[wp.uint32],
         max_box: wp.int32,
         declipped: wp.array2d[wp.vec3],
@@ -316,6 +323,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
                         virtual_layer,
                         physical_added,
                         physical_ratio,
+                        mirrored,
                         table,
                         max_box,
                         declipped,
@@ -336,6 +344,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
                 virtual_layer,
                 physical_added,
                 physical_ratio,
+                mirrored,
                 table,
                 max_box,
                 declipped,
@@ -366,6 +375,7 @@ def count_levels(
     physical_ratio: wp.array | None,
     levels_out: wp.array,
     *,
+    mirrored: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Count how bright the desk is under virtual light, for ``auto``.
@@ -379,12 +389,13 @@ def count_levels(
         physical_added: (H, W) vec3.
         physical_ratio: (H, W) vec3.
         levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
+        mirrored: (H, W) vec3.
         rows: Band of rows of ``levels_out``; None means all.
     """
     launch_rows(
         make_count_levels_kernel(layers),
         (levels_out.shape[0],),
-        [params, frame, decode_table, virtual, physical_added, physical_ratio],
+        [params, frame, decode_table, virtual, physical_added, physical_ratio, mirrored],
         [levels_out],
         rows=rows,
         device=frame.device,
@@ -415,6 +426,7 @@ def expose(
     codes: wp.array,
     image_out: wp.array,
     *,
+    mirrored: wp.array | None = None,
     declipped: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
@@ -433,6 +445,7 @@ def expose(
         scale: (1,) float32, not negative.
         codes: (256,) vec3ub of ``expose_codes`` for this ``scale``.
         image_out: (H, W) vec3ub, contiguous.
+        mirrored: (H, W) vec3, change of linear radiance.
         declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
         rows: Band of rows; None means all.
     """
@@ -449,6 +462,7 @@ def expose(
             virtual,
             physical_added,
             physical_ratio,
+            mirrored,
             table,
             largest_box(height),
             declipped,

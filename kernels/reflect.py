@@ -74,6 +74,18 @@ def look_up(frame: wp.array2d[wp.vec3ub], decode_table: wp.array[wp.vec3], x: wp
 
 
 @wp.func
+def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
+    """Bilinear sample of a layer over the frame, places as in ``look_up``."""
+    j = wp.min(wp.int32(x), layer.shape[1] - 2)
+    i = wp.min(wp.int32(y), layer.shape[0] - 2)
+    fx = x - wp.float32(j)
+    fy = y - wp.float32(i)
+    top = (1.0 - fx) * layer[i, j] + fx * layer[i, j + 1]
+    bottom = (1.0 - fx) * layer[i + 1, j] + fx * layer[i + 1, j + 1]
+    return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
 def nearest_of_object(hit_object: wp.array2d[wp.int32], i: wp.int32, j: wp.int32, found: wp.int32) -> wp.vec2i:
     """A pixel that shows an object: this one, else one of its eight neighbours, else (-1, -1)."""
     if hit_object[i, j] == found:

@@ -65,7 +65,7 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
+from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, intersect_sphere, make_trace
 
 wp.set_module_options({"enable_backward": False})
 
@@ -168,13 +168,118 @@ def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_
     return False
 
 
+@wp.struct
+class Desk:
+    """What is known of the real desk and of the room that lights it; what its ``RelightConfig`` does not use is empty."""
+
+    frame: wp.array2d[wp.vec3ub]
+    decode_table: wp.array[wp.vec3]
+    table: wp.array2d[wp.uint32]
+    box: wp.int32  # side of a pixel's surroundings
+    probes: wp.array[Probe]
+    key_lights: wp.array[KeyLight]
+    irradiance_sh: wp.array[wp.vec3]
+    irradiance_map: wp.array2d[wp.vec3]
+    lamps: wp.array[RoomLamp]
+
+
+@functools.cache
+def make_lit_by(config: RelightConfig) -> wp.Function:
+    """``lit_by(scene, lights, desk, hit, row, col, mirror, turn) -> vec3``: radiance that virtual light adds at a hit.
+
+    The pixel (row, col) shows the hit: straight where ``mirror`` is zero, else as a mirror ball of that reflectance has
+    it, which says nothing about the hit's surroundings. ``turn`` is for ``visible_share``.
+    """
+    is_lit = make_shadow(config.trace)
+    visible_share = make_visible_share(config.trace) if config.soft else None
+    rung = config.rung
+
+    @wp.func(module="unique")
+    def lit_by(
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        hit: Hit,
+        row: wp.int32,
+        col: wp.int32,
+        mirror: wp.vec3,
+        turn: wp.float32,
+    ) -> wp.vec3:
+        # What the desk is, found only once some light falls here.
+        known = bool(False)
+        radiance = wp.vec3()
+        kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        m = float(1.0)
+        key = wp.vec3()
+        dominance = float(0.0)
+
+        added = wp.vec3()
+        for index in range(lights.shape[0]):
+            light = sample_light(lights[index], hit.point)
+            n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
+            if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
+                continue
+            visible = float(1.0)
+            if wp.static(config.soft):
+                visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
+                if visible <= 0.0:
+                    continue
+            else:
+                if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                    continue
+            if wp.static(config.probes):
+                if meets_probe(desk.probes, hit.point, light.wi, light.distance):
+                    continue
+            response = n_dot_l
+            if wp.static(rung != "flat"):
+                if not known:
+                    known = True
+                    radiance = decode(desk.decode_table, desk.frame[row, col])
+                    is_mirrored = mirror[0] > 0.0
+                    if is_mirrored:
+                        radiance = wp.cw_div(radiance, mirror)
+                    key = desk.key_lights[0].direction
+                    dominance = desk.key_lights[0].dominance
+                    if wp.static(rung == "paper"):
+                        m = luminance(radiance)
+                    else:
+                        around = luminance(radiance)
+                        if not is_mirrored:
+                            around = surrounding_luminance(desk.table, desk.decode_table, row, col, desk.box)
+                            m = luminance(radiance) / around
+                        if wp.static(rung == "relief"):
+                            hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
+                            kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
+                        else:
+                            if wp.static(config.irradiance == "sh"):
+                                room = sh_irradiance(desk.irradiance_sh, hit.normal)
+                            else:
+                                room = sample_latlong(desk.irradiance_map, hit.normal)
+                            if wp.static(config.lamps):
+                                room = add_nearness(room, desk.lamps, desk.probes[0].center, hit.point, hit.normal)
+                            kd = wp.vec3(
+                                reflectance_of(radiance[0], room[0]),
+                                reflectance_of(radiance[1], room[1]),
+                                reflectance_of(radiance[2], room[2]),
+                            )
+                alpha = wp.dot(light.wi, key)
+                if wp.static(rung == "paper"):
+                    response = printed_response(n_dot_l, m, alpha * dominance)
+                elif wp.static(rung == "relief"):
+                    response = n_dot_l * relief_factor(m, alpha * dominance)
+                else:
+                    response = n_dot_l * turned_relief(m, alpha, dominance)
+            added += visible * response * light.irradiance_normal
+        return wp.cw_mul(kd, added) * _INV_PI
+
+    return lit_by
+
+
 @functools.cache
 def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
-    is_lit = make_shadow(config.trace)
-    visible_share = make_visible_share(config.trace) if config.soft else None
-    rung = config.rung
+    lit_by = make_lit_by(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def relight_kernel(
@@ -182,17 +287,9 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         row_start: wp.int32,
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
-        table: wp.array2d[wp.uint32],
         scene: RayScene,
-        probes: wp.array[Probe],
         lights: wp.array[Light],
-        key_lights: wp.array[KeyLight],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        lamps: wp.array[RoomLamp],
-        box: wp.int32,
+        desk: Desk,
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
     ):
@@ -210,71 +307,9 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return
         if wp.static(config.probes):
-            if meets_probe(probes, params[0].camera_position, direction, hit.t):
+            if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
                 return
-
-        # What the desk is, found only once some light falls here.
-        known = bool(False)
-        radiance = wp.vec3()
-        kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
-        m = float(1.0)
-        key = wp.vec3()
-        dominance = float(0.0)
-
-        added = wp.vec3()
-        for index in range(lights.shape[0]):
-            light = sample_light(lights[index], hit.point)
-            n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
-            if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
-                continue
-            visible = float(1.0)
-            if wp.static(config.soft):
-                turn = tile_turn(i, j)
-                visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
-                if visible <= 0.0:
-                    continue
-            else:
-                if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
-                    continue
-            if wp.static(config.probes):
-                if meets_probe(probes, hit.point, light.wi, light.distance):
-                    continue
-            response = n_dot_l
-            if wp.static(rung != "flat"):
-                if not known:
-                    known = True
-                    radiance = decode(decode_table, frame[i, j])
-                    key = key_lights[0].direction
-                    dominance = key_lights[0].dominance
-                    if wp.static(rung == "paper"):
-                        m = luminance(radiance)
-                    else:
-                        around = surrounding_luminance(table, decode_table, i, j, box)
-                        m = luminance(radiance) / around
-                        if wp.static(rung == "relief"):
-                            hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
-                            kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
-                        else:
-                            if wp.static(config.irradiance == "sh"):
-                                room = sh_irradiance(irradiance_sh, hit.normal)
-                            else:
-                                room = sample_latlong(irradiance_map, hit.normal)
-                            if wp.static(config.lamps):
-                                room = add_nearness(room, lamps, probes[0].center, hit.point, hit.normal)
-                            kd = wp.vec3(
-                                reflectance_of(radiance[0], room[0]),
-                                reflectance_of(radiance[1], room[1]),
-                                reflectance_of(radiance[2], room[2]),
-                            )
-                alpha = wp.dot(light.wi, key)
-                if wp.static(rung == "paper"):
-                    response = printed_response(n_dot_l, m, alpha * dominance)
-                elif wp.static(rung == "relief"):
-                    response = n_dot_l * relief_factor(m, alpha * dominance)
-                else:
-                    response = n_dot_l * turned_relief(m, alpha, dominance)
-            added += visible * response * light.irradiance_normal
-        physical_added_out[i, j] = wp.cw_mul(kd, added) * _INV_PI
+        physical_added_out[i, j] = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
 
     return relight_kernel
 
@@ -282,6 +317,27 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
 def surroundings_size(height: int) -> int:
     """Side of the box of a pixel's surroundings in a frame of ``height`` rows, odd."""
     return 2 * round(0.5 * SURROUNDINGS * height) + 1
+
+
+def make_desk(
+    config: RelightConfig,
+    frame: wp.array,
+    decode_table: wp.array,
+    table: wp.array | None,
+    probes: wp.array | None,
+    key_lights: wp.array | None,
+    irradiance: wp.array | None,
+    lamps: wp.array | None = None,
+) -> Desk:
+    """What kernels read of the desk; arguments as those of ``relight``."""
+    desk = Desk()
+    desk.frame, desk.decode_table, desk.box = frame, decode_table, surroundings_size(frame.shape[0])
+    form = f"irradiance_{config.irradiance}"
+    optional = {"table": table, "probes": probes, "key_lights": key_lights, form: irradiance, "lamps": lamps}
+    for name, array in optional.items():
+        if array is not None:
+            setattr(desk, name, array)
+    return desk
 
 
 def relight(
@@ -320,25 +376,11 @@ def relight(
         lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
         rows: Band of rows; None means all.
     """
-    is_map = config.irradiance == "map"
+    desk = make_desk(config, frame, decode_table, table, probes, key_lights, irradiance, lamps)
     launch_rows(
         make_relight_kernel(config),
         frame.shape,
-        [
-            params,
-            rays,
-            frame,
-            decode_table,
-            table,
-            scene,
-            probes,
-            lights,
-            key_lights,
-            None if is_map else irradiance,
-            irradiance if is_map else None,
-            lamps,
-            surroundings_size(frame.shape[0]),
-        ],
+        [params, rays, scene, lights, desk],
         [physical_added_out],
         rows=rows,
         device=frame.device,

@@ -75,7 +75,8 @@ class ShadeConfig:
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
-    ``pixel`` is where ``object_light`` has seen the object, or negative; ``turn`` is for ``visible_share``.
+    Where ``surrounded``, ``near_irradiance`` and ``near_mirrored`` of ``object_light`` are what the object receives;
+    ``turn`` is for ``visible_share``.
     """
     surface_at = make_surface(config.models, config.textures)
     reflect_direct = make_reflect_direct(config.models)
@@ -94,9 +95,9 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         dfg: wp.array2d[wp.vec2],
         hit: Hit,
         direction: wp.vec3,
-        near_irradiance: wp.array2d[wp.vec3],
-        near_mirrored: wp.array2d[wp.vec4],
-        pixel: wp.vec2i,
+        surrounded: wp.bool,
+        near_irradiance: wp.vec3,
+        near_mirrored: wp.vec4,
         turn: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
@@ -119,8 +120,8 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
             if wp.static(config.room_diffuse == "map"):
                 irradiance = sample_latlong(irradiance_map, normal)
             if wp.static(config.near):
-                if pixel[0] >= 0:
-                    irradiance = near_irradiance[pixel[0], pixel[1]]
+                if surrounded:
+                    irradiance = near_irradiance
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(config.room_specular):
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
@@ -133,9 +134,9 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                         level = 0.0
                 mirrored = sample_levels(levels, reflect(wo, normal), level, level_height)
                 if wp.static(config.near):
-                    if pixel[0] >= 0:
-                        near = near_mirrored[pixel[0], pixel[1]]
-                        mirrored = (1.0 - near[3]) * mirrored + wp.vec3(near[0], near[1], near[2])
+                    if surrounded:
+                        close = wp.vec3(near_mirrored[0], near_mirrored[1], near_mirrored[2])
+                        mirrored = (1.0 - near_mirrored[3]) * mirrored + close
                 radiance += wp.cw_mul(surface.reflectance, mirrored)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
@@ -221,9 +222,17 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
                 hit = closest_visible(scene, params[0].camera_position, direction)
         if hit.shape < 0:
             return wp.vec4(0.0)
-        pixel = wp.vec2i(-1, -1)
+        surrounded = bool(False)
+        irradiance = wp.vec3()
+        mirrored = wp.vec4()
         if wp.static(config.near):
             pixel = nearest_of_object(hit_object, i, j, hit.shape)
+            surrounded = pixel[0] >= 0
+            if surrounded:
+                if wp.static(config.room_diffuse != "none"):
+                    irradiance = near_irradiance[pixel[0], pixel[1]]
+                if wp.static(config.room_specular):
+                    mirrored = near_mirrored[pixel[0], pixel[1]]
         radiance = shade_hit(
             scene,
             lights,
@@ -234,9 +243,9 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             dfg,
             hit,
             direction,
-            near_irradiance,
-            near_mirrored,
-            pixel,
+            surrounded,
+            irradiance,
+            mirrored,
             tile_turn(i, j),
         )
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)

@@ -45,6 +45,7 @@ class FrameParams:
     object_rect: wp.vec4i  # row_start, row_stop, col_start, col_stop: where virtual objects can be on screen
     light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
     shadow_rect: wp.vec4i  # the same for what virtual objects do to the room's light on the physical
+    ball_rect: wp.vec4i  # the same for mirror balls
 
 
 @wp.struct

@@ -269,6 +269,8 @@ class Pipeline:
         add("light_rows", lambda: self._light_rows)
         self._shadow_rows = (0, height)
         add("shadow_rows", lambda: self._shadow_rows)
+        self._ball_rows = (0, height)
+        add("ball_rows", lambda: self._ball_rows)
         params = self._block.host("params")
         add("seconds", lambda: float(params["time"][0]))
         params["focal"] = (self.camera.fx, self.camera.fy)
@@ -546,6 +548,9 @@ class Pipeline:
             params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
             self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
             self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
+            if "mirrored" in self._arrays:
+                params["ball_rect"] = self._host_scene.ball_rect(pose, self.camera)
+                self._ball_rows = (int(params["ball_rect"][0][0]), int(params["ball_rect"][0][1]))
             if "physical_ratio" in self._arrays:
                 params["shadow_rect"] = self._host_scene.shadow_rect(pose, self.camera)
                 self._shadow_rows = (int(params["shadow_rect"][0][0]), int(params["shadow_rect"][0][1]))

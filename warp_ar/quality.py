@@ -48,6 +48,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="clipped",
                 room_shadow="none",
                 expose="box",
+                mirror_ball="none",
                 shade="environment",
             ),
             _preset(
@@ -61,6 +62,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="white_card",
                 room_shadow="none",
                 expose="box",
+                mirror_ball="none",
                 shade="environment",
             ),
             _preset(
@@ -74,6 +76,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="white_card",
                 room_shadow="coarse",
                 expose="glow",
+                mirror_ball="single",
                 shade="environment",
             ),
             _preset(
@@ -87,6 +90,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="shading",
                 room_shadow="bounce",
                 expose="ball",
+                mirror_ball="smooth",
                 shade="one_bounce",
             ),
             _preset(
@@ -100,6 +104,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="shading",
                 room_shadow="brute_force",
                 expose="ball",
+                mirror_ball="smooth",
                 shade="one_bounce",
             ),
         )

@@ -402,6 +402,11 @@ class HostScene:
             ]
         return screen_rect(self._lit, pose, camera)
 
+    def ball_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
+        """Where mirror balls are on screen; arguments as ``object_rect``."""
+        boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in self.scene.probes]
+        return screen_rect([box[list(face)] for box in boxes for face in _FACES], pose, camera)
+
     def shadow_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where virtual objects can change the room's light on proxies on screen; arguments as ``object_rect``."""
         self._follow_objects()

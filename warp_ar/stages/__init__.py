@@ -11,6 +11,7 @@ from warp_ar.stages.diffuse import Diffuse
 from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
+from warp_ar.stages.mirror_ball import MirrorBall
 from warp_ar.stages.object_light import ObjectLight
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.relight import Relight
@@ -38,6 +39,7 @@ STAGES: tuple[type[Stage], ...] = (
     RoomShadow,
     ObjectLight,
     Shade,
+    MirrorBall,
     Composite,
     Declip,
     Expose,

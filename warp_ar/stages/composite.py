@@ -52,13 +52,14 @@ class Composite(Stage):
                 arrays.get("physical_added"),
                 arrays.get("physical_ratio"),
                 image,
+                mirrored=arrays.get("mirrored"),
                 rows=rows,
             )
 
         if not device.is_cpu:
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
-        extents += [arrays["shadow_rows"]] * config.ratio
+        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
         return [Pass(lambda rows: wp.copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
 
 
@@ -72,7 +73,14 @@ def layer_names(request: Request) -> tuple[str, ...]:
         layers.append("physical_added")
     if shades_room(request):
         layers.append("physical_ratio")
+    if layers and mirrors_virtual(request):
+        layers.append("mirrored")
     return tuple(layers)
+
+
+def mirrors_virtual(request: Request) -> bool:
+    """Whether balls are to show what is virtual."""
+    return bool(request.scene.probes) and request.quality.rung("mirror_ball") not in ("default", "none")
 
 
 def shades_room(request: Request) -> bool:
@@ -91,7 +99,10 @@ def exposes(request: Request) -> bool:
 def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
     """Which layers to compile in."""
     return composite.CompositeConfig(
-        virtual="virtual" in layers, added="physical_added" in layers, ratio="physical_ratio" in layers
+        virtual="virtual" in layers,
+        added="physical_added" in layers,
+        ratio="physical_ratio" in layers,
+        mirrored="mirrored" in layers,
     )
 
 

@@ -63,12 +63,14 @@ class Expose(Stage):
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         virtual, added, ratio = (arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio"))
+        mirrored = arrays.get("mirrored")
         passes: list[Pass] = []
         if self.request.scene.exposure.scale == "auto":
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                exposure.count_levels(layers, params, frame, decode, virtual, added, ratio, levels, rows=rows)
+                parts = (virtual, added, ratio)
+                exposure.count_levels(layers, params, frame, decode, *parts, levels, mirrored=mirrored, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
             passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
@@ -90,6 +92,7 @@ class Expose(Stage):
                 scale,
                 codes,
                 arrays["image"],
+                mirrored=mirrored,
                 declipped=arrays.get("declipped"),
                 rows=rows,
             )

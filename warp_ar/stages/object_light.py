@@ -43,7 +43,7 @@ class ObjectLight(Stage):
         reads = ["frame", "pose", "objects", "hit_object", "hits", *room_reads(config)]
         if config.diffuse != "none":
             reads.append("room_samples")
-        reads += [name for name in layer_names(request) if name != "virtual"]
+        reads += [name for name in layer_names(request) if name not in ("virtual", "mirrored")]
         return Wiring(tuple(reads), tuple(name for name, used in near_names(shade_config(request)) if used))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -48,16 +48,7 @@ class Relight(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows that light can reach."""
         reads, irradiance = self.wiring.reads, irradiance_name(self.request)
-        form = "sh" if irradiance == "irradiance_sh" else "map"
-        scene = self.request.scene
-        config = relight.RelightConfig(
-            relight_rung(self.request),
-            trace_config(scene),
-            form,
-            bool(scene.probes),
-            casts_soft(self.request),
-            "lamps" in reads,
-        )
+        config = relight_config(self.request)
         relight.make_relight_kernel(config)
 
         def launch(rows: Rows | None) -> None:
@@ -79,6 +70,19 @@ class Relight(Stage):
             )
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["light_rows"]))]
+
+
+def relight_config(request: Request) -> relight.RelightConfig:
+    """What the relighting of a request's desk calls for."""
+    rung = relight_rung(request)
+    return relight.RelightConfig(
+        rung,
+        trace_config(request.scene),
+        "sh" if irradiance_name(request) == "irradiance_sh" else "map",
+        bool(request.scene.probes),
+        casts_soft(request),
+        rung == "reflectance" and knows_lamps(request),
+    )
 
 
 def relight_rung(request: Request) -> str:

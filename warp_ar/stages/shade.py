@@ -64,6 +64,12 @@ def near_names(config: ShadeConfig) -> tuple[tuple[str, bool], ...]:
     return ("object_irradiance", config.room_diffuse != "none"), ("object_mirrored", config.room_specular)
 
 
+def room_light_names(config: ShadeConfig) -> tuple[str, ...]:
+    """Resources that hold the forms of the room's light that materials reflect."""
+    diffuse = () if config.room_diffuse == "none" else (f"irradiance_{config.room_diffuse}",)
+    return (*diffuse, "specular_levels") if config.room_specular else diffuse
+
+
 class Shade(Stage):
     """Radiance and coverage of virtual objects, with smooth edges."""
 
@@ -80,10 +86,7 @@ class Shade(Stage):
         reads = ["pose", "objects", "hit_object", "hits"]
         if config.lights:
             reads.append("lights")
-        if config.room_diffuse != "none":
-            reads.append(f"irradiance_{config.room_diffuse}")
-        if config.room_specular:
-            reads.append("specular_levels")
+        reads += room_light_names(config)
         if config.near and (config.room_diffuse != "none" or config.room_specular):
             reads += [name for name, used in near_names(config) if used]
         return Wiring(tuple(reads), ("virtual",))

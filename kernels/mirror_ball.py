@@ -1,0 +1,244 @@
+"""What mirror balls show of what is virtual: objects, light on the desk, shadows.
+
+The camera's picture of a ball holds the real room. Were the virtual things there, the ball would mirror them too. A
+pixel's ray is reflected at the ball, of reflectance rho, and followed to what it meets first:
+
+- a virtual object: the ball shows rho times the object's radiance instead of what the camera saw;
+- a proxy: what the camera saw times the shadows that virtual objects cast there under the room's light, which are
+  looked up where the picture shows the same point, plus rho times the virtual light that the proxy sends back. What the
+  proxy is made of, the ball's own pixel says: it shows rho times the proxy's radiance;
+- another ball, or nothing: no change. Light is mirrored once.
+
+The result is a change of radiance, to be added to the frame's; it may be negative.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.reflect import look_up_layer, make_find_in_frame
+from warp_ar.kernels.relight import Desk, RelightConfig, make_lit_by
+from warp_ar.kernels.shade import ShadeConfig, make_shade_hit
+from warp_ar.kernels.shadow import tile_turn
+from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
+from warp_ar.kernels.visibility import (
+    FAR,
+    ROUNDING,
+    TraceConfig,
+    inside_rect,
+    intersect_sphere,
+    make_trace,
+    offset_origin,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_REFLECTANCE = wp.constant(wp.float32(0.05))
+"""Of a ball that is a mirror at all: what a pixel shows is divided by it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MirrorBallConfig:
+    """What is compiled into the kernel."""
+
+    trace: TraceConfig
+    """Kinds of shape in the scene."""
+    samples: int = 1
+    """Rays per pixel: a square number."""
+    shade: ShadeConfig | None = None
+    """How virtual objects look; None: there are none."""
+    relight: RelightConfig | None = None
+    """How the desk responds to virtual light; None: there is no virtual light, or no proxy for it."""
+    ratio: bool = False
+    """Whether virtual objects shade the desk under the room's light."""
+
+    def __post_init__(self) -> None:
+        if self.samples < 1 or math.isqrt(self.samples) ** 2 != self.samples:
+            raise ValueError(f"samples is {self.samples}; expected a square number such as 1 or 4")
+
+
+@wp.func
+def nearest_ball(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.int32:
+    """Number of the first ball that a ray meets before ``t_max``, or -1."""
+    nearest = wp.int32(-1)
+    reach = t_max
+    for index in range(probes.shape[0]):
+        t = intersect_sphere(probes[index].radius, origin - probes[index].center, direction, reach)
+        if t < reach:
+            reach = t
+            nearest = index
+    return nearest
+
+
+@functools.cache
+def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    trace = make_trace(config.trace)
+    closest_object, closest_proxy, occluded_by_proxies = (
+        trace.closest_object,
+        trace.closest_proxy,
+        trace.occluded_by_proxies,
+    )
+    shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
+    lit_by = make_lit_by(config.relight) if config.relight is not None else None
+    find_in_frame = make_find_in_frame(config.trace, True)
+    side = math.isqrt(config.samples)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def mirror_ball_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        irradiance_sh: wp.array[wp.vec3],
+        irradiance_map: wp.array2d[wp.vec3],
+        levels: wp.array[wp.vec3],
+        level_height: wp.int32,
+        dfg: wp.array2d[wp.vec2],
+        desk: Desk,
+        physical_ratio: wp.array2d[wp.vec3],
+        # Out:
+        mirrored_out: wp.array2d[wp.vec3],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        if not inside_rect(i, j, params[0].ball_rect):
+            return
+        mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        origin = params[0].camera_position
+        ray = rays[i, j]
+        seen = decode(desk.decode_table, desk.frame[i, j])
+        change = wp.vec3(0.0, 0.0, 0.0)
+        for sample in range(wp.static(config.samples)):
+            inner = wp.vec3(ray[0], ray[1], 1.0)
+            if wp.static(side > 1):
+                # n-rooks in both axes, as along the edges of objects.
+                n = wp.static(float(side))
+                a = wp.float32(sample % wp.static(side))
+                b = wp.float32(sample / wp.static(side))
+                inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
+                inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
+            direction = params[0].world_from_camera * inner
+            ball = nearest_ball(desk.probes, origin, direction, FAR)
+            if ball < 0:
+                continue
+            probe = desk.probes[ball]
+            t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
+            if occluded_by_proxies(scene, origin, direction, t):
+                continue
+            point = origin + t * direction
+            normal = wp.normalize(point - probe.center)
+            wo = -wp.normalize(direction)
+            outward = reflect(wo, normal)
+            error = ROUNDING * 16.0 * (wp.max(wp.abs(point)) + probe.radius)
+            start = offset_origin(point, normal, outward, error)
+            if nearest_ball(desk.probes, start, outward, FAR) >= 0:
+                continue
+            rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
+            surface = closest_proxy(scene, start, outward, FAR)
+            if wp.static(config.shade is not None):
+                thing = closest_object(scene, start, outward, surface.t)
+                if thing.shape >= 0:
+                    radiance = shade_hit(
+                        scene,
+                        lights,
+                        irradiance_sh,
+                        irradiance_map,
+                        levels,
+                        level_height,
+                        dfg,
+                        thing,
+                        outward,
+                        False,
+                        wp.vec3(),
+                        wp.vec4(),
+                        tile_turn(i, j),
+                    )
+                    change += wp.cw_mul(rho, radiance) - seen
+                    continue
+            if surface.shape < 0 or wp.dot(surface.geometric_normal, outward) >= 0.0:
+                continue
+            if wp.static(config.ratio):
+                at = find_in_frame(
+                    params[0],
+                    desk.frame.shape[0],
+                    desk.frame.shape[1],
+                    scene,
+                    desk.probes,
+                    surface.point,
+                    surface.geometric_normal,
+                )
+                if at[0] >= 0.0:
+                    change += wp.cw_mul(seen, look_up_layer(physical_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
+            if wp.static(config.relight is not None):
+                added = lit_by(scene, lights, desk, surface, i, j, rho, tile_turn(i, j))
+                change += wp.cw_mul(rho, added)
+        mirrored_out[i, j] = change / wp.static(float(config.samples))
+
+    return mirror_ball_kernel
+
+
+def mirror_ball(
+    config: MirrorBallConfig,
+    params: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    lights: wp.array | None,
+    irradiance_sh: wp.array | None,
+    irradiance_map: wp.array | None,
+    levels: wp.array | None,
+    level_height: int,
+    dfg: wp.array | None,
+    desk: Desk,
+    physical_ratio: wp.array | None,
+    mirrored_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Write what virtual things change in the picture of mirror balls; nothing outside ``params[0].ball_rect``.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: (1,) FrameParams: camera and ball_rect.
+        rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        irradiance_sh: Nine coefficients of the room's irradiance, as ``shade`` reads them.
+        irradiance_map: The room's irradiance as a latlong map, likewise.
+        levels: The room's prefiltered light, likewise.
+        level_height: Rows of its level 0.
+        dfg: Table of ``integrate_dfg``.
+        desk: From ``make_desk``; frame, decode table and probes are always needed.
+        physical_ratio: (H, W) vec3 of ``room_shadow``; needed if ``config.ratio``.
+        mirrored_out: (H, W) vec3, change of linear radiance in camera values.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_mirror_ball_kernel(config),
+        rays.shape,
+        [
+            params,
+            rays,
+            scene,
+            lights,
+            irradiance_sh,
+            irradiance_map,
+            levels,
+            level_height,
+            dfg,
+            desk,
+            physical_ratio,
+        ],
+        [mirrored_out],
+        rows=rows,
+        device=rays.device,
+    )

@@ -1,0 +1,119 @@
+"""What mirror balls show of what is virtual."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import mirror_ball
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.relight import make_desk
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.ray_scene import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.composite import layer_names, mirrors_virtual
+from warp_ar.stages.relight import Relight, irradiance_name, relight_config
+from warp_ar.stages.shade import DFG_SIZE, room_light_names, shade_config
+
+SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4}
+"""Rays per pixel, by rung; cheapest first, after ``none``."""
+
+
+def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
+    """What the mirrored part of a request's scene calls for."""
+    layers = layer_names(request)
+    # What a ball shows of an object is too small for what surrounds it at close range.
+    shading = dataclasses.replace(shade_config(request), near=False, edge_samples=1) if "virtual" in layers else None
+    lit = "physical_added" in layers
+    return mirror_ball.MirrorBallConfig(
+        trace_config(request.scene),
+        SAMPLES[request.quality.rung("mirror_ball")],
+        shading,
+        relight_config(request) if lit else None,
+        "physical_ratio" in layers,
+    )
+
+
+class MirrorBall(Stage):
+    """Virtual objects, light and shadow as the mirror balls of the frame show them."""
+
+    name: ClassVar[str] = "mirror_ball"
+    rungs: ClassVar[tuple[str, ...]] = ("none", *SAMPLES)
+    summary: ClassVar[str] = "what the mirror ball in the picture shows of virtual objects, light and shadows"
+
+    @classmethod
+    def wire(cls, request: Request) -> Wiring | LeftOut:
+        """Reads what the objects and the desk are lit by."""
+        if not request.scene.probes:
+            return LeftOut("the scene has no mirror ball")
+        if not mirrors_virtual(request):
+            return LeftOut(f"the quality {request.quality.name!r} leaves the ball as the camera saw it")
+        layers = layer_names(request)
+        if "mirrored" not in layers:
+            return LeftOut("the scene has nothing virtual that a ball could mirror")
+        reads = {"pose", "frame"}
+        if "virtual" in layers:
+            config = shade_config(request)
+            reads |= {"objects", *room_light_names(config)}
+            reads |= {"lights"} if config.lights else set()
+        if "physical_added" in layers:
+            # The ball shows the desk too small for a pixel's surroundings to mean anything.
+            wiring = Relight.wire(request)
+            assert isinstance(wiring, Wiring)
+            reads |= set(wiring.reads) - {"summed_area"}
+        if "physical_ratio" in layers:
+            reads.add("physical_ratio")
+        return Wiring(tuple(sorted(reads)), ("mirrored",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The change, and the table of reflectance where materials need it."""
+        width, height = self.request.size
+        specs = {"mirrored": ArraySpec((height, width), wp.vec3)}
+        if METALLIC_ROUGHNESS in shade_config(self.request).models:
+            specs["mirror_ball_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
+        return specs
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over the rows in which a ball can be."""
+        config = mirror_config(self.request)
+        mirror_ball.make_mirror_ball_kernel(config)
+        dfg = arrays.get("mirror_ball_dfg")
+        if dfg is not None:
+            integrate_dfg(dfg)
+        reads = self.wiring.reads
+        relighting = relight_config(self.request)
+        room = irradiance_name(self.request)
+        lit = config.relight is not None
+        desk = make_desk(
+            relighting,
+            arrays["frame"],
+            arrays["decode"],
+            None,
+            arrays["probes"],
+            arrays["key_lights"] if "key_lights" in reads else None,
+            arrays[room] if lit and room in reads else None,
+            arrays["lamps"] if "lamps" in reads else None,
+        )
+        shading = config.shade
+        diffuse = "none" if shading is None else shading.room_diffuse
+        inputs = (
+            arrays["params"],
+            arrays["rays"],
+            arrays["ray_scene"],
+            arrays["light_array"] if "lights" in reads else None,
+            arrays["irradiance_sh"] if diffuse == "sh" else None,
+            arrays["irradiance_map"] if diffuse == "map" else None,
+            arrays["specular_levels"] if shading is not None and shading.room_specular else None,
+            self.request.quality.environment_height,
+            dfg,
+            desk,
+            arrays["physical_ratio"] if config.ratio else None,
+        )
+
+        def launch(rows: Rows | None) -> None:
+            mirror_ball.mirror_ball(config, *inputs, arrays["mirrored"], rows=rows)
+
+        return [Pass(launch, rows=self.request.size[1], extent=arrays["ball_rows"])]
