@@ -56,8 +56,7 @@ def in_rect(rect: wp.vec4i, row: wp.int32, col: wp.int32) -> wp.bool:
 
 @functools.cache
 def make_read_layers(config: CompositeConfig) -> wp.Function:
-    """What lies over a pixel: four layers from
-    ``read_layers(params, virtual, added, ratio, mirrored, row, col)``, in this order.
+    """``virtual, added, ratio, change = read_layers(params, virtual, added, ratio, mirrored, row, col)`` of a pixel.
 
     A layer that is not there, or does not reach the pixel, changes nothing: it is 0, or a ratio of 1. All are read
     before any is looked at: one after another would be as many times the memory's latency.

@@ -111,14 +111,15 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
+        mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
         if not inside_rect(i, j, params[0].ball_rect):
             return
-        mirrored_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
         origin = params[0].camera_position
         ray = rays[i, j]
         seen = decode(desk.decode_table, desk.frame[i, j])
         change = wp.vec3(0.0, 0.0, 0.0)
-        for sample in range(wp.static(config.samples)):
+        count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
+        for sample in range(count):
             inner = wp.vec3(ray[0], ray[1], 1.0)
             if wp.static(side > 1):
                 # n-rooks in both axes, as along the edges of objects.
@@ -133,20 +134,25 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
                 continue
             probe = desk.probes[ball]
             t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
+            # Back onto the ball: what a far camera adds to the error of t ends here.
+            normal = wp.normalize(origin - probe.center + t * direction)
+            if wp.dot(normal, direction) >= 0.0:
+                continue  # the camera is inside the ball, or the ray grazes it
             if occluded_by_proxies(scene, origin, direction, t):
                 continue
-            point = origin + t * direction
-            normal = wp.normalize(point - probe.center)
-            wo = -wp.normalize(direction)
-            outward = reflect(wo, normal)
-            error = ROUNDING * 16.0 * (wp.max(wp.abs(point)) + probe.radius)
+            point = probe.center + probe.radius * normal
+            outward = reflect(-wp.normalize(direction), normal)
+            error = ROUNDING * (8.0 * wp.max(wp.abs(point)) + 32.0 * probe.radius)
             start = offset_origin(point, normal, outward, error)
-            if nearest_ball(desk.probes, start, outward, FAR) >= 0:
+            surface = closest_proxy(scene, start, outward, FAR)
+            reach = surface.t
+            if wp.static(config.shade is not None):
+                thing = closest_object(scene, start, outward, reach)
+                reach = thing.t
+            if nearest_ball(desk.probes, start, outward, reach) >= 0:
                 continue
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
-            surface = closest_proxy(scene, start, outward, FAR)
             if wp.static(config.shade is not None):
-                thing = closest_object(scene, start, outward, surface.t)
                 if thing.shape >= 0:
                     radiance = shade_hit(
                         scene,
@@ -204,7 +210,7 @@ def mirror_ball(
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Write what virtual things change in the picture of mirror balls; nothing outside ``params[0].ball_rect``.
+    """Write what virtual things change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.

@@ -170,7 +170,7 @@ def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_
 
 @wp.struct
 class Desk:
-    """What is known of the real desk and of the room that lights it; what its ``RelightConfig`` does not use is empty."""
+    """What is known of the real desk and of the room that lights it; what a ``RelightConfig`` leaves out is empty."""
 
     frame: wp.array2d[wp.vec3ub]
     decode_table: wp.array[wp.vec3]

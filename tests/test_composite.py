@@ -10,12 +10,26 @@ from warp_ar.kernels.structs import FrameParams
 
 H, W = 24, 40
 
-CONFIGS = [composite.CompositeConfig(v, a, r) for v in (False, True) for a in (False, True) for r in (False, True)]
+CONFIGS = [
+    composite.CompositeConfig(v, a, r, m)
+    for m in (False, True)
+    for v in (False, True)
+    for a in (False, True)
+    for r in (False, True)
+]
 
 
-def make_params(object_rect=(0, H, 0, W), light_rect=(0, H, 0, W), shadow_rect=(0, H, 0, W), scale=1.0, time_step=0.0):
+def make_params(
+    object_rect=(0, H, 0, W),
+    light_rect=(0, H, 0, W),
+    shadow_rect=(0, H, 0, W),
+    ball_rect=(0, H, 0, W),
+    scale=1.0,
+    time_step=0.0,
+):
     params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-    params["object_rect"], params["light_rect"], params["shadow_rect"] = object_rect, light_rect, shadow_rect
+    params["object_rect"], params["light_rect"] = object_rect, light_rect
+    params["shadow_rect"], params["ball_rect"] = shadow_rect, ball_rect
     params["exposure_scale"], params["time_step"] = scale, time_step
     return wp.array(params, dtype=FrameParams)
 
@@ -34,14 +48,17 @@ def make_layers(seed=0):
     virtual = np.concatenate([rng.random((H, W, 3)) * alpha, alpha], -1).astype(np.float32)
     added = (rng.random((H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
     ratio = rng.random((H, W, 3)).astype(np.float32)
-    return frame, virtual, added, ratio
+    mirrored = (rng.uniform(-1.0, 1.0, (H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
+    return frame, virtual, added, ratio, mirrored
 
 
 def array(values, dtype):
     return None if values is None else wp.array(values, dtype=dtype)
 
 
-def run(config, frame, virtual=None, added=None, ratio=None, params=None, transfer="srgb", bands=(None,)):
+def run(
+    config, frame, virtual=None, added=None, ratio=None, mirrored=None, params=None, transfer="srgb", bands=(None,)
+):
     out = wp.full(frame.shape[:2], wp.vec3ub(7, 7, 7), dtype=wp.vec3ub)
     for rows in bands:
         composite.composite(
@@ -53,6 +70,7 @@ def run(config, frame, virtual=None, added=None, ratio=None, params=None, transf
             array(added, wp.vec3),
             array(ratio, wp.vec3),
             out,
+            mirrored=array(mirrored, wp.vec3),
             rows=rows,
         )
     return out.numpy()
@@ -73,56 +91,67 @@ def test_opaque_layer_replaces_the_frame(device):
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
 def test_what_nothing_touches_stays_bit_for_bit(device, config, transfer):
     frame, *_ = make_layers()
-    empty = np.zeros((H, W, 4), np.float32), np.zeros((H, W, 3), np.float32), np.ones((H, W, 3), np.float32)
+    black = np.zeros((H, W, 3), np.float32)
+    empty = np.zeros((H, W, 4), np.float32), black, np.ones((H, W, 3), np.float32), black
     np.testing.assert_array_equal(run(config, frame, *empty, transfer=transfer), frame)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
 def test_matches_twin(device, config):
-    frame, virtual, added, ratio = make_layers(1)
+    frame, virtual, added, ratio, mirrored = make_layers(1)
     linear = reference.compose(
         reference_color.decode(color.decode_table("srgb"), frame),
         virtual if config.virtual else None,
         added if config.added else None,
         ratio if config.ratio else None,
+        mirrored if config.mirrored else None,
     )
-    assert_codes(run(config, frame, virtual, added, ratio), linear)
+    assert_codes(run(config, frame, virtual, added, ratio, mirrored), linear)
 
 
 def test_layers_count_only_inside_their_rectangles(device):
-    frame, virtual, added, ratio = make_layers(2)
-    rects = (3, 15, 5, 21), (10, 24, 0, 33), (7, 20, 11, 39)
-    got = run(CONFIGS[7], frame, virtual, added, ratio, params=make_params(*rects))
-    inside_object, inside_light, inside_shadow = (reference.within(rect, (H, W)) for rect in rects)
+    frame, virtual, added, ratio, mirrored = make_layers(2)
+    rects = (3, 15, 5, 21), (10, 24, 0, 33), (7, 20, 11, 39), (1, 12, 15, 38)
+    got = run(CONFIGS[15], frame, virtual, added, ratio, mirrored, make_params(*rects))
+    inside_object, inside_light, inside_shadow, inside_ball = (reference.within(rect, (H, W)) for rect in rects)
     linear = reference.compose(
         reference_color.decode(color.decode_table("srgb"), frame),
         virtual * inside_object[..., None],
         added * inside_light[..., None],
         np.where(inside_shadow[..., None], ratio, 1.0),
+        mirrored * inside_ball[..., None],
     )
     assert_codes(got, linear)
-    outside = ~(inside_object | inside_light | inside_shadow)
+    outside = ~(inside_object | inside_light | inside_shadow | inside_ball)
     np.testing.assert_array_equal(got[outside], frame[outside])
 
 
 def test_bands_give_the_same_picture(device):
-    frame, virtual, added, ratio = make_layers(3)
-    whole = run(CONFIGS[7], frame, virtual, added, ratio)
-    np.testing.assert_array_equal(run(CONFIGS[7], frame, virtual, added, ratio, bands=((0, 5), (5, 5), (5, H))), whole)
-    part = run(CONFIGS[7], frame, virtual, added, ratio, bands=((5, 9),))
+    frame, *layers = make_layers(3)
+    whole = run(CONFIGS[15], frame, *layers)
+    np.testing.assert_array_equal(run(CONFIGS[15], frame, *layers, bands=((0, 5), (5, 5), (5, H))), whole)
+    part = run(CONFIGS[15], frame, *layers, bands=((5, 9),))
     assert (part[:5] == 7).all()
     assert (part[9:] == 7).all()
 
 
 def test_light_does_not_reach_through_an_object(device):
-    frame, _, added, _ = make_layers(4)
+    frame, _, added, _, mirrored = make_layers(4)
     virtual = np.zeros((H, W, 4), np.float32)
     virtual[..., 3] = 1.0
-    np.testing.assert_array_equal(run(CONFIGS[6], frame, virtual, 1e6 * added), 0)
+    np.testing.assert_array_equal(run(CONFIGS[14], frame, virtual, 1e6 * added, mirrored=1e6 * mirrored), 0)
 
 
 def test_extremes_stay_in_range(device):
     frame = np.zeros((1, 5, 3), np.uint8)
     added = np.repeat(np.float32([np.nan, np.inf, -np.inf, 1e30, -1.0])[None, :, None], 3, axis=2)
-    got = run(CONFIGS[2], frame, added=added)
-    np.testing.assert_array_equal(got[0, :, 0], [0, 255, 0, 255, 0])
+    for got in (run(CONFIGS[2], frame, added=added), run(CONFIGS[8], frame, mirrored=added)):
+        np.testing.assert_array_equal(got[0, :, 0], [0, 255, 0, 255, 0])
+
+
+def test_no_more_is_taken_from_a_ball_than_it_shows(device):
+    """A change below black is black, and takes nothing from what lies over it."""
+    frame, virtual, *_ = make_layers(5)
+    virtual[..., 3] = 0.25
+    gone = np.full((H, W, 3), -5.0, np.float32)
+    assert_codes(run(CONFIGS[12], frame, virtual, mirrored=gone), virtual[..., :3].astype(float))

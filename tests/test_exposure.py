@@ -14,11 +14,13 @@ BIN = 2.0**0.125
 SCALES = [0.0, 0.01, 0.25, 0.5, 0.9, np.nextafter(np.float32(1), np.float32(0)), 1.0, 1.5, 4.0]
 
 
-def run(frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, transfer="srgb"):
+def run(
+    frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, mirrored=None, transfer="srgb"
+):
     frame_array = wp.array(frame, dtype=wp.vec3ub)
     shape = frame.shape[:2]
     height, width = shape
-    params = make_params(*3 * [(0, height, 0, width)], scale)
+    params = make_params(*4 * [(0, height, 0, width)], scale)
     decode, encode = tables(transfer)
     table, scale_array = wp.zeros(shape, wp.uint32), wp.zeros(1, wp.float32)
     codes, image = wp.zeros(256, wp.vec3ub), wp.zeros(shape, wp.vec3ub)
@@ -38,6 +40,7 @@ def run(frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, r
         scale_array,
         codes,
         image,
+        mirrored=array(mirrored, wp.vec3),
         declipped=wp.array(declipped(frame, transfer), dtype=wp.vec3),
     )
     return image.numpy()
@@ -88,11 +91,11 @@ def test_box_matches_twin(device, scale):
 
 @pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])
 def test_layers_are_composed_before_they_are_exposed(device, scale):
-    frame, virtual, added, ratio = make_layers(3)
+    frame, *layers = make_layers(3)
     gains = reference.gains(frame, scale, exposure.largest_box(H))
-    total = reference_composite.compose(linear(frame) * gains[..., None], virtual, added, ratio)
+    total = reference_composite.compose(linear(frame) * gains[..., None], *layers)
     exact = reference_color.encoded_srgb(np.clip(scale * total, 0.0, 1.0))
-    check_error("expose", run(frame, scale, "box", CONFIGS[7], virtual, added, ratio), exact)
+    check_error("expose", run(frame, scale, "box", CONFIGS[15], *layers), exact)
 
 
 def test_centre_stays_bright_and_edge_fades(device):
@@ -164,18 +167,17 @@ def test_impossible_scale_is_black(device, scale):
     np.testing.assert_array_equal(run(disc(), scale), 0)
 
 
-def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None):
+def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None, mirrored=None):
     frame = np.zeros((*added.shape[:2], 3), np.uint8) if frame is None else frame
     height, width = frame.shape[:2]
-    params = make_params(*3 * [(0, height, 0, width)], time_step=time_step)
+    params = make_params(*4 * [(0, height, 0, width)], time_step=time_step)
     levels = wp.zeros((-(-height // exposure.AUTO_STRIDE), exposure.LEVELS), wp.int32)
     scale = wp.array([start], dtype=wp.float32)
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
-    layers = CONFIGS[2] if virtual is None else CONFIGS[6]
+    layers = exposure.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
     for _ in range(frames):
-        exposure.count_levels(
-            layers, params, frame, decode, array(virtual, wp.vec4), array(added, wp.vec3), None, levels
-        )
+        over = array(virtual, wp.vec4), array(added, wp.vec3), None
+        exposure.count_levels(layers, params, frame, decode, *over, levels, mirrored=array(mirrored, wp.vec3))
         exposure.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
 
@@ -207,6 +209,13 @@ def test_auto_ignores_what_darkening_cannot_help(device):
     hidden = np.zeros((64, 80, 4), np.float32)
     hidden[..., 3] = 1.0
     assert auto(spot(3.0), virtual=hidden) == 1.0
+
+
+def test_auto_sees_the_desk_as_it_is_composed(device):
+    """What a ball beside the lit desk shows is no reason to darken it; what is taken from lit pixels counts."""
+    bright = np.where(spot(1.0) > 0, 0.0, 50.0).astype(np.float32)
+    assert auto(spot(0.9), mirrored=bright) == 1.0
+    assert auto(spot(4.0), mirrored=-3.5 * (spot(1.0) > 0).astype(np.float32)) == 1.0
 
 
 def test_auto_allows_a_few_glints(device):

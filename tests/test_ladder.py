@@ -1,5 +1,6 @@
 """Knobs turn what they say; choices are the best there are, against trying all."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -51,9 +52,16 @@ def test_scenes_have_the_knobs_that_they_call_for():
 
     assert "expose" in names("darken")
     assert names("darken").isdisjoint({"diffuse", "specular", "relight", "shade", "edge_samples"})
-    assert {"diffuse", "specular", "relight", "room_shadow", "environment_height"} <= names("desk")
+    assert {"diffuse", "specular", "relight", "room_shadow", "environment_height", "mirror_ball"} <= names("desk")
     assert "expose" not in names("desk")
     assert "relight" not in names("torus")
+
+
+def test_scenes_without_a_ball_or_anything_virtual_have_nothing_to_mirror():
+    desk = load_scene("desk")
+    for changes in ({"probes": ()}, {"objects": (), "lights": ()}):
+        bare = dataclasses.replace(desk, **changes)
+        assert "mirror_ball" not in {knob.name for knob in relevant_knobs(bare, (640, 480))}
 
 
 def random_prices(seed, knobs=4, rungs=4):

@@ -264,6 +264,37 @@ def test_object_rect_holds_every_ray_that_meets_an_object(device, camera):
     assert np.median(wasted) < 3.0
 
 
+@pytest.mark.parametrize("camera", [CAMERA, BENT], ids=["pinhole", "bent"])
+def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
+    """Cameras around, near, inside and looking away; one ball, two far apart, and none."""
+    one = scenes.Probe((0.1, -0.05, 0.04), 0.04)
+    two = scenes.Probe((-0.4, 0.3, 0.1), 0.1)
+    rng = np.random.default_rng(3)
+    for probes in ((one,), (one, two)):
+        host = HostScene(scenes.Scene(camera, probes=probes), wp.get_device(device))
+        balls = [reference.Body("sphere", np.eye(3), np.array(p.center), 1.0, np.full(3, p.radius)) for p in probes]
+        wasted, seen_any = [], 0
+        for index in range(60):
+            distance = (0.02, 0.05, 0.4, 1.5)[index % 4]
+            eye = np.array(one.center) + distance * rng.normal(size=3)
+            target = rng.normal(size=3) * 0.2 if index % 5 else 3.0 * eye - 2.0 * np.array(one.center)
+            pose = look(eye, target)
+            rect, mask = host.ball_rect(pose, camera), seen(balls, pose, camera)
+            inside = np.zeros_like(mask)
+            inside[rect[0] : rect[1], rect[2] : rect[3]] = True
+            assert not (mask & ~inside).any(), (eye, rect)
+            seen_any += mask.any()
+            if len(probes) == 1 and distance == 1.5 and mask.any():
+                rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+                wasted.append(inside.sum() / ((np.ptp(rows) + 1) * (np.ptp(columns) + 1)))
+        assert seen_any > 20
+        if wasted:
+            # The ball in its box seen from a corner, and a pixel on every side of a few.
+            assert np.median(wasted) < 5.0
+    host = HostScene(scenes.Scene(camera), wp.get_device(device))
+    assert host.ball_rect(look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), camera) == EMPTY
+
+
 def test_nothing_in_front_gives_no_rectangle(device):
     """Objects behind the camera, and no object at all."""
     host = HostScene(scenes.Scene(CAMERA, objects=OBJECTS), wp.get_device(device))

@@ -76,6 +76,18 @@ def test_a_rung_that_leaves_a_stage_out_costs_nothing_of_it(case, device):
     assert costs["coarse"] > 0.0
 
 
+def test_what_the_ball_shows_is_compared_with_many_rays(case, device):
+    """Every rung leaves less of it than the one before; left out, all of it."""
+    rows, _ = tradeoff.sweep(case, knob("mirror_ball"), device, PRESETS["low"])
+    assert [row.rung for row in rows] == ["none", "single", "smooth", "brute_force"]
+    left = [row.stage_error.relative_rmse for row in rows]
+    assert left[0] == pytest.approx(1.0)
+    assert left[0] > left[1] > left[2] > left[3] == 0.0
+    errors = [row.error for row in rows]
+    assert errors[0] > max(errors[1:])
+    assert errors[3] == 0.0
+
+
 def test_truth_is_what_pictures_are_compared_with(case, device):
     truth = dataclasses.replace(case, truth={3: np.full_like(case.frames[3].image, 250)})
     rows, _ = tradeoff.sweep(truth, knob("expose"), device, PRESETS["low"])

@@ -45,7 +45,16 @@ class Knob:
         return self.name in _CONVERGING
 
 
-_CONVERGING = ("environment_height", "edge_samples", "light_shadow", "unwrap", "diffuse", "specular", "room_shadow")
+_CONVERGING = (
+    "environment_height",
+    "edge_samples",
+    "light_shadow",
+    "unwrap",
+    "diffuse",
+    "specular",
+    "room_shadow",
+    "mirror_ball",
+)
 _LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples")
 KNOBS: tuple[Knob, ...] = (
     Knob("environment_height", ("32", "64", "128", "256"), _LIGHT),
@@ -119,6 +128,15 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "what virtual objects reflect",
         {"environment": "the room (the paper)", "one_bounce": "the room, the desk and each other"},
     ),
+    "mirror_ball": (
+        "what the mirror ball in the picture shows of virtual things",
+        {
+            "none": "nothing (the paper)",
+            "single": "one ray per pixel",
+            "smooth": "4 rays per pixel",
+            "brute_force": "64 rays per pixel",
+        },
+    ),
     "expose": (
         "clipped pixels at a shorter exposure",
         {
@@ -140,6 +158,7 @@ _LIGHT_ONLY = {
     "relight": "paper",
     "room_shadow": "none",
     "shade": "environment",
+    "mirror_ball": "none",
     "edge_samples": "1",
 }
 """Rungs of what only shows the light, for frames that nobody looks at."""

@@ -129,6 +129,13 @@ NUMERICS: dict[str, StageNumerics] = {
         4.1e-07,
         (5, 6, 8, 9, 13, 14, 17, 18),
     ),
+    "mirror_ball": StageNumerics(
+        "float32; points put back onto the ball and onto what it mirrors",
+        2e-4,
+        "twenty roundings, turned by the ball's curvature; edges fall to either side",
+        1.8e-05,
+        (1, 3, 5, 6, 8, 9, 13, 14, 17, 18),
+    ),
     "composite": StageNumerics(
         "float32 to 8-bit codes by exact thresholds",
         0.501,

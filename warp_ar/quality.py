@@ -104,7 +104,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 recover="shading",
                 room_shadow="brute_force",
                 expose="ball",
-                mirror_ball="smooth",
+                mirror_ball="brute_force",
                 shade="one_bounce",
             ),
         )

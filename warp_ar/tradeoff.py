@@ -119,6 +119,7 @@ _OUTPUT = {
     "relight": "physical_added",
     "room_shadow": "physical_ratio",
     "shade": "virtual",
+    "mirror_ball": "mirrored",
     "edge_samples": "virtual",
     "light_shadow": "physical_added",
     "expose": "image",
@@ -473,9 +474,10 @@ def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
         if "irradiance_sh" in arrays:
             return irradiance_from_sh(arrays["irradiance_sh"].numpy())
         return resample(arrays["irradiance_map"].numpy(), NORMALS)
-    if name == "physical_ratio" and name not in arrays:
+    neutral = {"physical_ratio": 1.0, "mirrored": 0.0}
+    if name in neutral and name not in arrays:
         width, height = pipeline.size
-        return np.ones((height, width, 3), np.float32)
+        return np.full((height, width, 3), neutral[name], np.float32)
     return np.array(arrays[name].numpy()) if name in arrays else None
 
 

@@ -39,17 +39,17 @@ ROWS = {
 TRACK, SOURCE, PIPELINE = "track", "source", "pipeline"
 """What is no stage of a plan: finding the marker, reading frames, and the frame's way as a whole."""
 
-_RAYS = ("visibility", "shade", "relight", "room_shadow", "object_light")
+_RAYS = ("visibility", "shade", "relight", "room_shadow", "object_light", "mirror_ball")
 CONCERNS: dict[int, tuple[str, ...]] = {
-    1: ("unwrap", "recover", "declip"),
+    1: ("unwrap", "recover", "mirror_ball", "declip"),
     2: ("unwrap", "declip"),
-    3: ("unwrap", "fill", "recover"),
+    3: ("unwrap", "fill", "recover", "mirror_ball"),
     4: ("unwrap", "bracket", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples"),
     5: ("unwrap", "recover", "diffuse", "specular", *_RAYS, "declip"),
     6: (*(stage for stage in RUNGS if stage != "visibility"), PIPELINE),
     7: ("bracket", "accumulate", "recover", "expose", PIPELINE),
-    8: ("specular", "shade", "room_shadow", "object_light"),
-    9: ("relight", "shade"),
+    8: ("specular", "shade", "room_shadow", "object_light", "mirror_ball"),
+    9: ("relight", "shade", "mirror_ball"),
     10: ("key_lights", "relight"),
     11: ("summed_area", "expose"),
     12: ("summed_area", "recover", "composite", "declip", "expose"),
@@ -70,6 +70,7 @@ CONCERNS: dict[int, tuple[str, ...]] = {
         "room_shadow",
         "object_light",
         "shade",
+        "mirror_ball",
     ),
 }
 
@@ -146,6 +147,15 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_object_light.py::test_garbage_in_the_room_stays_finite": ((6, "object_light", "*"),),
     "test_object_light.py::test_averages_stop_at_the_edges_of_objects": ((6, "object_light", "*"),),
     "test_room_shadow.py::test_nothing_virtual_changes_nothing_to_the_bit": ((18, "room_shadow", "*"),),
+    "test_mirror_ball.py::test_grazing_the_silhouette": ((1, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_partly_outside_the_frame": ((3, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_a_ball_behind_a_proxy_is_not_changed": ((3, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_a_camera_inside_the_ball_sees_no_mirror": ((3, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_a_camera_close_to_the_ball": ((1, "mirror_ball", "*"), (3, "mirror_ball", "*")),
+    "test_mirror_ball.py::test_a_ball_behind_what_is_mirrored_hides_nothing": ((13, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_a_broken_shadow_reaches_only_what_mirrors_its_place": ((6, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_a_pixel_of_the_frame_changes_itself_alone": ((6, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_broken_light_reaches_only_what_mirrors_a_thing": ((6, "mirror_ball", "*"),),
     "test_materials.py::test_ends_of_every_range_are_finite": ((8, "shade", "*"),),
     "test_materials.py::test_white_furnace": ((8, "shade", "*"), (18, "shade", "*")),
     "test_relight.py::test_hard_lights_stay_finite": ((9, "relight", ""),),

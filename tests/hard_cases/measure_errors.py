@@ -34,6 +34,7 @@ TWINS = (
     "tests/test_materials.py::test_phong_matches_reference",
     "tests/test_materials.py::test_ggx_matches_reference",
     "tests/test_shade.py::test_matches_reference",
+    "tests/test_mirror_ball.py::test_matches_twin",
     "tests/test_composite.py::test_matches_twin",
     "tests/test_declip.py::test_matches_twin",
     "tests/test_exposure.py::test_box_matches_twin",

@@ -59,6 +59,14 @@ MUTATIONS = (
         "tests/test_declip.py::test_ball_pixel_off_the_middle_shows_what_it_mirrors",
     ),
     Mutation(
+        1,
+        "what leaves the mirror ball starts on it, not off it: at the rim it meets the ball again",
+        "kernels/mirror_ball.py",
+        "            start = offset_origin(point, normal, outward, error)\n",
+        "            start = point\n",
+        "tests/test_mirror_ball.py::test_grazing_the_silhouette",
+    ),
+    Mutation(
         2,
         "orthographic unwrapping: the reflected ray of a camera at infinity",
         "kernels/probe.py",
@@ -93,6 +101,14 @@ MUTATIONS = (
         "i = wp.clamp(i, 0, frame.shape[0] - 1)\n                    j = wp.clamp(j, 0, frame.shape[1] - 1)\n"
         "                    clear = at[2] > 0.0",
         "tests/test_recover.py::test_observation_reads_surfaces_and_nothing_else",
+    ),
+    Mutation(
+        3,
+        "a camera inside the ball sees it mirror the room",
+        "kernels/mirror_ball.py",
+        "            if wp.dot(normal, direction) >= 0.0:\n                continue",
+        "            if wp.dot(normal, direction) >= 0.0:\n                normal = -normal",
+        "tests/test_mirror_ball.py::test_a_camera_inside_the_ball_sees_no_mirror",
     ),
     Mutation(
         4,
@@ -149,6 +165,14 @@ MUTATIONS = (
         "if hit_object[i + a, j + b] == found and wp.dot",
         "if wp.dot",
         "tests/test_object_light.py::test_averages_stop_at_the_edges_of_objects",
+    ),
+    Mutation(
+        6,
+        "the ball takes on the shadows of what it hides, not of what it mirrors",
+        "kernels/mirror_ball.py",
+        "look_up_layer(physical_ratio, at[0], at[1])",
+        "physical_ratio[i, j]",
+        "tests/test_mirror_ball.py::test_a_broken_shadow_reaches_only_what_mirrors_its_place",
     ),
     Mutation(
         7,
@@ -273,6 +297,14 @@ MUTATIONS = (
         "tests/test_reflect.py::test_a_face_turned_away_is_not_in_the_picture",
     ),
     Mutation(
+        13,
+        "another ball beyond what is mirrored hides it",
+        "kernels/mirror_ball.py",
+        "nearest_ball(desk.probes, start, outward, reach)",
+        "nearest_ball(desk.probes, start, outward, FAR)",
+        "tests/test_mirror_ball.py::test_a_ball_behind_what_is_mirrored_hides_nothing",
+    ),
+    Mutation(
         14,
         "a fixed offset of ten micrometres where surfaces look at the room",
         "kernels/recover.py",
@@ -367,6 +399,14 @@ MUTATIONS = (
         "sent += weight * light\n",
         "sent += 0.0 * light\n",
         f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
+    ),
+    Mutation(
+        18,
+        "mirrored things are laid over what the ball showed, not put in its place",
+        "kernels/mirror_ball.py",
+        "change += wp.cw_mul(rho, radiance) - seen",
+        "change += wp.cw_mul(rho, radiance)",
+        f"{HARD}test_row18_energy.py::test_white_objects_in_a_white_ball_change_nothing",
     ),
     Mutation(
         18,

@@ -23,7 +23,7 @@ MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environmen
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
 GUARDED = ("accumulate", "fill", "diffuse", "specular", "room_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
-SIGNED = ("irradiance_sh",)
+SIGNED = ("irradiance_sh", "mirrored")
 MAP_READERS = [(stage, rung) for stage, rung in STAGE_RUNGS if stage not in ("unwrap", "summed_area", "visibility")]
 
 

@@ -45,6 +45,7 @@ BOUNDS = {
     "room_shadow": Bound(2e-3, "one of 64 rays may fall on the other side of an edge", 0.02),
     "object_light": Bound(2e-3, "one of 32 rays may fall on the other side of an edge", 0.05),
     "shade": Bound(5e-4, "powers, and edges of silhouettes and shadows", 0.02),
+    "mirror_ball": Bound(5e-4, "as relight and shade, turned by the ball; edges of what it mirrors", 0.02),
     "composite": Bound(0.0, "thresholds are exact; a code may move where radiance lies within an ulp of one", 0.001),
     "declip": Bound(1e-4, "sums of sums over ten levels, and a power"),
     "expose": Bound(0.0, "as composite", 0.001),

@@ -191,3 +191,24 @@ def test_white_objects_give_back_the_light_that_they_take(furnace_for, rung):
     else:
         assert abs(left).mean() < LOST * taken.mean()
         assert -left.min() < SAMPLED
+
+
+@pytest.mark.atlas(row=18, stage="mirror_ball")
+@pytest.mark.parametrize("rung", RUNGS["mirror_ball"])
+@pytest.mark.parametrize("name", WHITE)
+def test_white_objects_in_a_white_ball_change_nothing(furnace_for, rig_for, rung, name):
+    """A perfect mirror among white things: what it shows of them is what it showed of the room behind them."""
+    ball = rig_for("mirror_ball", rung).arrays["probes"].numpy().copy()
+    ball["reflectance"] = 1.0
+    found = {}
+    for color, colors in ((0.0, {"base_color": 0.0, "specular": 0.0}), (1.0, {})):
+        rig = furnace_for("mirror_ball", rung, {**WHITE[name], **colors})
+        rig.arrays["probes"].assign(ball)
+        found[color] = rig.run("mirror_ball")["mirrored"]
+    black = found[0.0].max(-1) < 0.0
+    assert black.any(), "the ball must show the objects"
+    if name in ("lambert", "mirror"):
+        assert found[0.0].min() >= -1.0, "nothing is darker than black"
+        assert found[0.0].min() < -0.5, "black things are black in it, where they fill a pixel"
+    np.testing.assert_allclose(found[1.0], 0.0, atol=FURNACE if name in ("lambert", "mirror") else TABLES)
+    np.testing.assert_array_equal(found[1.0][~black & (found[0.0] == 0.0).all(-1)], 0.0)

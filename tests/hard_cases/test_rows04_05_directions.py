@@ -22,6 +22,7 @@ FURNACE = 5e-4
 LIGHT_STAGES = [
     (stage, rung) for stage in ("fill", "key_lights", "diffuse", "specular", "room_samples") for rung in RUNGS[stage]
 ]
+AXIS_STAGES = ("recover", "visibility", "relight", "room_shadow", "object_light", "shade", "mirror_ball", "declip")
 make_lone = functools.lru_cache(maxsize=64)(LoneStage)
 
 
@@ -158,11 +159,7 @@ def test_directions_an_ulp_beyond_unit_length(device):
 @pytest.mark.atlas(row=5)
 @pytest.mark.parametrize(
     ("stage", "rung"),
-    [
-        (stage, rung)
-        for stage in ("recover", "visibility", "relight", "room_shadow", "object_light", "shade", "declip")
-        for rung in RUNGS[stage]
-    ],
+    [(stage, rung) for stage in AXIS_STAGES for rung in RUNGS[stage]],
 )
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_looking_exactly_along_the_axis(rig_for, stage, rung, up):

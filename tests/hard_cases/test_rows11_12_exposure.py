@@ -138,6 +138,15 @@ def test_exposures_at_their_ends(device, rung, name):
     assert (np.diff(pictures, axis=0) >= 0).all(), "darker, yet a pixel got brighter"
 
 
+def untouched_by(rig):
+    """Pixels that no layer changes."""
+    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
+    for name, neutral in (("physical_ratio", 1.0), ("mirrored", 0.0)):
+        if name in rig.arrays:
+            untouched &= (rig.get(name) == neutral).all(-1)
+    return untouched
+
+
 @pytest.mark.atlas(row=12)
 @pytest.mark.parametrize(
     ("stage", "rung"),
@@ -153,9 +162,7 @@ def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, rung, name):
         expected = ((FRAMES[name] @ weights + 128) >> 8).cumsum(0).cumsum(1)
         np.testing.assert_array_equal(rig.get("summed_area"), expected)
         return
-    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
-    if "physical_ratio" in rig.arrays:
-        untouched &= (rig.get("physical_ratio") == 1).all(-1)
+    untouched = untouched_by(rig)
     assert untouched.any()
     if stage == "composite":
         np.testing.assert_array_equal(picture[untouched], FRAMES[name][untouched])
@@ -169,9 +176,7 @@ def test_no_box_beyond_the_frame_darkens_its_border(rig_for, rung):
     """On a white frame every pixel, in corners too, is at least as bright as scaling alone makes it."""
     rig = rig_for("expose", rung)
     picture = rig.frame(FRAMES["white"])
-    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
-    if "physical_ratio" in rig.arrays:
-        untouched &= (rig.get("physical_ratio") == 1).all(-1)
+    untouched = untouched_by(rig)
     scale = rig.get("expose_scale")[0]
     least = round(255 * float(1.055 * scale ** (1 / 2.4) - 0.055))
     assert untouched.any()

@@ -37,7 +37,7 @@ from warp_ar.scene import Object, PhongMaterial, Proxy
 from warp_ar.tracking import Pose
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
-RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "room_shadow", "object_light", "declip")
+RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "room_shadow", "object_light", "mirror_ball", "declip")
 """Stages whose outputs are those of the same picture at any scale; ``recover`` rests on a card of the marker's size."""
 RAY_RUNGS = [(stage, rung) for stage in RAY_STAGES for rung in RUNGS[stage]]
 LONG_RAYS, SHORT_RAYS = 10_000_000, 100_000

@@ -17,8 +17,9 @@ from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows,
 from warp_ar.stages.composite import layer_names, mirrors_virtual
 from warp_ar.stages.relight import Relight, irradiance_name, relight_config
 from warp_ar.stages.shade import DFG_SIZE, room_light_names, shade_config
+from warp_ar.stages.visibility import GrowingRows
 
-SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4}
+SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
 """Rays per pixel, by rung; cheapest first, after ``none``."""
 
 
@@ -116,4 +117,4 @@ class MirrorBall(Stage):
         def launch(rows: Rows | None) -> None:
             mirror_ball.mirror_ball(config, *inputs, arrays["mirrored"], rows=rows)
 
-        return [Pass(launch, rows=self.request.size[1], extent=arrays["ball_rows"])]
+        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
