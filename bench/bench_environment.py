@@ -30,7 +30,7 @@ def run_height(height: int, device: str) -> None:
     change = wp.zeros(environment.change_shape(*shape), dtype=wp.vec2)
     levels = wp.zeros(environment.fill_level_offsets(*shape)[-1], dtype=wp.vec4)
     complete, lights = wp.zeros(shape, dtype=wp.vec3), wp.zeros(environment.KEY_LIGHT_COUNT, dtype=KeyLight)
-    sums, cells = wp.zeros(height, dtype=wp.vec4), wp.zeros(environment.CELL_SUMS, dtype=wp.vec3)
+    sums, cells = wp.zeros(height, dtype=wp.vec4), wp.zeros(environment.CELL_SUMS, dtype=wp.vec4)
 
     def accumulate() -> None:
         environment.measure_change(radiance, confidence, total, known, change)

@@ -93,15 +93,21 @@ KEY_LIGHT_COUNT = 4
 CELL_ROWS = wp.constant(8)
 CELL_COLUMNS = wp.constant(16)
 KEY_CELLS = wp.constant(CELL_ROWS * CELL_COLUMNS)
-CELL_SUMS = 2 * CELL_ROWS * CELL_COLUMNS
-"""Length of the scratch array of cells."""
+CELL_SUMS = 2 * CELL_ROWS * CELL_COLUMNS + 16
+"""Length of the scratch array of cells: their excess, what of it is left over, and sums around lights and pairs."""
 LOBE_INNER = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 LOBE_OUTER = wp.constant(wp.float32(math.cos(math.radians(40.0))))
 """Cosines of the angles up to which a texel belongs to a light whole, and at all."""
 CORE = wp.constant(wp.float32(0.9))
 """Share of a lobe's peak above which texels say where exactly the light is."""
 LOBE_ANGLE = wp.constant(wp.float32(math.radians(40.0)))
-KEY_BLOCK = 512
+COSINE_ROUNDING = wp.constant(wp.float32(1.0e-5))
+"""More than rounding makes of a cosine."""
+KEY_BLOCK = 256
+KEY_BLOCKS = 8
+"""Threads of a block, and blocks of a cluster, that find key lights."""
+CLUSTERS_FROM = 90
+"""Architecture from which on a device has clusters."""
 MAX_KEY_LIGHTS = 4
 
 mat43 = wp.types.matrix(shape=(MAX_KEY_LIGHTS, 3), dtype=wp.float32)
@@ -166,9 +172,12 @@ def warp_sum(value: wp.vec4) -> wp.vec4:
     """Sum over the warp's lanes, known to all of them, the same in all bits."""
 
 
+# A team is the block, or several blocks of one cluster where the device has them (from compute capability 9.0 on):
+# their sums go into each other's shared memory. Where they go is another place every other time, so that a block which
+# is ahead does not overwrite what one that is behind still reads.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    __shared__ float parts[32][4];
+    __shared__ float parts[32][4], shares[2][16][4];
     for (int reach = 16; reach > 0; reach /= 2)
         for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
     const int lane = threadIdx.x & 31;
@@ -178,12 +187,33 @@ def warp_sum(value: wp.vec4) -> wp.vec4:
     for (int k = 0; k < 4; ++k) value[k] = lane < blockDim.x / 32 ? parts[lane][k] : 0.0f;
     for (int reach = 16; reach > 0; reach /= 2)
         for (int k = 0; k < 4; ++k) value[k] += __shfl_xor_sync(0xffffffffu, value[k], reach);
+#if __CUDA_ARCH__ >= 900
+    if (blocks > 1) {
+        if (threadIdx.x < 4 * blocks) {
+            const unsigned int to = threadIdx.x / 4, part = threadIdx.x % 4;
+            const unsigned int own = __cvta_generic_to_shared(&shares[turn % 2][blockIdx.x % blocks][part]);
+            const float sum = part == 0 ? value[0] : part == 1 ? value[1] : part == 2 ? value[2] : value[3];
+            unsigned int other;
+            asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(other) : "r"(own), "r"(to));
+            asm volatile("st.shared::cluster.f32 [%0], %1;" :: "r"(other), "f"(sum) : "memory");
+        }
+        asm volatile("barrier.cluster.arrive.release.aligned; barrier.cluster.wait.acquire.aligned;" ::: "memory");
+        for (int k = 0; k < 4; ++k) {
+            value[k] = 0.0f;
+            for (int block = 0; block < blocks; ++block) value[k] += shares[turn % 2][block][k];
+        }
+        return value;
+    }
+#endif
     __syncthreads();
 #endif
     return value;
 """)
-def block_sum(value: wp.vec4) -> wp.vec4:
-    """Sum over the block's warps, known to all threads, the same in all bits."""
+def team_sum(value: wp.vec4, blocks: wp.int32, turn: wp.int32) -> wp.vec4:
+    """Sum over the team's threads, known to all of them, the same in all bits.
+
+    What was written before can be read after it. ``turn`` counts the calls.
+    """
 
 
 @wp.func_native("""
@@ -204,12 +234,47 @@ def block_max(value: wp.float32) -> wp.float32:
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    __shared__ float shares[2][16];
+    if (blocks > 1) {
+        if (threadIdx.x < blocks) {
+            const unsigned int own = __cvta_generic_to_shared(&shares[turn % 2][blockIdx.x % blocks]);
+            unsigned int other;
+            asm volatile("mapa.shared::cluster.u32 %0, %1, %2;" : "=r"(other) : "r"(own), "r"(threadIdx.x));
+            asm volatile("st.shared::cluster.f32 [%0], %1;" :: "r"(other), "f"(value) : "memory");
+        }
+        asm volatile("barrier.cluster.arrive.release.aligned; barrier.cluster.wait.acquire.aligned;" ::: "memory");
+        for (int block = 0; block < blocks; ++block) value = fmaxf(value, shares[turn % 2][block]);
+    }
+#endif
+    return value;
+""")
+def team_max(value: wp.float32, blocks: wp.int32, turn: wp.int32) -> wp.float32:
+    """Largest value of the team's blocks, known to all of them; arguments as ``team_sum``."""
+
+
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
     __syncthreads();
 #endif
 """)
 def wait_for_block():
     """Goes on once all threads of the block are here and what they wrote can be read."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ float from[3];
+    if (threadIdx.x == 0)
+        for (int k = 0; k < 3; ++k) from[k] = value[k];
+    __syncthreads();
+    for (int k = 0; k < 3; ++k) value[k] = from[k];
+    __syncthreads();
+#endif
+    return value;
+""")
+def from_first(value: wp.vec3) -> wp.vec3:
+    """What the block's first thread has, known to all of them."""
 
 
 # ---- accumulation ----
@@ -814,7 +879,7 @@ def sum_cells_kernel(
     environment: wp.array2d[wp.vec3],
     sums: wp.array[wp.vec4],
     # Out:
-    cells_out: wp.array[wp.vec3],  # excess luminance times direction, over the cell's solid angle
+    cells_out: wp.array[wp.vec4],  # excess luminance times direction, over the cell's solid angle; and its length
 ):
     """Excess of one cell a warp; lanes take ``parts`` of its rows."""
     cell, lane = wp.tid()
@@ -841,9 +906,9 @@ def sum_cells_kernel(
             at = rotated(at, cos_step, sin_step)
     sum = warp_sum(wp.vec4(moment[0], moment[1], moment[2], 0.0))
     if lane == 0:
-        moment = wp.vec3(sum[0], sum[1], sum[2])
-        cells_out[cell] = moment
-        cells_out[KEY_CELLS + cell] = moment  # what is left over by the lights found so far
+        found = wp.vec4(sum[0], sum[1], sum[2], wp.length(wp.vec3(sum[0], sum[1], sum[2])))
+        cells_out[cell] = found
+        cells_out[KEY_CELLS + cell] = found  # what is left over by the lights found so far
 
 
 @wp.func
@@ -852,90 +917,216 @@ def lobe_window(cosine: wp.float32) -> wp.float32:
     return smooth_ramp(LOBE_OUTER, LOBE_INNER, cosine)
 
 
+# Loops over lights have constant ends, and what is known of a light is picked by comparing: indices that are not
+# constants would put it into memory.
+
+
 @wp.func
 def left_over(direction: wp.vec3, found: mat43, count: wp.int32) -> wp.float32:
     """Share of a texel that no light found so far has taken."""
     share = wp.float32(1.0)
-    for k in range(count):
-        share *= 1.0 - lobe_window(wp.dot(direction, wp.vec3(found[k, 0], found[k, 1], found[k, 2])))
+    for k in range(MAX_KEY_LIGHTS):
+        if k < count:
+            share *= 1.0 - lobe_window(wp.dot(direction, wp.vec3(found[k, 0], found[k, 1], found[k, 2])))
     return share
 
 
 @wp.func
-def shift_on_cells(cells: wp.array[wp.vec3], direction: wp.vec3, power: wp.int32, lane: wp.int32) -> wp.vec3:
-    """One mean shift with the kernel cos^power of all that faces the direction; for a whole warp, power 0, 2 or 8."""
-    sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for cell in range(lane, KEY_CELLS, lane_count()):
-        moment = cells[KEY_CELLS + cell]
-        facing = wp.dot(moment, direction)
-        if facing > 0.0:
-            cosine = facing / wp.length(moment)
-            weight = wp.float32(1.0)
-            if power >= 2:
-                weight *= cosine * cosine
-            if power >= 8:
-                weight *= cosine * cosine * cosine
-                weight *= cosine * cosine * cosine
-            sum += weight * wp.vec4(moment[0], moment[1], moment[2], 0.0)
-    total = warp_sum(sum)
-    centre = wp.vec3(total[0], total[1], total[2])
-    if wp.length(centre) > 0.0:
-        return wp.normalize(centre)
-    return direction
+def columns_of_lobe(
+    direction: wp.vec3, sin_theta: wp.float32, cos_theta: wp.float32, centre: wp.float32, width: wp.int32
+) -> wp.vec2i:
+    """First column, and number of columns, of a row's texels that may lie within ``LOBE_ANGLE`` of a direction.
+
+    Columns are counted on beyond the seam. A texel lies within where its cosine,
+    sin theta |xy| cos(phi - phi0) + cos theta z, is at least that of the angle.
+
+    Args:
+        direction: Unit.
+        sin_theta: Of the row.
+        cos_theta: Of the row.
+        centre: Column of the direction, texel centres at integers.
+        width: Columns of the map.
+    """
+    widest = sin_theta * wp.length(wp.vec2(direction[0], direction[1]))
+    least = LOBE_OUTER - cos_theta * direction[2]
+    if least > widest + COSINE_ROUNDING:
+        return wp.vec2i(0, 0)
+    if not (least > COSINE_ROUNDING - widest):
+        return wp.vec2i(0, width)
+    reach = wp.acos(wp.min(least / widest, 1.0)) / (2.0 * PI) * wp.float32(width) + 0.5
+    first = wp.int32(wp.floor(centre - reach))
+    return wp.vec2i(first, wp.min(wp.int32(wp.ceil(centre + reach)) - first + 1, width))
 
 
-@wp.func
-def excess_around(cells: wp.array[wp.vec3], direction: wp.vec3, lane: wp.int32) -> wp.float32:
+# What concerns cells is written so that few instructions do it: a warp that has a processor to itself waits for each.
+
+
+_LANES = f"""
+#if defined(__CUDA_ARCH__)
+    constexpr int LANES = 32;
+    const int lane = threadIdx.x & 31;
+#else
+    constexpr int LANES = 1;
+    const int lane = 0;
+#endif
+    constexpr int CELLS = {CELL_ROWS * CELL_COLUMNS}, OWN = CELLS / LANES;
+"""
+
+
+@wp.func_native(
+    _LANES
+    + """
+    const wp::vec_t<4, float>* left_over = cells.data + CELLS;
+#if defined(__CUDA_ARCH__)
+    __shared__ float4 staged[CELLS];
+    for (int cell = threadIdx.x; cell < CELLS; cell += blockDim.x)
+        staged[cell] = make_float4(left_over[cell][0], left_over[cell][1], left_over[cell][2], 0.0f);
+    __syncthreads();
+    return reinterpret_cast<wp::uint64>(staged);
+#else
+    return reinterpret_cast<wp::uint64>(left_over);
+#endif
+"""
+)
+def stage_cells(cells: wp.array[wp.vec4]) -> wp.uint64:
+    """Where what is left over can be read fast; for a whole block."""
+
+
+@wp.func_native(
+    _LANES
+    + """
+    const float* moments = reinterpret_cast<const float*>(staged);
+    float sum = 0.0f;
+#if defined(__CUDA_ARCH__)
+#pragma unroll 8
+#endif
+    for (int cell = 0; cell < CELLS; ++cell) {
+        const float* at = moments + 4 * cell;
+        const float facing = at[0] * toward[0] + at[1] * toward[1] + at[2] * toward[2];
+        sum += facing > 0.0f ? facing : 0.0f;
+    }
+    return sum;
+"""
+)
+def received_from(staged: wp.uint64, toward: wp.vec3) -> wp.float32:
+    """What a surface that faces ``toward`` receives of the excess that is left over; ``staged`` is ``stage_cells``."""
+
+
+@wp.func_native("""
+    const wp::vec3& texel = wp::index(environment, row, column);
+#if defined(__CUDA_ARCH__)
+    return wp::vec3(__ldg(&texel.c[0]), __ldg(&texel.c[1]), __ldg(&texel.c[2]));
+#else
+    return texel;
+#endif
+""")
+def load_constant(environment: wp.array2d[wp.vec3], row: wp.int32, column: wp.int32) -> wp.vec3:
+    """A texel of what does not change while a team works: it stays in the cache while blocks wait for each other."""
+
+
+@wp.func_native(
+    _LANES
+    + """
+    wp::vec_t<4, float> own[OWN];
+    float inverse[OWN];
+    for (int n = 0; n < OWN; ++n) {
+        own[n] = cells.data[CELLS + lane + LANES * n];
+        inverse[n] = own[n][3] > 0.0f ? 1.0f / own[n][3] : 0.0f;
+    }
+#if defined(__CUDA_ARCH__)
+#pragma unroll 1
+#endif
+    for (int shift = 0; shift < 10; ++shift) {
+        float centre[3] = {0.0f, 0.0f, 0.0f};
+        for (int n = 0; n < OWN; ++n) {
+            const float facing = own[n][0] * direction[0] + own[n][1] * direction[1] + own[n][2] * direction[2];
+            const float cosine = facing * inverse[n], square = cosine * cosine, fourth = square * square;
+            const float weight = facing > 0.0f ? (shift < 2 ? 1.0f : shift < 4 ? square : fourth * fourth) : 0.0f;
+            for (int k = 0; k < 3; ++k) centre[k] += weight * own[n][k];
+        }
+#if defined(__CUDA_ARCH__)
+        for (int reach = 16; reach > 0; reach /= 2)
+            for (int k = 0; k < 3; ++k) centre[k] += __shfl_xor_sync(0xffffffffu, centre[k], reach);
+#endif
+        const float length = sqrtf(centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]);
+        if (length > 0.0f)
+            for (int k = 0; k < 3; ++k) direction[k] = centre[k] / length;
+    }
+    return direction;
+"""
+)
+def shift_on_cells(cells: wp.array[wp.vec4], direction: wp.vec3) -> wp.vec3:
+    """Ten mean shifts: two with all that faces the direction, two with cos^2, six with cos^8; for a whole warp."""
+
+
+@wp.func_native(
+    _LANES
+    + """
+    float sum = 0.0f;
+    for (int n = 0; n < OWN; ++n) {
+        const wp::vec_t<4, float> moment = cells.data[lane + LANES * n];
+        const float facing = moment[0] * direction[0] + moment[1] * direction[1] + moment[2] * direction[2];
+        if (facing > 0.0f) {
+            const float cosine = facing / moment[3], square = cosine * cosine, fourth = square * square;
+            sum += moment[3] * fourth * fourth * fourth * fourth;
+        }
+    }
+#if defined(__CUDA_ARCH__)
+    for (int reach = 16; reach > 0; reach /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, reach);
+#endif
+    return sum;
+"""
+)
+def excess_around(cells: wp.array[wp.vec4], direction: wp.vec3) -> wp.float32:
     """Excess within some 17 degrees of a direction, weighted by cos^16; for a whole warp."""
-    sum = wp.float32(0.0)
-    for cell in range(lane, KEY_CELLS, lane_count()):
-        facing = wp.dot(cells[cell], direction)
-        if facing > 0.0:
-            cosine = facing / wp.length(cells[cell])
-            power = cosine * cosine
-            power *= power
-            power *= power
-            sum += facing / cosine * power * power
-    return warp_sum(wp.vec4(sum, 0.0, 0.0, 0.0))[0]
 
 
 # A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
-@wp.kernel(module="unique", enable_backward=False)
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=KEY_BLOCK, cluster_dim=KEY_BLOCKS)
 def find_key_lights_kernel(
     # In:
+    blocks: wp.int32,
     environment: wp.array2d[wp.vec3],
     sums: wp.array[wp.vec4],
     # Out:
-    cells_out: wp.array[wp.vec3],
+    cells_out: wp.array[wp.vec4],
     key_lights_out: wp.array[KeyLight],
 ):
-    """One block finds all lights, one after another; thread 0 ranks and writes them.
+    """A team of blocks finds all lights, one after another.
 
-    What concerns cells, every warp does for itself: to wait for each other would take longer. Texels are shared out.
+    Every block does for itself what concerns cells: to wait for each other would take longer. Texels are shared out: a
+    row to a warp, of which its lanes take every so manyth, and only as far as the lobe reaches. Loops that are not to
+    be unrolled are written as ``while``: a kernel that is run through once takes as long as its instructions take to
+    arrive.
     """
-    _block, thread = wp.tid()
+    block, thread = wp.tid()
     threads = wp.block_dim()
-    lane = thread % lane_count()
+    worker = block * threads + thread
+    workers = blocks * threads
+    lanes = lane_count()
+    lane = thread % lanes
     height = environment.shape[0]
     width = environment.shape[1]
-    all = sum_all(sums, lane, lane_count())
+    all = sum_all(sums, lane, lanes)
     flow = wp.vec3(all[0], all[1], all[2])
     mean = all[3] / (4.0 * PI)
-    cos_step = wp.cos(2.0 * PI / wp.float32(width))
-    sin_step = wp.sin(2.0 * PI / wp.float32(width))
+    column_angle = 2.0 * PI / wp.float32(width)
+    cos_step = wp.cos(column_angle * wp.float32(lanes))
+    sin_step = wp.sin(column_angle * wp.float32(lanes))
+    area_of_sine = 2.0 * wp.sin(0.5 * PI / wp.float32(height)) * column_angle  # a texel's solid angle / sin theta
     found = mat43()
     strengths = wp.vec4(0.0, 0.0, 0.0, 0.0)
     reds = wp.vec4(0.0, 0.0, 0.0, 0.0)
     greens = wp.vec4(0.0, 0.0, 0.0, 0.0)
     blues = wp.vec4(0.0, 0.0, 0.0, 0.0)
     count = key_lights_out.shape[0]
-    # Runs of texels that share one start of the rotation: long ones where a single thread walks them all.
-    segments = wp.where(threads == 1, 1, 64)
+    turn = int(0)
 
     for k in range(count):
         # The cell's direction in which a surface receives most; the first of equals, whatever the number of threads.
         best = wp.float32(0.0)
         best_cell = wp.float32(KEY_CELLS)
+        staged = stage_cells(cells_out)
         candidate = thread
         while candidate < KEY_CELLS:
             toward = direction_from_latlong(
@@ -944,9 +1135,7 @@ def find_key_lights_kernel(
                 CELL_ROWS,
                 CELL_COLUMNS,
             )
-            received = wp.float32(0.0)
-            for cell in range(KEY_CELLS):
-                received += wp.max(wp.dot(cells_out[KEY_CELLS + cell], toward), 0.0)
+            received = received_from(staged, toward)
             if received > best:
                 best = received
                 best_cell = wp.float32(candidate)
@@ -964,14 +1153,15 @@ def find_key_lights_kernel(
                 CELL_ROWS,
                 CELL_COLUMNS,
             )
-            for step in range(10):
-                power = wp.where(step < 2, 0, wp.where(step < 4, 2, 8))
-                direction = shift_on_cells(cells_out, direction, power, lane)
+            if thread < lanes:
+                direction = shift_on_cells(cells_out, direction)
+            direction = from_first(direction)
 
         # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
         # 3: what the lobe gives.
         peak = wp.float32(0.0)
-        for step in range(4):
+        step = int(0)
+        while step < 4:
             sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
             highest = wp.float32(0.0)
             theta = wp.atan2(wp.length(wp.vec2(direction[0], direction[1])), direction[2])
@@ -979,92 +1169,119 @@ def find_key_lights_kernel(
             last_row = wp.min(wp.int32((theta + LOBE_ANGLE) / PI * wp.float32(height)), height - 1)
             if not lit:
                 last_row = first_row - 1
-            item = thread
-            while item < (last_row - first_row + 1) * segments:
-                i = first_row + item // segments
-                start = item % segments * width // segments
-                stop = (item % segments + 1) * width // segments
-                area = texel_solid_angle(i, height, width)
-                at = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(start) + 0.5, height, width)
-                for j in range(start, stop):
+            middle = (wp.atan2(direction[1], direction[0]) / PI + 1.0) * 0.5 * wp.float32(width) - 0.5
+            i = first_row + worker // lanes
+            while i <= last_row:
+                row_theta = (wp.float32(i) + 0.5) * PI / wp.float32(height)
+                sin_theta = wp.sin(row_theta)
+                cos_theta = wp.cos(row_theta)
+                span = columns_of_lobe(direction, sin_theta, cos_theta, middle, width)
+                area = area_of_sine * sin_theta
+                phi = (wp.float32(span[0] + lane) + 0.5) * column_angle - PI
+                at = wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), cos_theta)
+                column = lane
+                while column < span[1]:
+                    j = span[0] + column
+                    if j < 0:
+                        j += width
+                    if j >= width:
+                        j -= width
+                    value = load_constant(environment, i, j)
                     cosine = wp.dot(at, direction)
-                    if cosine > LOBE_OUTER:
-                        value = environment[i, j]
-                        excess = wp.max(luminance(value) - mean, 0.0)
-                        if excess > 0.0:
-                            share = lobe_window(cosine) * left_over(at, found, k)
-                            weight = area * share * excess
-                            if step == 2:
-                                weight = area * share * wp.max(excess - CORE * peak, 0.0)
-                            if step < 3:
-                                highest = wp.max(highest, share * excess)
-                                sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
-                            else:
-                                # Light above the room's mean, in the texel's own colour.
-                                given = (weight / luminance(value) * cosine) * value
-                                sum += wp.vec4(given[0], given[1], given[2], 0.0)
+                    excess = wp.max(luminance(value) - mean, 0.0)
+                    if cosine > LOBE_OUTER and excess > 0.0:
+                        share = lobe_window(cosine) * left_over(at, found, k)
+                        weight = area * share * excess
+                        if step == 2:
+                            weight = area * share * wp.max(excess - CORE * peak, 0.0)
+                        if step < 3:
+                            highest = wp.max(highest, share * excess)
+                            sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
+                        else:
+                            # Light above the room's mean, in the texel's own colour.
+                            given = (weight / luminance(value) * cosine) * value
+                            sum += wp.vec4(given[0], given[1], given[2], 0.0)
                     at = rotated(at, cos_step, sin_step)
-                item += threads
+                    column += lanes
+                i += workers // lanes
             if step == 3:
-                # Each thread its own cells; the sums below make all of them wait for that.
-                cell = thread
+                # Each worker its own cells; the sums below make all of them wait for that.
+                cell = worker
                 while cell < KEY_CELLS:
                     moment = cells_out[KEY_CELLS + cell]
-                    if wp.length(moment) > 0.0:
-                        taken = lobe_window(wp.dot(moment, direction) / wp.length(moment))
-                        cells_out[KEY_CELLS + cell] = (1.0 - taken) * moment
-                    cell += threads
-            total = block_sum(sum)
+                    if moment[3] > 0.0:
+                        facing = wp.dot(wp.vec3(moment[0], moment[1], moment[2]), direction)
+                        cells_out[KEY_CELLS + cell] = (1.0 - lobe_window(facing / moment[3])) * moment
+                    cell += workers
+            total = team_sum(sum, blocks, turn)
+            turn += 1
             if step == 1:
-                peak = block_max(highest)
+                peak = team_max(block_max(highest), blocks, turn)
+                turn += 1
             if step < 3:
                 centre = wp.vec3(total[0], total[1], total[2])
                 if wp.length(centre) > 0.0:
                     direction = wp.normalize(centre)
             else:
-                reds[k] = total[0]
-                greens[k] = total[1]
-                blues[k] = total[2]
-                strengths[k] = luminance(wp.vec3(total[0], total[1], total[2]))
-        for axis in range(3):
-            found[k, axis] = direction[axis]
+                given = wp.vec3(total[0], total[1], total[2])
+                for place in range(MAX_KEY_LIGHTS):
+                    if place == k:
+                        reds[place] = given[0]
+                        greens[place] = given[1]
+                        blues[place] = given[2]
+                        strengths[place] = luminance(given)
+            step += 1
+        for place in range(MAX_KEY_LIGHTS):
+            if place == k:
+                for axis in range(3):
+                    found[place, axis] = direction[axis]
 
-    # How far each pair of lights are rivals: 60 degrees apart, with a valley between them.
-    apart = wp.mat44()
-    around = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for k in range(count):
-        a = wp.vec3(found[k, 0], found[k, 1], found[k, 2])
-        around[k] = excess_around(cells_out, a, lane)
-        for j in range(k):
-            b = wp.vec3(found[j, 0], found[j, 1], found[j, 2])
-            middle = excess_around(cells_out, wp.normalize(a + b), lane)
-            least = wp.min(around[j], around[k])
+    # How far each pair of lights are rivals: 60 degrees apart, with a valley between them. A sum to a warp.
+    if block > 0:
+        return
+    lights = found
+    strength = strengths
+    item = thread // lanes
+    while item < MAX_KEY_LIGHTS * MAX_KEY_LIGHTS:
+        first = item // MAX_KEY_LIGHTS
+        second = item % MAX_KEY_LIGHTS
+        if first <= second and second < count:
+            a = wp.vec3(lights[first, 0], lights[first, 1], lights[first, 2])
+            b = wp.vec3(lights[second, 0], lights[second, 1], lights[second, 2])
+            halfway = wp.normalize(a + b)
+            if first == second:
+                halfway = a
+            excess = excess_around(cells_out, halfway)
             rivalry = wp.clamp(2.0 * (1.0 - wp.dot(a, b)), 0.0, 1.0)
-            if least > 0.0:
-                rivalry *= 1.0 - smooth_ramp(0.3, 0.6, middle / least)
-            apart[j, k] = rivalry
-            apart[k, j] = rivalry
+            if lane == 0:
+                cells_out[2 * KEY_CELLS + item] = wp.vec4(excess, rivalry, 0.0, 0.0)
+        item += threads // lanes
+    wait_for_block()
 
-    if thread == 0:
-        placed = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        for place in range(count):
-            # Brightest first; of equals the one that was found first.
-            pick = wp.int32(-1)
-            for k in range(count):
-                if placed[k] == 0.0:
-                    if pick < 0 or strengths[k] > strengths[wp.max(pick, 0)]:
-                        pick = k
-            placed[pick] = 1.0
-            light = KeyLight()
-            light.direction = wp.vec3(found[pick, 0], found[pick, 1], found[pick, 2])
-            light.irradiance = wp.vec3(reds[pick], greens[pick], blues[pick])
-            light.dominance = 0.0
-            if strengths[pick] > 0.0:
-                alone = wp.float32(1.0)
-                for k in range(count):
-                    alone = wp.min(alone, 1.0 - wp.min(1.0, strengths[k] / strengths[pick]) * apart[pick, k])
-                light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
-            key_lights_out[place] = light
+    k = thread
+    while k < count:
+        around = cells_out[2 * KEY_CELLS + (MAX_KEY_LIGHTS + 1) * k][0]
+        # Brightest first; of equals the one that was found first.
+        place = int(0)
+        alone = wp.float32(1.0)
+        for j in range(count):
+            if strength[j] > strength[k] or (strength[j] == strength[k] and j < k):
+                place += 1
+            between = cells_out[2 * KEY_CELLS + MAX_KEY_LIGHTS * wp.min(j, k) + wp.max(j, k)]
+            least = wp.min(around, cells_out[2 * KEY_CELLS + (MAX_KEY_LIGHTS + 1) * j][0])
+            rivalry = between[1]
+            if least > 0.0:
+                rivalry *= 1.0 - smooth_ramp(0.3, 0.6, between[0] / least)
+            if j != k and strength[k] > 0.0:
+                alone = wp.min(alone, 1.0 - wp.min(1.0, strength[j] / strength[k]) * rivalry)
+        light = KeyLight()
+        light.direction = wp.vec3(lights[k, 0], lights[k, 1], lights[k, 2])
+        light.irradiance = wp.vec3(reds[k], greens[k], blues[k])
+        light.dominance = 0.0
+        if strength[k] > 0.0:
+            light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
+        key_lights_out[place] = light
+        k += threads
 
 
 def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.array, key_lights_out: wp.array) -> None:
@@ -1073,7 +1290,7 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
     Args:
         environment: ``wp.vec3`` (h, w), finite and not negative.
         sums_out: Scratch, ``wp.vec4`` (h).
-        cells_out: Scratch, ``wp.vec3`` (``CELL_SUMS``).
+        cells_out: Scratch, ``wp.vec4`` (``CELL_SUMS``).
         key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0
             and looks toward +z.
 
@@ -1087,10 +1304,11 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
     wp.launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
     cells = CELL_ROWS * CELL_COLUMNS
     wp.launch(sum_cells_kernel, (cells, lanes), [lanes, parts, environment, sums_out], [cells_out], device=device)
+    blocks = KEY_BLOCKS if device.is_cuda and device.arch >= CLUSTERS_FROM else 1
     launch_tiles(
         find_key_lights_kernel,
-        [1],
-        [environment, sums_out],
+        [blocks],
+        [blocks, environment, sums_out],
         [cells_out, key_lights_out],
         block_dim=KEY_BLOCK,
         device=device,

@@ -417,7 +417,7 @@ def key_lights(radiance, count=environment.KEY_LIGHT_COUNT):
     radiance = np.ascontiguousarray(radiance, np.float32)
     lights = wp.zeros(count, dtype=KeyLight)
     sums = wp.zeros(radiance.shape[0], dtype=wp.vec4)
-    cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec3)
+    cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec4)
     environment.find_key_lights(wp.array(radiance, dtype=wp.vec3), sums, cells, lights)
     return lights.numpy()
 

@@ -32,7 +32,7 @@ class KeyLights(Stage):
         return {
             "key_lights": ArraySpec((environment.KEY_LIGHT_COUNT,), KeyLight),
             "key_lights_sums": ArraySpec((self.request.quality.environment_height,), wp.vec4),
-            "key_lights_cells": ArraySpec((environment.CELL_SUMS,), wp.vec3),
+            "key_lights_cells": ArraySpec((environment.CELL_SUMS,), wp.vec4),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
