@@ -15,7 +15,7 @@ from warp_ar import graph
 from warp_ar.graph import Plan, make_plan
 from warp_ar.kernels.launch import launch_rows
 from warp_ar.quality import PRESETS
-from warp_ar.scheduler import Scheduler
+from warp_ar.scheduler import Scheduler, _giving_way
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 
 SIZE = 37
@@ -215,3 +215,25 @@ def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, dev
     if wp.get_device(device).is_cuda:
         assert sorted(len(segments) for segments in scheduler._patterns.values()) == [1, 3]
     scheduler.close()
+
+
+def test_a_stage_gives_way_as_far_as_its_readers_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind the last stage that it names, but before whoever reads what it writes."""
+
+    def order(a: tuple[str, ...] = (), b: tuple[str, ...] = ()) -> list[str]:
+        stages = {}
+        for target, source in (("a", "frame"), ("b", "frame"), ("c", "frame"), ("d", "a"), ("e", "frame")):
+            way = {"a": a, "b": b}.get(target, ())
+            fields = {"name": target, "source": source, "target": target, "gives_way": lambda self, way=way: way}
+            stages[target] = type(target, (AddOne,), fields)
+        plan = plan_of(monkeypatch, tuple(stages.values()), ("a", "b", "c", "d", "e"))
+        return [
+            stage.name for stage, _ in _giving_way([(kind(plan.request, wiring), []) for kind, wiring in plan.stages])
+        ]
+
+    assert order() == ["a", "b", "c", "d", "e"]
+    assert order(a=("b",)) == ["b", "a", "c", "d", "e"]
+    assert order(a=("b", "c")) == ["b", "c", "a", "d", "e"]
+    assert order(a=("e",)) == ["a", "b", "c", "d", "e"]  # d, in between, reads it
+    assert order(b=("e",)) == ["a", "c", "d", "e", "b"]
+    assert order(b=("a",)) == ["a", "b", "c", "d", "e"]

@@ -1,9 +1,10 @@
 """Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
 
 On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
-graph. In the graph a stage waits only for those whose output it reads, so that short kernels, which leave most of the
-device idle, run beside others. On CPU it is the same: threads take bands of whatever stage has its inputs, the first in
-order first, so that nobody waits for a pass that cannot be split, or for the last band of one that can.
+graph. In the graph a stage waits only for those whose output it reads, and for those that it gives way to, so that
+short kernels, which leave most of the device idle, run beside others. On CPU it is the same: threads take bands of
+whatever stage has its inputs, the first in order first, so that nobody waits for a pass that cannot be split, or for
+the last band of one that can.
 """
 
 from __future__ import annotations
@@ -268,15 +269,19 @@ class Scheduler:
         self._streams += [wp.Stream(self.device) for _ in range(len(part) - len(self._streams))]
         begun = stream.record_event()
         written: dict[str, Any] = {}
-        for own, (stage, passes) in zip(self._streams, part, strict=False):
+        ends: dict[str, Any] = {}
+        for own, (stage, passes) in zip(self._streams, _giving_way(part), strict=False):
             own.wait_event(begun)
             for name in stage.wiring.reads:
                 if name in written:
                     own.wait_event(written[name])
+            for name in stage.gives_way():
+                if name in ends:
+                    own.wait_event(ends[name])
             with wp.ScopedStream(own, sync_enter=False):
                 for step in passes:
                     step.launch(None)
-            done = own.record_event()
+            done = ends[stage.name] = own.record_event()
             written.update(dict.fromkeys(stage.wiring.writes, done))
             stream.wait_event(done)
 
@@ -420,6 +425,22 @@ def _due_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
     """Passes of a stage that take part in this frame."""
     stage.begin()
     return [step for step in passes if step.due is None or step.due()]
+
+
+def _giving_way(part: list[Step]) -> list[Step]:
+    """Stages in the order of their launch: after those that they give way to, but before those that read them."""
+    ordered = list(part)
+    for step in part:
+        stage = step[0]
+        place = at = ordered.index(step)
+        for behind in range(at + 1, len(ordered)):
+            other = ordered[behind][0]
+            if not set(stage.wiring.writes).isdisjoint(other.wiring.reads):
+                break
+            if other.name in stage.gives_way():
+                place = behind
+        ordered.insert(place, ordered.pop(at))
+    return ordered
 
 
 def _segments(due: list[Step]) -> list[Segment]:

@@ -148,6 +148,13 @@ class Stage(abc.ABC):
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
 
+    def gives_way(self) -> tuple[str, ...]:
+        """Names of stages that are slower beside this one than before it: on CUDA it waits for them.
+
+        For a stage that nobody waits for before those are done, and that fills the device by itself.
+        """
+        return ()
+
     def close(self) -> None:  # noqa: B027
         """Let go of what the stage holds beside arrays: its threads."""
 

@@ -11,7 +11,7 @@ from warp_ar.kernels import relight
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.room_samples import knows_lamps
-from warp_ar.stages.shade import casts_soft
+from warp_ar.stages.shade import casts_soft, sees_near
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -39,6 +39,10 @@ class Relight(Stage):
             reads.append(irradiance_name(request))
             reads += ["lamps"] * knows_lamps(request)
         return Wiring(tuple(reads), ("physical_added",))
+
+    def gives_way(self) -> tuple[str, ...]:
+        """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
+        return () if sees_near(self.request) else ("room_shadow",)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance."""
