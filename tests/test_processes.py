@@ -31,7 +31,7 @@ def test_folders_alone_are_spread(monkeypatch, pytestconfig, arguments, options,
     monkeypatch.chdir(pytestconfig.rootpath)
     monkeypatch.setattr(conftest, "_cores", lambda: 3)
     monkeypatch.setattr(conftest, "_devices", lambda: ["cpu"])
-    assert asked(arguments, options) == expected
+    assert asked(monkeypatch, arguments, options) == expected
 
 
 @pytest.mark.parametrize(
@@ -47,12 +47,13 @@ def test_neither_one_core_nor_a_gpu_is_shared(monkeypatch, pytestconfig, cores, 
     monkeypatch.chdir(pytestconfig.rootpath)
     monkeypatch.setattr(conftest, "_cores", lambda: cores)
     monkeypatch.setattr(conftest, "_devices", lambda: devices)
-    assert asked([HERE], {}) == expected
+    assert asked(monkeypatch, [HERE], {}) == expected
 
 
-def asked(arguments, options):
+def asked(monkeypatch, arguments, options):
     """Number of processes that a run with these arguments is spread over, None where it is not, and how."""
     option = types.SimpleNamespace(**{**FREE, **options})
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     plugins = types.SimpleNamespace(hasplugin=lambda name: name == "xdist")
     conftest.pytest_cmdline_main(types.SimpleNamespace(option=option, args=arguments, pluginmanager=plugins))
     return option.numprocesses, option.dist
