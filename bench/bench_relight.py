@@ -1,12 +1,15 @@
-"""Virtual light on a desk of one plane and one box, 640x480, every rung, light on the whole frame."""
+"""Virtual light on a desk of one plane and one box, 640x480, every rung, light on the whole frame; and its cells."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar.kernels import color, relight, summed_area
+from warp_ar.kernels import color, desk_cells, relight, room_samples, summed_area
+from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.kernels.structs import BOX, PLANE, POINT, SPHERE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
 
@@ -25,6 +28,64 @@ def _shape(kind: int, position: tuple, extent: tuple) -> dict:
     return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent, "material": -1}
 
 
+def _cells(
+    device: str,
+    params: wp.array,
+    rays: wp.array,
+    frame: wp.array,
+    decode: wp.array,
+    table: wp.array,
+    scene: RayScene,
+    probes: wp.array,
+    lights: wp.array,
+    keys: wp.array,
+    room: wp.array,
+    out: wp.array,
+) -> dict[str, Callable[[], None]]:
+    """Passes of the rung ``bounce``, in their order, in a white room."""
+    trace = TraceConfig((SPHERE,), (PLANE, BOX))
+    config = relight.RelightConfig("reflectance", trace, "sh", True, share=True, bounced=True)
+    place, share_stride, stride, patch_stride = desk_cells.CellConfig(config), 4, 8, 16
+    environment = wp.full((64, 128), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
+    cumulative = wp.zeros((64, 128), wp.float32, device=device)
+    sums, samples = wp.zeros(64, wp.vec2, device=device), wp.zeros(1024, RoomSample, device=device)
+    unused = [wp.zeros(1024, wp.vec3, device=device) for _ in range(2)]
+    room_samples.sum_environment(environment, cumulative, sums)
+    room_samples.draw_samples(environment, cumulative, sums, wp.vec3(-0.1, 0.0, 0.04), *unused, samples)
+
+    def grid(size: int, dtype: type) -> wp.array:
+        return wp.zeros((-(-H // size), -(-W // size)), dtype, device=device)
+
+    cells = relight.DeskCells()
+    cells.share, cells.share_surface = grid(share_stride, wp.vec3), grid(share_stride, wp.int32)
+    cells.bounced, cells.bounced_surface = grid(stride, wp.vec3), grid(stride, wp.int32)
+    cells.share_stride, cells.bounced_stride = share_stride, stride
+    patches, listed = grid(patch_stride, desk_cells.Patch), grid(patch_stride, desk_cells.Patch)
+    count = wp.zeros(patches.shape[0], wp.int32, device=device)
+    desk = relight.make_desk(config, frame, decode, table, probes, keys, room, cells=cells)
+    seen = params, rays, scene
+    shares = desk, samples, 256, share_stride, cells.share, cells.share_surface
+    sums_out = cells.bounced, cells.bounced_surface
+    known = frame, decode, table, scene, probes, lights, keys, room, out
+    passes: dict[str, Callable[[], None]] = {
+        "share_room": lambda: desk_cells.share_room(place, *seen, lights, *shares),
+        "send_light": lambda: desk_cells.send_light(place, *seen, lights, desk, patch_stride, patches),
+        "list_patches": lambda: desk_cells.list_patches(patches, listed, count),
+        "gather_light": lambda: desk_cells.gather_light(
+            place, *seen, desk, listed, count, patch_stride, stride, *sums_out
+        ),
+        "bounce, with cells": lambda: relight.relight(config, params, rays, *known, cells=cells),
+    }
+    for call in passes.values():
+        call()
+    on_desk, share = cells.share_surface.numpy() == 0, cells.share.numpy()
+    assert on_desk.any()
+    assert ((share[on_desk] > 0.4) & (share[on_desk] <= 1.0)).all(), "half is what grey paper leaves at least"
+    assert share[on_desk].min() < 0.95, "the ball and the box hide some of the room"
+    assert 0.0 < cells.bounced.numpy()[cells.bounced_surface.numpy() >= 0].max() < 0.3 / 0.02
+    return passes
+
+
 def main(device: str) -> None:
     columns, rows = np.meshgrid((np.arange(W) - W / 2) / 600, (np.arange(H) - H / 2) / 600)
     rays = wp.array(np.stack([columns, rows], -1), dtype=wp.vec2, device=device)
@@ -33,7 +94,7 @@ def main(device: str) -> None:
     summed_area.sum_area(frame, table)
     look_down = np.diag([1.0, -1.0, -1.0])
     camera = {"camera_position": (0, 0, 0.6), "world_from_camera": look_down, "light_rect": (0, H, 0, W)}
-    params = _records(FrameParams, device, camera)
+    params = _records(FrameParams, device, {**camera, "focal": (600, 600)})
     light = {"kind": POINT, "position": (0.1, 0.1, 0.3), "intensity": (0.3,) * 3, "attenuation": (0, 0, 1)}
     lights = _records(Light, device, light)
     keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "dominance": 0.5})
@@ -60,5 +121,6 @@ def main(device: str) -> None:
         centre = out.numpy()[H // 2, W // 2]
         assert ((centre > 0.0) & (centre <= bright * 1.01)).all(), (rung, centre)
         contenders[rung] = call
+    contenders |= _cells(device, params, rays, frame, decode, table, scene, probes, lights, keys, room, out)
     for rung, times in measure(contenders, device).items():
         report(f"relight {W}x{H} {rung}", times, device)

@@ -41,6 +41,11 @@ turned to the virtual light:
 
     response = N.L (1 + alpha e) / (1 + e),   e = dominance * biweight(m - 1) * (m - 1).                           (4)
 
+With *cells* (``kernels/desk_cells.py``) (3) takes the part of the room's light that boxes and balls let through, and
+the irradiance by virtual light that lit proxies send to each other is added to the direct one:
+
+    added += Kd / pi * E_bounced.                                                                                  (5)
+
 Where the room is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key light's
 dominance.
 
@@ -65,7 +70,7 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, intersect_sphere, make_trace
+from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, intersect_sphere, make_trace, surface_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -102,6 +107,10 @@ class RelightConfig:
     """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
     lamps: bool = False
     """Whether ``reflectance`` knows lamps of the room by their places."""
+    share: bool = False
+    """Whether ``reflectance`` knows which part of the room's light reaches a point."""
+    bounced: bool = False
+    """Whether light that lit proxies send to each other is known."""
 
     def __post_init__(self) -> None:
         if self.rung not in RUNGS:
@@ -169,6 +178,18 @@ def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_
 
 
 @wp.struct
+class DeskCells:
+    """What ``kernels/desk_cells.py`` found for cells of the frame, each with the surface that it lies on."""
+
+    share: wp.array2d[wp.vec3]  # of the room's light that reaches a cell
+    share_surface: wp.array2d[wp.int32]
+    share_stride: wp.int32  # pixels per cell
+    bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
+    bounced_surface: wp.array2d[wp.int32]
+    bounced_stride: wp.int32
+
+
+@wp.struct
 class Desk:
     """What is known of the real desk and of the room that lights it; what a ``RelightConfig`` leaves out is empty."""
 
@@ -181,6 +202,130 @@ class Desk:
     irradiance_sh: wp.array[wp.vec3]
     irradiance_map: wp.array2d[wp.vec3]
     lamps: wp.array[RoomLamp]
+    cells: DeskCells
+
+
+@wp.struct
+class Matter:
+    """What a point of the desk is taken to be."""
+
+    kd: wp.vec3  # reflectance
+    m: wp.float32  # luminance over that of the surroundings, or the intensity itself
+    key: wp.vec3  # unit, toward the room's dominant light
+    dominance: wp.float32
+
+
+@wp.func
+def middle_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
+    """Row or column at which a cell is estimated."""
+    return wp.min(cell * stride + stride / 2, size - 1)
+
+
+@wp.func
+def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
+    """Which cell is estimated at a row or column: whole numbers at ``middle_pixel``, even between, none beyond."""
+    last = (size - 1) / stride
+    low = wp.clamp((pixel - stride / 2) / stride, 0, last)
+    here = middle_pixel(low, stride, size)
+    there = middle_pixel(wp.min(low + 1, last), stride, size)
+    if pixel <= here or there <= here:
+        return wp.float32(low)
+    return wp.float32(low) + wp.min(wp.float32(pixel - here) / wp.float32(there - here), 1.0)
+
+
+@wp.func
+def look_up_cells(
+    values: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    key: wp.int32,
+    size: wp.vec2i,
+    row: wp.int32,
+    col: wp.int32,
+) -> wp.vec4:
+    """Mean of the cells around a pixel that lie on its surface, weighted as bilinear interpolation does, and 1.
+
+    Where none of those is on its surface, the mean of others that touch the pixel; zero where no cell around it shows
+    its surface. ``size`` is that of the frame.
+    """
+    y = cell_place(row, stride, size[0])
+    x = cell_place(col, stride, size[1])
+    i0 = wp.int32(y)
+    j0 = wp.int32(x)
+    total = wp.vec3()
+    weights = float(0.0)
+    beside = wp.vec3()
+    count = float(0.0)
+    for a in range(2):
+        for b in range(2):
+            i = wp.min(i0 + a, values.shape[0] - 1)
+            j = wp.min(j0 + b, values.shape[1] - 1)
+            if surface[i, j] == key:
+                weight = (1.0 - wp.abs(y - wp.float32(i0 + a))) * (1.0 - wp.abs(x - wp.float32(j0 + b)))
+                if weight > 0.0:
+                    total += weight * values[i, j]
+                    weights += weight
+                else:
+                    beside += values[i, j]
+                    count += 1.0
+    if weights <= 0.0:
+        if count <= 0.0:
+            return wp.vec4()
+        total = beside
+        weights = count
+    mean = total / weights
+    return wp.vec4(mean[0], mean[1], mean[2], 1.0)
+
+
+@functools.cache
+def make_find_matter(config: RelightConfig) -> wp.Function:
+    """``find_matter(scene, desk, hit, row, col, mirror) -> Matter``; arguments as those of ``lit_by``."""
+    rung = config.rung
+
+    @wp.func(module="unique")
+    def find_matter(scene: RayScene, desk: Desk, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3) -> Matter:
+        matter = Matter()
+        matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
+        matter.m = 1.0
+        radiance = decode(desk.decode_table, desk.frame[row, col])
+        is_mirrored = mirror[0] > 0.0
+        if is_mirrored:
+            radiance = wp.cw_div(radiance, mirror)
+        matter.key = desk.key_lights[0].direction
+        matter.dominance = desk.key_lights[0].dominance
+        if wp.static(rung == "paper"):
+            matter.m = luminance(radiance)
+        else:
+            around = luminance(radiance)
+            if not is_mirrored:
+                around = surrounding_luminance(desk.table, desk.decode_table, row, col, desk.box)
+                matter.m = luminance(radiance) / around
+            if wp.static(rung == "relief"):
+                hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
+                matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
+            else:
+                if wp.static(config.irradiance == "sh"):
+                    room = sh_irradiance(desk.irradiance_sh, hit.normal)
+                else:
+                    room = sample_latlong(desk.irradiance_map, hit.normal)
+                if wp.static(config.lamps):
+                    room = add_nearness(room, desk.lamps, desk.probes[0].center, hit.point, hit.normal)
+                if wp.static(config.share):
+                    if not is_mirrored:
+                        cells = desk.cells
+                        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                        size = wp.vec2i(desk.frame.shape[0], desk.frame.shape[1])
+                        share = look_up_cells(cells.share, cells.share_surface, cells.share_stride, key, size, row, col)
+                        if share[3] > 0.0:
+                            room = wp.cw_mul(room, wp.vec3(share[0], share[1], share[2]))
+                matter.kd = wp.vec3(
+                    reflectance_of(radiance[0], room[0]),
+                    reflectance_of(radiance[1], room[1]),
+                    reflectance_of(radiance[2], room[2]),
+                )
+        return matter
+
+    return find_matter
 
 
 @functools.cache
@@ -192,6 +337,7 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
     """
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
+    find_matter = make_find_matter(config)
     rung = config.rung
 
     @wp.func(module="unique")
@@ -205,14 +351,9 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
         mirror: wp.vec3,
         turn: wp.float32,
     ) -> wp.vec3:
-        # What the desk is, found only once some light falls here.
-        known = bool(False)
-        radiance = wp.vec3()
-        kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
-        m = float(1.0)
-        key = wp.vec3()
-        dominance = float(0.0)
-
+        known = bool(False)  # what the desk is, found only once some light falls here
+        matter = Matter()
+        matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         added = wp.vec3()
         for index in range(lights.shape[0]):
             light = sample_light(lights[index], hit.point)
@@ -234,43 +375,27 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
             if wp.static(rung != "flat"):
                 if not known:
                     known = True
-                    radiance = decode(desk.decode_table, desk.frame[row, col])
-                    is_mirrored = mirror[0] > 0.0
-                    if is_mirrored:
-                        radiance = wp.cw_div(radiance, mirror)
-                    key = desk.key_lights[0].direction
-                    dominance = desk.key_lights[0].dominance
-                    if wp.static(rung == "paper"):
-                        m = luminance(radiance)
-                    else:
-                        around = luminance(radiance)
-                        if not is_mirrored:
-                            around = surrounding_luminance(desk.table, desk.decode_table, row, col, desk.box)
-                            m = luminance(radiance) / around
-                        if wp.static(rung == "relief"):
-                            hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
-                            kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
-                        else:
-                            if wp.static(config.irradiance == "sh"):
-                                room = sh_irradiance(desk.irradiance_sh, hit.normal)
-                            else:
-                                room = sample_latlong(desk.irradiance_map, hit.normal)
-                            if wp.static(config.lamps):
-                                room = add_nearness(room, desk.lamps, desk.probes[0].center, hit.point, hit.normal)
-                            kd = wp.vec3(
-                                reflectance_of(radiance[0], room[0]),
-                                reflectance_of(radiance[1], room[1]),
-                                reflectance_of(radiance[2], room[2]),
-                            )
-                alpha = wp.dot(light.wi, key)
+                    matter = find_matter(scene, desk, hit, row, col, mirror)
+                alpha = wp.dot(light.wi, matter.key)
                 if wp.static(rung == "paper"):
-                    response = printed_response(n_dot_l, m, alpha * dominance)
+                    response = printed_response(n_dot_l, matter.m, alpha * matter.dominance)
                 elif wp.static(rung == "relief"):
-                    response = n_dot_l * relief_factor(m, alpha * dominance)
+                    response = n_dot_l * relief_factor(matter.m, alpha * matter.dominance)
                 else:
-                    response = n_dot_l * turned_relief(m, alpha, dominance)
+                    response = n_dot_l * turned_relief(matter.m, alpha, matter.dominance)
             added += visible * response * light.irradiance_normal
-        return wp.cw_mul(kd, added) * _INV_PI
+        if wp.static(config.bounced):
+            if mirror[0] <= 0.0:
+                cells = desk.cells
+                key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                size = wp.vec2i(desk.frame.shape[0], desk.frame.shape[1])
+                stride = cells.bounced_stride
+                bounced = look_up_cells(cells.bounced, cells.bounced_surface, stride, key, size, row, col)
+                if bounced[0] + bounced[1] + bounced[2] > 0.0:
+                    if not known:
+                        matter = find_matter(scene, desk, hit, row, col, mirror)
+                    added += wp.vec3(bounced[0], bounced[1], bounced[2])
+        return wp.cw_mul(matter.kd, added) * _INV_PI
 
     return lit_by
 
@@ -328,9 +453,12 @@ def make_desk(
     key_lights: wp.array | None,
     irradiance: wp.array | None,
     lamps: wp.array | None = None,
+    cells: DeskCells | None = None,
 ) -> Desk:
     """What kernels read of the desk; arguments as those of ``relight``."""
     desk = Desk()
+    if cells is not None:
+        desk.cells = cells
     desk.frame, desk.decode_table, desk.box = frame, decode_table, surroundings_size(frame.shape[0])
     form = f"irradiance_{config.irradiance}"
     optional = {"table": table, "probes": probes, "key_lights": key_lights, form: irradiance, "lamps": lamps}
@@ -355,6 +483,7 @@ def relight(
     physical_added_out: wp.array,
     *,
     lamps: wp.array | None = None,
+    cells: DeskCells | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the desk; zero outside ``params[0].light_rect``.
@@ -374,9 +503,10 @@ def relight(
             ``reflectance``.
         physical_added_out: (H, W) vec3, linear radiance in camera values.
         lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
+        cells: From ``desk_cells``; needed if ``config.share`` or ``config.bounced``.
         rows: Band of rows; None means all.
     """
-    desk = make_desk(config, frame, decode_table, table, probes, key_lights, irradiance, lamps)
+    desk = make_desk(config, frame, decode_table, table, probes, key_lights, irradiance, lamps, cells)
     launch_rows(
         make_relight_kernel(config),
         frame.shape,

@@ -34,6 +34,10 @@ from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RaySc
 
 wp.set_module_options({"enable_backward": False})
 
+FACES = wp.constant(8)
+"""Numbers of ``surface_key`` per shape."""
+MESH_KEY = wp.constant(7)
+"""``surface_key`` modulo ``FACES`` of a mesh."""
 # Half the spacing of float32 at 1: the relative error of one rounding.
 ROUNDING = wp.constant(wp.float32(2.0**-24))
 FAR = wp.constant(wp.float32(3.0e38))
@@ -216,6 +220,20 @@ def offset_origin(point: wp.vec3, geometric_normal: wp.vec3, direction: wp.vec3,
     knows the shape.
     """
     return point + wp.where(wp.dot(geometric_normal, direction) < 0.0, -error, error) * geometric_normal
+
+
+@wp.func
+def surface_key(shape: Shape, index: wp.int32, geometric_normal: wp.vec3) -> wp.int32:
+    """Number that points on one flat surface share: the shape's ``index``, and the face of a box."""
+    key = FACES * index
+    if shape.kind == MESH:
+        key += MESH_KEY
+    if shape.kind == BOX:
+        local = wp.transpose(shape.rotation) * geometric_normal
+        for axis in range(3):
+            if wp.abs(local[axis]) > 0.7:
+                key += 2 * axis + wp.where(local[axis] > 0.0, 1, 0)
+    return key
 
 
 class Trace(NamedTuple):

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from warp_ar.pipeline import Pipeline
+from warp_ar.quality import PRESETS, Quality
 from warp_ar.scene import bundled_scenes, load_scene
 from warp_ar.sources import open_source
 
@@ -21,7 +22,9 @@ GOLDEN = Path(__file__).parent / "golden"
 SCENES = ("darken", "desk", "mirror", "torus", "wire_coincident", "wire_opposing")
 SIZE = (320, 240)
 FRAMES = 5  # the last one is compared: by then the light has been accumulated over several
-QUALITY = "medium"
+QUALITY = PRESETS["medium"]
+CASES = {**{name: (name, QUALITY) for name in SCENES}, "desk_bounce": ("desk", QUALITY.with_rungs(relight="bounce"))}
+"""Scene and quality of every golden frame."""
 
 # Codes. Video decoders may differ by a code or two, CPU and CUDA by rounding; both are spread over all pixels.
 MEAN_TOLERANCE = 0.5
@@ -30,14 +33,14 @@ LARGE = 8
 LARGE_SHARE = 0.002
 
 
-def render(name: str, device: str) -> npt.NDArray[np.uint8]:
+def render(name: str, quality: Quality, device: str) -> npt.NDArray[np.uint8]:
     """The last of a scene's first frames, halved in size and lit."""
     scene = load_scene(name)
     assert scene.source is not None
     assert scene.source.path is not None
     with (
         open_source(scene.source.path) as source,
-        Pipeline(scene, device=device, quality=QUALITY, size=SIZE) as pipeline,
+        Pipeline(scene, device=device, quality=quality, size=SIZE) as pipeline,
     ):
         for frame in itertools.islice(source, FRAMES):
             small = cv2.resize(frame.image, SIZE, interpolation=cv2.INTER_AREA)
@@ -49,9 +52,9 @@ def test_every_bundled_scene_has_a_test() -> None:
     assert set(SCENES) == set(bundled_scenes())
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", CASES)
 def test_golden(name: str, device: str, request: pytest.FixtureRequest) -> None:
-    image = render(name, device)
+    image = render(*CASES[name], device)
     path = GOLDEN / f"{name}.png"
     if request.config.getoption("--update-golden"):
         path.parent.mkdir(exist_ok=True)

@@ -344,6 +344,73 @@ def test_light_rect_holds_every_lit_pixel(device, name):
         assert max(shares) == 0.0
 
 
+SENDING = {
+    "box": PROXIES,
+    "wall": (PROXIES[0], scenes.Proxy("plane", size=(1.0, 0.6), at=(0.0, 0.4, 0.3), rotate=(90.0, 0.0, 0.0))),
+    "roof": (PROXIES[0], scenes.Proxy("plane", size=(0.5, 0.3), at=(0.0, 0.2, 0.4), rotate=(130.0, 0.0, 0.0))),
+    "boxes": (
+        *PROXIES,
+        scenes.Proxy("box", size=(0.1, 0.3, 0.3), at=(-0.2, 0.1, 0.15), rotate=(0.0, 20.0, 0.0)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(LAMPS))
+@pytest.mark.parametrize("proxies", list(SENDING))
+def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, proxies):
+    """Every pixel's point that lies before some point that the lamp sees, which lies before it, is inside."""
+    lamp = LAMPS[name]
+    host = HostScene(scenes.Scene(CAMERA, lights=(lamp,), proxies=SENDING[proxies]), wp.get_device(device))
+    shapes = bodies(records(host, "proxies"))
+    position, axis = lamp.pose_at(0.0)
+    rng = np.random.default_rng(2)
+    directions = rng.normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    if lamp.kind == "spot":
+        directions = axis + 2 * math.tan(math.radians(min(lamp.outer_angle, 80))) * directions
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        directions = directions[directions @ axis > math.cos(math.radians(lamp.outer_angle))]
+    t, which, normals = reference.closest(shapes, np.broadcast_to(position, directions.shape), directions)
+    lit = (which >= 0) & ((normals * directions).sum(-1) < 0)
+    sources, facings = (position + np.where(lit, t, 0)[:, None] * directions)[lit][:400], normals[lit][:400]
+    reached = 0
+    for _ in range(8):
+        pose = look([*rng.uniform(-0.9, 0.9, 2), rng.uniform(0.2, 1.0)], [*rng.uniform(-0.2, 0.2, 2), 0.0])
+        rect = host.light_rect(pose, CAMERA, bounced=True)
+        direct = host.light_rect(pose, CAMERA)
+        inverse = pose.inverse()
+        directions = pixel_rays(CAMERA, (0, 0)) @ inverse.rotation.T
+        t, which, normals = reference.closest(
+            shapes, np.broadcast_to(inverse.translation, directions.shape), directions
+        )
+        seen = (which >= 0) & ((normals * directions).sum(-1) < 0)
+        way = sources[None] - (inverse.translation + np.where(seen, t, 0)[:, None] * directions)[:, None]
+        gets = ((way * normals[:, None]).sum(-1) > 1e-6) & ((way * facings[None]).sum(-1) < -1e-6)
+        gets = (gets.any(1) & seen).reshape(CAMERA.height, CAMERA.width)
+        inside = np.zeros_like(gets)
+        inside[rect[0] : rect[1], rect[2] : rect[3]] = True
+        assert not (gets & ~inside).any(), rect
+        if direct != EMPTY:
+            assert inside[direct[0] : direct[1], direct[2] : direct[3]].all()
+        reached += gets.sum()
+    assert (reached > 0) == (len(sources) > 0 and name != "inside the box")
+
+
+def test_a_light_that_nothing_sends_on_has_the_same_rectangle(device):
+    """Above a desk alone, and on the top of a box, which no face rises above."""
+    pose = look((0.2, -0.8, 0.6), (0.1, 0.1, 0.0))
+    lamp = scenes.Light("spot", 1.0, at=(0.3, 0.2, 0.5), target=(0.3, 0.2, 0.2), inner_angle=1.0, outer_angle=4.0)
+    for proxies in ((PROXIES[0],), (PROXIES[1],)):
+        host = HostScene(scenes.Scene(CAMERA, lights=(lamp,), proxies=proxies), wp.get_device(device))
+        assert host.light_rect(pose, CAMERA, bounced=True) == host.light_rect(pose, CAMERA) != EMPTY
+    # On the desk before the box: the faces of the box that look there, and no more of the desk.
+    lamp = dataclasses.replace(lamp, at=(0.0, -0.2, 0.5), target=(0.0, -0.2, 0.0))
+    host = HostScene(scenes.Scene(CAMERA, lights=(lamp,), proxies=PROXIES), wp.get_device(device))
+    rect = host.light_rect(pose, CAMERA, bounced=True)
+    assert rect != host.light_rect(pose, CAMERA)
+    assert (rect[1] - rect[0]) * (rect[3] - rect[2]) < 0.5 * CAMERA.width * CAMERA.height
+
+
 def test_screen_rect_of_a_known_square():
     """A square facing the camera: the pixels whose centres it covers, and one more on every side."""
     pose = Pose(np.eye(3), np.zeros(3))

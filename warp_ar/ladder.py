@@ -112,6 +112,8 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
             "paper": "blended by the frame's brightness (the paper)",
             "relief": "the paper's blend, relief told from paint",
             "reflectance": "on the reflectance that frame and room light give",
+            "bounce": "the same, knowing the room's own shadows, and what lit surfaces send each other",
+            "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
         },
     ),
     "room_shadow": (

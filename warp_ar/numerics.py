@@ -95,9 +95,9 @@ NUMERICS: dict[str, StageNumerics] = {
         "uint32 modulo 2^32", 0.0, "exact for boxes of up to 2^32 / 255 pixels", 0, (6, 11, 12, 17)
     ),
     "relight": StageNumerics(
-        "float32 over an integer table",
+        "float32 over an integer table; sums over samples and patches",
         5e-5,
-        "a dozen roundings; shadow edges fall to either side",
+        "a dozen roundings, sums over a thousand terms; shadow edges fall to either side",
         3e-07,
         (5, 6, 9, 10, 13, 14, 17),
     ),

@@ -545,7 +545,8 @@ class Pipeline:
             touched.append("pose")
         if pose is not None:
             params["object_rect"] = self._host_scene.object_rect(pose, self.camera)
-            params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
+            bounced = "relight_bounced" in self._arrays
+            params["light_rect"] = self._host_scene.light_rect(pose, self.camera, bounced=bounced)
             self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
             self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
             if "mirrored" in self._arrays:

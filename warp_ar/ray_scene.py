@@ -59,6 +59,8 @@ radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees hig
 _CONE_SIDES: Final = 8
 # From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
 _WIDE_CONE: Final = math.radians(75.0)
+# Planes whose normals have a larger cosine, 2.6 degrees, send each other less than a hundredth of their light.
+_ONE_WAY: Final = 0.999
 # Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
 _FACES: Final = (
     (0, 2, 6, 4),
@@ -250,6 +252,7 @@ class HostScene:
         self._place_objects()
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
         self._lit: list[FloatArray] | None = None
+        self._bounced: list[FloatArray] | None = None
         self._placed = b""  # the objects that the polygons below are of
         self._outlines: list[FloatArray] = []
         self._shaded: list[FloatArray] | None = None
@@ -394,13 +397,24 @@ class HostScene:
             self._outlines = [face for record in self._objects for face in _faces(record)]
             self._shaded = None
 
-    def light_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
-        """Where virtual light or its shadows can fall on proxies on screen; arguments as ``object_rect``."""
+    def light_rect(self, pose: Pose, camera: scenes.Camera, *, bounced: bool = False) -> Rect:
+        """Where virtual light or its shadows can fall on proxies on screen.
+
+        Args:
+            pose: ``camera_from_world``.
+            camera: The camera of the frames.
+            bounced: Light that lit proxies send on counts as well.
+        """
         if self._lit is None:
             self._lit = [
                 lit for light in self._lights for record in self._proxies for lit in _lit_faces(light, _faces(record))
             ]
-        return screen_rect(self._lit, pose, camera)
+            self._bounced = None
+        if not bounced:
+            return screen_rect(self._lit, pose, camera)
+        if self._bounced is None:
+            self._bounced = _bounced_faces(self._lights, self._proxies)
+        return screen_rect([*self._lit, *self._bounced], pose, camera)
 
     def ball_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where mirror balls are on screen; arguments as ``object_rect``."""
@@ -416,6 +430,15 @@ class HostScene:
                 part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)
             ]
         return screen_rect(self._shaded, pose, camera)
+
+
+def proxies_face(scene: scenes.Scene) -> bool:
+    """Whether light that proxies send can reach one: not if there is one plane or box, or planes that look one way."""
+    if any(proxy.shape == "mesh" for proxy in scene.proxies):
+        return True  # which may face itself
+    normals = [rotation_matrix(proxy.rotate)[:, 2] for proxy in scene.proxies if proxy.shape == "plane"]
+    turned = any(float(a @ b) < _ONE_WAY for a in normals for b in normals)
+    return len(scene.proxies) > 1 and (len(normals) < len(scene.proxies) or turned)
 
 
 def _dtype(struct: Any) -> Any:
@@ -500,6 +523,51 @@ def _lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
         if all((apex - face.mean(axis=0)) @ (center - face.mean(axis=0)) >= 0.0 for face in faces):
             parts.append(apex[None, :])
     return parts
+
+
+def _outward(face: FloatArray, center: FloatArray, kind: int, rotation: FloatArray) -> FloatArray:
+    """Unit normal of a face of a shape: a plane's own, a box's away from its middle."""
+    if kind == structs.PLANE:
+        return rotation[:, 2]
+    away = face.mean(axis=0) - center
+    normal = np.cross(face[1] - face[0], face[2] - face[1])
+    length = float(np.linalg.norm(normal))
+    return normal * (math.copysign(1.0, float(normal @ away)) / length) if length > 0.0 else np.zeros(3)
+
+
+def _bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[FloatArray]:
+    """Parts of the proxies' faces before which some lit face stands, and behind which it does not.
+
+    The surface of a mesh lies in its box and looks every way: it sends from all of its box to all sides.
+    """
+    sources: list[tuple[FloatArray, FloatArray | None]] = []  # lit parts, and the normal if there is one
+    for record in proxies:
+        faces, rotation = _faces(record), np.array(record["rotation"], np.float64)
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        for light in lights:
+            if record["kind"] == structs.MESH:
+                if _lit_faces(light, faces):
+                    sources += [(face, None) for face in faces]
+                continue
+            for face in faces:
+                facing = _outward(face, center, int(record["kind"]), rotation)
+                at, direction = (np.array(light[name], np.float64) for name in ("position", "direction"))
+                directional = light["kind"] == structs.DIRECTIONAL
+                if (float(-direction @ facing) if directional else float((at - face[0]) @ facing)) > 0.0:
+                    sources += [(part, facing) for part in _lit_faces(light, [face])]
+    reached: list[FloatArray] = []
+    for record in proxies:
+        faces, rotation = _faces(record), np.array(record["rotation"], np.float64)
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        for face in faces:
+            inward = -_outward(face, center, int(record["kind"]), rotation)
+            for part, normal in sources:
+                if record["kind"] != structs.MESH and (part @ inward >= float(face[0] @ inward) - 1e-9).all():
+                    continue
+                seen = face if normal is None else _clip(face, normal, float(normal @ part[0]) - 1e-9)
+                if len(seen):
+                    reached.append(seen)
+    return reached
 
 
 def _shaded_faces(record: Any, faces: list[FloatArray]) -> list[FloatArray]:

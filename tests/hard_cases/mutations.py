@@ -305,6 +305,14 @@ MUTATIONS = (
         "tests/test_mirror_ball.py::test_a_ball_behind_what_is_mirrored_hides_nothing",
     ),
     Mutation(
+        13,
+        "rays that leave a box's middle behind are taken to miss it",
+        "kernels/desk_cells.py",
+        "    return beside <= 0.0 or (along > 0.0 and along * along > beside)\n",
+        "    return along > 0.0 and along * along > beside\n",
+        "tests/test_desk_cells.py::test_the_end_of_a_long_box_is_not_passed_by",
+    ),
+    Mutation(
         14,
         "a fixed offset of ten micrometres where surfaces look at the room",
         "kernels/recover.py",
@@ -383,6 +391,14 @@ MUTATIONS = (
         "start + (stop - start) * band // bands for band",
         "start + (stop - start - (bands > 1)) * band // bands for band",
         f"{HARD}test_row17_same_answer.py::test_bands_of_threads",
+    ),
+    Mutation(
+        17,
+        "patches that the light has left still send it",
+        "kernels/desk_cells.py",
+        "range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0]))",
+        "range(patches.shape[0])",
+        "tests/test_desk_cells.py::test_nothing_of_an_earlier_frame_is_read",
     ),
     Mutation(
         18,

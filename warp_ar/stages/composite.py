@@ -90,6 +90,13 @@ def shades_room(request: Request) -> bool:
     return bool(wanted and scene.objects and scene.proxies and scene.probes)
 
 
+def shares_room(request: Request) -> bool:
+    """Whether relighting asks which part of the room's light reaches the desk."""
+    scene = request.scene
+    asks = request.quality.rung("relight") in ("bounce", "brute_force")
+    return bool(asks and scene.lights and scene.proxies and scene.probes)
+
+
 def exposes(request: Request) -> bool:
     """Whether the scene asks for another exposure; ``auto`` does where virtual light falls on the desk."""
     scale = request.scene.exposure.scale

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.relight import make_desk
+from warp_ar.kernels.relight import RelightConfig, make_desk
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
@@ -33,9 +33,14 @@ def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
         trace_config(request.scene),
         SAMPLES[request.quality.rung("mirror_ball")],
         shading,
-        relight_config(request) if lit else None,
+        mirrored_relighting(request) if lit else None,
         "physical_ratio" in layers,
     )
+
+
+def mirrored_relighting(request: Request) -> RelightConfig:
+    """How the desk that a ball shows responds: cells of the frame say nothing about it."""
+    return dataclasses.replace(relight_config(request), share=False, bounced=False)
 
 
 class MirrorBall(Stage):
@@ -64,7 +69,7 @@ class MirrorBall(Stage):
             # The ball shows the desk too small for a pixel's surroundings to mean anything.
             wiring = Relight.wire(request)
             assert isinstance(wiring, Wiring)
-            reads |= set(wiring.reads) - {"summed_area"}
+            reads |= set(wiring.reads) - {"summed_area", "room_samples"}
         if "physical_ratio" in layers:
             reads.add("physical_ratio")
         return Wiring(tuple(sorted(reads)), ("mirrored",))
@@ -85,7 +90,7 @@ class MirrorBall(Stage):
         if dfg is not None:
             integrate_dfg(dfg)
         reads = self.wiring.reads
-        relighting = relight_config(self.request)
+        relighting = mirrored_relighting(self.request)
         room = irradiance_name(self.request)
         lit = config.relight is not None
         desk = make_desk(

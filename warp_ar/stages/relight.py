@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels import relight
-from warp_ar.ray_scene import trace_config
+from warp_ar.kernels import desk_cells, relight
+from warp_ar.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.room_samples import knows_lamps
+from warp_ar.stages.composite import shares_room
+from warp_ar.stages.room_samples import SAMPLES, knows_lamps
 from warp_ar.stages.shade import casts_soft, sees_near
 from warp_ar.stages.visibility import GrowingRows
+
+
+@dataclasses.dataclass(frozen=True)
+class Grain:
+    """How finely cells of the desk are estimated."""
+
+    samples: int
+    """Of the room's light, for its share."""
+    share: int
+    """Pixels per cell of the room's share, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
+    bounced: int
+    """The same, of bounced light."""
+    patch: int
+    """The same, of what sends it."""
+
+
+GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(256, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
+"""Rungs that know the room's own shadows on the desk and one bounce of virtual light; else they are ``reflectance``."""
+STRIDE_ROWS = 480
 
 
 class Relight(Stage):
     """Adds what virtual lights send to the proxies, shadowed, to the desk in the frame."""
 
     name = "relight"
-    rungs = relight.RUNGS
+    rungs = (*relight.RUNGS, *GRAINS)
     summary = "virtual light and its shadows on the physical desk"
 
     @classmethod
@@ -33,11 +56,13 @@ class Relight(Stage):
         reads = ["pose", "lights", "objects"]
         if rung != "flat":
             reads += ["frame", "key_lights"]
-        if rung in ("relief", "reflectance"):
+        if rung in ("relief", "reflectance", *GRAINS):
             reads.append("summed_area")
-        if rung == "reflectance":
+        if rung in ("reflectance", *GRAINS):
             reads.append(irradiance_name(request))
             reads += ["lamps"] * knows_lamps(request)
+        if shares_room(request):
+            reads.append("room_samples")
         return Wiring(tuple(reads), ("physical_added",))
 
     def gives_way(self) -> tuple[str, ...]:
@@ -45,47 +70,149 @@ class Relight(Stage):
         return () if sees_near(self.request) else ("room_shadow",)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The added radiance."""
+        """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
-        return {"physical_added": ArraySpec((height, width), wp.vec3)}
+        specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
+        if shares_room(self.request):
+            cells = _cells(self.request, _grain(self.request).share)
+            specs["relight_share"] = ArraySpec(cells, wp.vec3)
+            specs["relight_share_surface"] = ArraySpec(cells, wp.int32, -1)
+        if bounces_virtual(self.request):
+            grain = _grain(self.request)
+            cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
+            specs["relight_bounced"] = ArraySpec(cells, wp.vec3)
+            specs["relight_bounced_surface"] = ArraySpec(cells, wp.int32, -1)
+            specs["relight_patches"] = ArraySpec(patches, desk_cells.Patch, desk_cells.Patch())
+            specs["relight_listed"] = ArraySpec(patches, desk_cells.Patch, desk_cells.Patch())
+            specs["relight_count"] = ArraySpec(patches[:1], wp.int32)
+        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """One pass over the rows that light can reach."""
+        """Cells, then one pass over the rows that light can reach."""
         reads, irradiance = self.wiring.reads, irradiance_name(self.request)
         config = relight_config(self.request)
         relight.make_relight_kernel(config)
+        cells = make_cells(self.request, arrays)
+        room = arrays[irradiance] if irradiance in reads else None
+        known = (
+            arrays["frame"],
+            arrays["decode"],
+            arrays["summed_area"] if "summed_area" in reads else None,
+            arrays["ray_scene"],
+            arrays["probes"],
+            arrays["light_array"],
+            arrays["key_lights"] if "key_lights" in reads else None,
+            room,
+        )
+        lamps = arrays["lamps"] if "lamps" in reads else None
+        seen = arrays["params"], arrays["rays"]
 
         def launch(rows: Rows | None) -> None:
-            relight.relight(
-                config,
-                arrays["params"],
-                arrays["rays"],
-                arrays["frame"],
-                arrays["decode"],
-                arrays["summed_area"] if "summed_area" in reads else None,
-                arrays["ray_scene"],
-                arrays["probes"],
-                arrays["light_array"],
-                arrays["key_lights"] if "key_lights" in reads else None,
-                arrays[irradiance] if irradiance in reads else None,
-                arrays["physical_added"],
-                lamps=arrays["lamps"] if "lamps" in reads else None,
-                rows=rows,
-            )
+            relight.relight(config, *seen, *known, arrays["physical_added"], lamps=lamps, cells=cells, rows=rows)
 
-        return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["light_rows"]))]
+        height = self.request.size[1]
+        light_rows = arrays["light_rows"]
+        last = Pass(launch, rows=height, extent=GrowingRows(light_rows))
+        if not (config.share or config.bounced):
+            return [last]
+
+        frame, decode, table, scene, probes, lights, key_lights, _ = known
+        desk = relight.make_desk(config, frame, decode, table, probes, key_lights, room, lamps, cells)
+        place = desk_cells.CellConfig(config)
+        passes: list[Pass] = []
+
+        def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
+            """Rows of cells that pixels in the light's rows look up; what stands in the others is never read."""
+
+            def extent() -> Rows:
+                start, stop = light_rows()
+                if stop <= start:
+                    return 0, 0
+                return max(start // size - margin, 0), min(-(-stop // size) + margin, count)
+
+            return extent
+
+        grain = _grain(self.request)
+        if config.share:
+            share, surface, size = arrays["relight_share"], arrays["relight_share_surface"], cells.share_stride
+
+            def estimate(rows: Rows | None, bounced: bool = False) -> None:
+                own = arrays["room_samples"], grain.samples, size, share, surface
+                desk_cells.share_room(place, *seen, scene, lights, desk, *own, bounced=bounced, rows=rows)
+
+            desk_cells.make_share_room_kernel(place)
+            passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))
+        if config.bounced:
+            patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
+            bounced, lit = arrays["relight_bounced"], arrays["relight_bounced_surface"]
+            step, wide = cells.bounced_stride, _stride(self.request, grain.patch)
+
+            def send(rows: Rows | None) -> None:
+                desk_cells.send_light(place, *seen, scene, lights, desk, wide, patches, rows=rows)
+
+            def arrange(rows: Rows | None) -> None:
+                desk_cells.list_patches(patches, listed, count, rows=rows)
+
+            def gather(rows: Rows | None) -> None:
+                desk_cells.gather_light(place, *seen, scene, desk, listed, count, wide, step, bounced, lit, rows=rows)
+
+            desk_cells.make_send_light_kernel(place)
+            desk_cells.make_gather_light_kernel(place)
+            lit_patches = rows_of(wide, len(patches), 0)
+            passes.append(Pass(send, rows=len(patches), extent=lit_patches))
+            passes.append(Pass(arrange, rows=len(patches), extent=lit_patches))
+            passes.append(Pass(gather, rows=len(bounced), extent=rows_of(step, len(bounced), 2)))
+            if config.share:
+                again = functools.partial(estimate, bounced=True)
+                passes.append(Pass(again, rows=len(share), extent=rows_of(size, len(share), 2)))
+        return [*passes, last]
+
+
+def _grain(request: Request) -> Grain:
+    return GRAINS[relight_rung(request)]
+
+
+def _stride(request: Request, pixels: int) -> int:
+    """Pixels per cell, growing with the frame."""
+    return 1 if pixels == 1 else max(1, round(pixels * request.size[1] / STRIDE_ROWS))
+
+
+def _cells(request: Request, pixels: int) -> tuple[int, int]:
+    width, height = request.size
+    stride = _stride(request, pixels)
+    return -(-height // stride), -(-width // stride)
+
+
+def make_cells(request: Request, arrays: Arrays) -> relight.DeskCells:
+    """The cells of a request as kernels read them."""
+    cells = relight.DeskCells()
+    if relight_rung(request) in GRAINS:
+        grain = _grain(request)
+        cells.share_stride, cells.bounced_stride = _stride(request, grain.share), _stride(request, grain.bounced)
+    if shares_room(request):
+        cells.share, cells.share_surface = arrays["relight_share"], arrays["relight_share_surface"]
+    if bounces_virtual(request):
+        cells.bounced, cells.bounced_surface = arrays["relight_bounced"], arrays["relight_bounced_surface"]
+    return cells
+
+
+def bounces_virtual(request: Request) -> bool:
+    """Whether lit proxies light each other: where the quality asks for it, and one proxy faces another."""
+    return relight_rung(request) in GRAINS and proxies_face(request.scene)
 
 
 def relight_config(request: Request) -> relight.RelightConfig:
     """What the relighting of a request's desk calls for."""
     rung = relight_rung(request)
     return relight.RelightConfig(
-        rung,
+        "reflectance" if rung in GRAINS else rung,
         trace_config(request.scene),
         "sh" if irradiance_name(request) == "irradiance_sh" else "map",
         bool(request.scene.probes),
         casts_soft(request),
-        rung == "reflectance" and knows_lamps(request),
+        rung in ("reflectance", *GRAINS) and knows_lamps(request),
+        shares_room(request),
+        bounces_virtual(request),
     )
 
 

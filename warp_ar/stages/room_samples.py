@@ -10,7 +10,7 @@ import warp as wp
 from warp_ar.kernels import pyramid, room_samples
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import shades_room
+from warp_ar.stages.composite import shades_room, shares_room
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.shade import sees_near, shade_config
 
@@ -48,7 +48,7 @@ class RoomSamples(Stage):
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Read the environment, write samples."""
         gathers = sees_near(request) and shade_config(request).room_diffuse != "none"
-        if not shades_room(request) and not gathers:
+        if not shades_room(request) and not shares_room(request) and not gathers:
             return LeftOut("nothing traces rays to the room's light")
         lamps = ("lamps",) if knows_lamps(request) else ()
         return Wiring(("environment", *lamps), ("room_samples",))

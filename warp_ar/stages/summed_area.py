@@ -25,7 +25,7 @@ class SummedArea(Stage):
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Wired for darkening by the paper's box, and for relief against its surroundings."""
         lit = "physical_added" in layer_names(request)
-        relief = lit and relight_rung(request) in ("relief", "reflectance")
+        relief = lit and relight_rung(request) not in ("flat", "paper")
         if not uses_table(request) and not relief:
             return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
         return Wiring(("frame",), ("summed_area",))

@@ -1,0 +1,512 @@
+"""What ``relight`` needs to know of the desk beyond its own pixel, estimated for cells of the frame.
+
+**Share.** Reflectance is what the camera sees over what the room sends (``relight``, equation 3). The room's filtered
+irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it is too much, and the desk
+would be taken for darker than it is. So per cell, over the room's samples (``room_samples``),
+
+    share = 1 - sum over hidden ones of measure * cos * (radiance - what hides it) / sum of measure * cos * radiance,
+
+which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
+light shines on, then, once it is known what these send on, those that are reached by that.
+What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box as grey paper
+would. Planes hide nothing: the ball has seen them where the environment has them.
+
+**Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
+adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. A receiver at distance r
+gets
+
+    E = sum over patches of  L A cos cos' / (r^2 + A / pi),
+
+which is a disc's form factor on its axis: finite where a box stands on the lit desk, and pi L for a patch that fills
+the hemisphere. One bounce; what the camera does not show sends nothing, and nothing stands between. Points of one flat
+surface lie above each other by rounding alone: what is no higher than a hit's error sends nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.relight import (
+    DEFAULT_REFLECTANCE,
+    Desk,
+    RelightConfig,
+    look_up_cells,
+    make_lit_by,
+    meets_probe,
+    middle_pixel,
+)
+from warp_ar.kernels.room_samples import RoomSample, sample_toward
+from warp_ar.kernels.shadow import sample_light, tile_turn
+from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
+from warp_ar.kernels.visibility import (
+    FAR,
+    Hit,
+    TraceConfig,
+    inside_rect,
+    intersect_sphere,
+    make_trace,
+    offset_origin,
+    surface_key,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
+"""Irradiance, in camera values, below which a share means nothing."""
+NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
+"""Bounced light over the room's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
+MIN_FACING = wp.constant(wp.float32(0.02))
+"""Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
+
+
+@wp.struct
+class Patch:
+    """A piece of a proxy that sends virtual light on."""
+
+    position: wp.vec3
+    normal: wp.vec3
+    flux: wp.vec3  # radiance times area
+    area: wp.float32  # square metres
+
+
+@dataclasses.dataclass(frozen=True)
+class CellConfig:
+    """What is compiled into the kernels."""
+
+    relight: RelightConfig
+    """Of the direct light: kinds of shape, and form of the room's irradiance."""
+
+    @property
+    def trace(self) -> TraceConfig:
+        """Kinds of shape."""
+        return self.relight.trace
+
+
+@functools.cache
+def make_seen_desk(config: CellConfig) -> wp.Function:
+    """``seen_desk(params, rays, scene, desk, row, col) -> Hit``: the proxy that a pixel shows, or shape -1."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+
+    @wp.func(module="unique")
+    def seen_desk(
+        params: FrameParams, rays: wp.array2d[wp.vec2], scene: RayScene, desk: Desk, row: wp.int32, col: wp.int32
+    ) -> Hit:
+        ray = rays[row, col]
+        direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params.camera_position, direction, FAR)
+        if hit.shape >= 0:
+            if wp.dot(hit.geometric_normal, direction) >= 0.0:
+                hit.shape = -1
+            if wp.static(config.relight.probes):
+                if meets_probe(desk.probes, params.camera_position, direction, hit.t):
+                    hit.shape = -1
+        return hit
+
+    return seen_desk
+
+
+@wp.func
+def share_of(lost: wp.float32, whole: wp.float32) -> wp.float32:
+    """Part of ``whole`` that is left without ``lost``; within 0..1 for whatever comes in, 1 where nothing is known."""
+    if not whole > MIN_IRRADIANCE:  # NaN as well
+        return 1.0
+    share = 1.0 - lost / whole
+    if not share < 1.0:
+        return 1.0
+    return wp.max(share, 0.0)
+
+
+@wp.func
+def near_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool:
+    """Whether a direction leads from a point into the ball around ``away``, or the point is in it."""
+    beside = wp.dot(away, away) - radius * radius
+    along = wp.dot(away, direction)
+    return beside <= 0.0 or (along > 0.0 and along * along > beside)
+
+
+@wp.func
+def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect: wp.vec4i) -> wp.bool:
+    """Whether a pixel of the rectangle may look a cell up."""
+    reach = wp.vec4i(rect[0] - 2 * stride, rect[1] + 2 * stride, rect[2] - 2 * stride, rect[3] + 2 * stride)
+    return rect[0] < rect[1] and inside_rect(cell_row * stride, cell_col * stride, reach)
+
+
+@functools.cache
+def make_mean_facing(config: CellConfig) -> wp.Function:
+    """``mean_facing(desk, normal) -> vec3``: mean radiance, by the cosine, of the room before a surface."""
+    form = config.relight.irradiance
+
+    @wp.func(module="unique")
+    def mean_facing(desk: Desk, normal: wp.vec3) -> wp.vec3:
+        if wp.static(form == "sh"):
+            mean = sh_irradiance(desk.irradiance_sh, normal) / wp.pi
+        else:
+            mean = sample_latlong(desk.irradiance_map, normal) / wp.pi
+        # A series may ring below zero, which no light does.
+        return wp.max(mean, wp.vec3(0.0, 0.0, 0.0))
+
+    return mean_facing
+
+
+@functools.cache
+def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``share_room``."""
+    seen_desk = make_seen_desk(config)
+    mean_facing = make_mean_facing(config)
+    closest_proxy = make_trace(config.trace).closest_proxy
+    only_planes = set(config.trace.proxies) <= {PLANE}
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def share_room_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        samples: wp.array[RoomSample],
+        count: wp.int32,
+        stride: wp.int32,
+        bounced: wp.bool,
+        # Out:
+        share_out: wp.array2d[wp.vec3],
+        surface_out: wp.array2d[wp.int32],
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        if not bounced:
+            surface_out[ci, cj] = -1
+        elif surface_out[ci, cj] >= 0:
+            return
+        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
+            return
+        i = middle_pixel(ci, stride, rays.shape[0])
+        j = middle_pixel(cj, stride, rays.shape[1])
+        hit = seen_desk(params[0], rays, scene, desk, i, j)
+        if hit.shape < 0:
+            return
+        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+        needed = bool(False)
+        if bounced:
+            cells = desk.cells
+            size = wp.vec2i(rays.shape[0], rays.shape[1])
+            sent = look_up_cells(cells.bounced, cells.bounced_surface, cells.bounced_stride, key, size, i, j)
+            needed = sent[0] + sent[1] + sent[2] > 0.0
+        else:
+            for index in range(lights.shape[0]):
+                light = sample_light(lights[index], hit.point)
+                if wp.dot(hit.geometric_normal, light.wi) > 0.0 and wp.max(light.irradiance_normal) > 0.0:
+                    needed = True
+        if not needed:
+            return
+        surface_out[ci, cj] = key
+        whole = wp.vec3()
+        lost = wp.vec3()
+        for k in range(count):
+            sample = samples[k]
+            toward = sample_toward(sample, hit.point)
+            cosine = wp.dot(hit.normal, toward.direction)
+            if cosine > 0.0:
+                flux = cosine * toward.measure * sample.radiance
+                whole += flux
+                nearest = toward.distance
+                hides = bool(False)
+                radiance = wp.vec3()  # of what hides the sample
+                for index in range(desk.probes.shape[0]):
+                    probe = desk.probes[index]
+                    away = probe.center - hit.point
+                    if near_ball(away, probe.radius, toward.direction):
+                        t = intersect_sphere(probe.radius, -away, toward.direction, nearest)
+                        if t < nearest:
+                            nearest = t
+                            hides = True
+                            normal = (t * toward.direction - away) / probe.radius
+                            radiance = wp.cw_mul(probe.reflectance, mean_facing(desk, normal))
+                if wp.static(not only_planes):
+                    near_some = bool(False)
+                    for index in range(scene.proxies.shape[0]):
+                        shape = scene.proxies[index]
+                        if shape.kind != PLANE:
+                            radius = shape.scale * wp.length(shape.extent)
+                            if near_ball(shape.position - hit.point, radius, toward.direction):
+                                near_some = True
+                    if near_some:
+                        origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
+                        hidden = closest_proxy(scene, origin, toward.direction, nearest)
+                        if hidden.shape >= 0:
+                            if scene.proxies[hidden.shape].kind != PLANE:
+                                facing = hidden.normal
+                                if wp.dot(facing, toward.direction) > 0.0:
+                                    facing = -facing
+                                hides = True
+                                radiance = DEFAULT_REFLECTANCE * mean_facing(desk, facing)
+                if hides:
+                    lost += cosine * toward.measure * (sample.radiance - radiance)
+        share_out[ci, cj] = wp.vec3(
+            share_of(lost[0], whole[0]), share_of(lost[1], whole[1]), share_of(lost[2], whole[2])
+        )
+
+    return share_room_kernel
+
+
+@functools.cache
+def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``send_light``."""
+    seen_desk = make_seen_desk(config)
+    lit_by = make_lit_by(dataclasses.replace(config.relight, bounced=False))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def send_light_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        stride: wp.int32,
+        # Out:
+        patches_out: wp.array2d[Patch],
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        patch = Patch()
+        i = middle_pixel(ci, stride, rays.shape[0])
+        j = middle_pixel(cj, stride, rays.shape[1])
+        if inside_rect(i, j, params[0].light_rect):
+            hit = seen_desk(params[0], rays, scene, desk, i, j)
+            if hit.shape >= 0:
+                added = lit_by(scene, lights, desk, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                if added[0] + added[1] + added[2] > 0.0:
+                    ray = rays[i, j]
+                    # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.
+                    length = wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1.0)
+                    direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0) / length
+                    facing = wp.max(-wp.dot(direction, hit.geometric_normal), MIN_FACING)
+                    # A patch at the frame's border has fewer pixels.
+                    rows = wp.min(stride, rays.shape[0] - ci * stride)
+                    pixels = wp.float32(rows * wp.min(stride, rays.shape[1] - cj * stride))
+                    patch.area = pixels * hit.t * hit.t / (length * params[0].focal[0] * params[0].focal[1] * facing)
+                    patch.position = hit.point
+                    patch.normal = hit.geometric_normal
+                    patch.flux = patch.area * added
+        patches_out[ci, cj] = patch
+
+    return send_light_kernel
+
+
+@wp.kernel(enable_backward=False)
+def list_patches_kernel(
+    # In:
+    row_start: wp.int32,
+    patches: wp.array2d[Patch],
+    # Out:
+    listed_out: wp.array2d[Patch],
+    count_out: wp.array[wp.int32],
+):
+    """Patches of a row that send light, in their order: sums over them are the same in every run."""
+    i = wp.tid() + row_start
+    count = int(0)
+    for j in range(patches.shape[1]):
+        if patches[i, j].area > 0.0:
+            listed_out[i, count] = patches[i, j]
+            count += 1
+    count_out[i] = count
+
+
+@functools.cache
+def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``gather_light``."""
+    seen_desk = make_seen_desk(config)
+    mean_facing = make_mean_facing(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_light_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        desk: Desk,
+        patches: wp.array2d[Patch],
+        count: wp.array[wp.int32],
+        patch_stride: wp.int32,
+        stride: wp.int32,
+        # Out:
+        bounced_out: wp.array2d[wp.vec3],
+        surface_out: wp.array2d[wp.int32],
+    ):
+        ci, cj = wp.tid()
+        ci += row_start
+        surface_out[ci, cj] = -1
+        if not in_lit_cells(ci, cj, stride, params[0].light_rect):
+            return
+        i = middle_pixel(ci, stride, rays.shape[0])
+        j = middle_pixel(cj, stride, rays.shape[1])
+        hit = seen_desk(params[0], rays, scene, desk, i, j)
+        if hit.shape < 0:
+            return
+        surface_out[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+        total = wp.vec3()
+        # Rows that the light reaches: the others may be of an earlier frame.
+        rect = params[0].light_rect
+        for row in range(rect[0] / patch_stride, wp.min((rect[1] - 1) / patch_stride + 1, patches.shape[0])):
+            for k in range(count[row]):
+                patch = patches[row, k]
+                way = patch.position - hit.point
+                here = wp.dot(way, hit.normal)
+                there = -wp.dot(way, patch.normal)
+                if here > hit.error and there > hit.error:
+                    squared = wp.dot(way, way)
+                    total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
+        room = wp.pi * mean_facing(desk, hit.normal)
+        seen = bool(False)
+        for channel in range(3):
+            if total[channel] > NEGLIGIBLE * room[channel]:
+                seen = True
+        bounced_out[ci, cj] = wp.where(seen, total, wp.vec3(0.0, 0.0, 0.0))
+
+    return gather_light_kernel
+
+
+def share_room(
+    config: CellConfig,
+    params: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    lights: wp.array,
+    desk: Desk,
+    samples: wp.array,
+    count: int,
+    stride: int,
+    share_out: wp.array,
+    surface_out: wp.array,
+    *,
+    bounced: bool = False,
+    rows: Rows | None = None,
+) -> None:
+    """Estimate which part of the room's light reaches the desk, for cells that virtual lights may shine on.
+
+    Args:
+        config: Kinds of shape, form of the room's irradiance.
+        params: (1,) FrameParams: camera and light_rect.
+        rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
+        scene: Proxies.
+        lights: (n,) Light.
+        desk: From ``relight.make_desk``: balls and the room's irradiance; with the cells of ``gather_light`` if
+            ``bounced``.
+        samples: (n,) RoomSample.
+        count: How many of them are used, the first ones. The same for all cells, so there is no noise; an aligned block
+            of Sobol's sequence if it is a power of 2.
+        stride: Pixels per cell.
+        share_out: (ceil(H / stride), ceil(W / stride)) vec3, 0..1; undefined where ``surface_out`` is -1.
+        surface_out: The same shape, int32: ``surface_key`` of the cell, -1 for none.
+        bounced: Whether to add cells that get bounced light to those that were estimated before.
+        rows: Band of rows of cells; None means all.
+    """
+    launch_rows(
+        make_share_room_kernel(config),
+        share_out.shape,
+        [params, rays, scene, lights, desk, samples, min(count, samples.shape[0]), stride, bounced],
+        [share_out, surface_out],
+        rows=rows,
+        device=rays.device,
+    )
+
+
+def send_light(
+    config: CellConfig,
+    params: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    lights: wp.array,
+    desk: Desk,
+    stride: int,
+    patches_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Find what every patch of the desk sends on of the virtual light that falls on it.
+
+    Args:
+        config: As for ``share_room``.
+        params: (1,) FrameParams: camera and light_rect.
+        rays: (H, W) vec2.
+        scene: Objects and proxies.
+        lights: (n,) Light.
+        desk: From ``relight.make_desk``, with the cells of ``share_room`` where the config has them.
+        stride: Pixels along a patch.
+        patches_out: (ceil(H / stride), ceil(W / stride)) Patch; those that send nothing have no area.
+        rows: Band of rows of patches; None means all.
+    """
+    launch_rows(
+        make_send_light_kernel(config),
+        patches_out.shape,
+        [params, rays, scene, lights, desk, stride],
+        [patches_out],
+        rows=rows,
+        device=rays.device,
+    )
+
+
+def list_patches(patches: wp.array, listed_out: wp.array, count_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Move the patches that send light to the front of their rows.
+
+    Args:
+        patches: (r, c) Patch of ``send_light``.
+        listed_out: (r, c) Patch.
+        count_out: (r,) int32, how many of a row send light.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        list_patches_kernel, count_out.shape, [patches], [listed_out, count_out], rows=rows, device=patches.device
+    )
+
+
+def gather_light(
+    config: CellConfig,
+    params: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    desk: Desk,
+    patches: wp.array,
+    count: wp.array,
+    patch_stride: int,
+    stride: int,
+    bounced_out: wp.array,
+    surface_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Sum what patches send to the cells of the desk.
+
+    Args:
+        config: As for ``share_room``.
+        params: (1,) FrameParams: camera and light_rect.
+        rays: (H, W) vec2.
+        scene: Proxies.
+        desk: From ``relight.make_desk``: balls and the room's irradiance.
+        patches: (r, c) Patch of ``list_patches``; only rows that light_rect reaches are read.
+        count: (r,) int32, how many of a row send light.
+        patch_stride: Pixels along a patch.
+        stride: Pixels per cell.
+        bounced_out: (ceil(H / stride), ceil(W / stride)) vec3, irradiance; 0 where it is less than ``NEGLIGIBLE`` of
+            the room's, undefined where ``surface_out`` is -1.
+        surface_out: The same shape, int32: ``surface_key`` of the cell, -1 for none.
+        rows: Band of rows of cells; None means all.
+    """
+    launch_rows(
+        make_gather_light_kernel(config),
+        bounced_out.shape,
+        [params, rays, scene, desk, patches, count, patch_stride, stride],
+        [bounced_out, surface_out],
+        rows=rows,
+        device=rays.device,
+    )

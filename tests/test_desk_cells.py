@@ -1,0 +1,772 @@
+"""Cells of the desk: the room's share, one bounce of virtual light, and how pixels look both up."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from tests.error_model import check_error
+from tests.hard_cases.generators import frames
+from tests.hard_cases.rig import SIZE, Rig, assert_same_bits
+from tests.reference import desk_cells as reference
+from tests.reference import relight as reference_relight
+from tests.reference.room_shadow import sphere_form_factor
+from tests.test_composite import tables
+from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_room, point, records, shape
+from tests.test_room_shadow import draw, lamp_at, list_texels, sky, with_sun
+from warp_ar.geometry import rotation_matrix
+from warp_ar.kernels import desk_cells, relight, room_samples, summed_area
+from warp_ar.kernels.desk_cells import Patch
+from warp_ar.kernels.room_samples import RoomSample
+from warp_ar.kernels.structs import BOX, DIRECTIONAL, MESH, PLANE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.ray_scene import HostScene, proxies_face
+from warp_ar.scene import Camera, Proxy, Scene
+
+SIZE_OF_FRAME = (48, 64)
+FOCAL = 60.0
+GREY = reference.GREY
+# Sums of float32 over up to 32,768 samples of like size.
+SUM_ERROR = 2e-4
+# A texel of the sky at a shape's outline is hidden or not: one row of 64 over the height of a wall or ball.
+OUTLINE = 0.006
+# A patch is one sample of its area, softened by A / pi over r^2: patches of 1 cm from 10 cm on.
+PATCHES = 5e-3
+ABOVE = point((0, 0, 0.5))
+"""Shines on all of the desk."""
+WHITE = np.ones(3)
+
+
+def box(low, high):
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    return shape(BOX, tuple((low + high) / 2), tuple((high - low) / 2))
+
+
+def ball(center, radius, reflectance=0.85):
+    return {"center": center, "radius": radius, "reflectance": (reflectance,) * 3}
+
+
+def pixel_rays(size):
+    rows, columns = ((np.arange(n) - (n - 1) / 2) / FOCAL for n in size)
+    return np.stack(np.meshgrid(columns, rows), -1).astype(np.float32)
+
+
+class View:
+    """A camera above the desk, and all that the launchers ask for."""
+
+    def __init__(
+        self,
+        proxies=(DESK,),
+        probes=(),
+        lights=(ABOVE,),
+        size=SIZE_OF_FRAME,
+        rect=None,
+        room=WHITE,
+        frame=None,
+        camera=CAMERA,
+        turn=LOOK_DOWN,
+        irradiance=None,
+        scene=None,
+        **forms,
+    ):
+        kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
+        trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
+        self.relight = relight.RelightConfig(
+            "reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms
+        )
+        self.config = desk_cells.CellConfig(self.relight)
+        self.size = size
+        self.params = records(
+            FrameParams,
+            {
+                "camera_position": camera,
+                "world_from_camera": turn,
+                "focal": (FOCAL, FOCAL),
+                "light_rect": rect or (0, size[0], 0, size[1]),
+            },
+        )
+        self.rays = wp.array(pixel_rays(size), dtype=wp.vec2)
+        self.scene = RayScene() if scene is None else scene
+        if scene is None:
+            self.scene.objects, self.scene.proxies = records(Shape), records(Shape, *proxies)
+        self.lights = records(Light, *lights)
+        image = np.full((*size, 3), 128, np.uint8) if frame is None else frame
+        self.frame, self.table = wp.array(image, dtype=wp.vec3ub), wp.zeros(size, wp.uint32)
+        summed_area.sum_area(self.frame, self.table)
+        self.keys = records(KeyLight, {"direction": (0, 0, 1), "dominance": 0.0})
+        self.probes = records(Probe, *probes)
+        self.room = wp.array(constant_room(room), dtype=wp.vec3)
+        if irradiance is not None:
+            self.room = wp.array(irradiance, dtype=wp.vec3)
+
+    def desk(self, cells=None):
+        known = self.frame, tables()[0], self.table, self.probes, self.keys, self.room
+        return relight.make_desk(self.relight, *known, cells=cells)
+
+    def cells(self, stride):
+        return tuple(-(-n // stride) for n in self.size)
+
+    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False):
+        share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
+        surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
+        desk_cells.share_room(
+            self.config,
+            self.params,
+            self.rays,
+            self.scene,
+            self.lights,
+            self.desk(cells),
+            samples,
+            count or samples.shape[0],
+            stride,
+            share,
+            surface,
+            bounced=bounced,
+            rows=rows,
+        )
+        return share.numpy(), surface.numpy()
+
+    def send(self, stride=4, rows=None, out=None, cells=None):
+        patches = wp.full(self.cells(stride), Patch(), dtype=Patch) if out is None else out
+        desk_cells.send_light(
+            self.config, self.params, self.rays, self.scene, self.lights, self.desk(cells), stride, patches, rows=rows
+        )
+        return patches
+
+    def gather(self, patches, patch_stride=4, stride=4, rows=None, out=None):
+        listed, count = wp.full(patches.shape, Patch(), dtype=Patch), wp.full(patches.shape[0], 99, dtype=wp.int32)
+        for band in rows or [None]:
+            desk_cells.list_patches(patches, listed, count, rows=band and (band[0] // 2, band[1] // 2))
+        if rows:
+            desk_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
+        bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
+        surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
+        for band in rows or [None]:
+            desk_cells.gather_light(
+                self.config,
+                self.params,
+                self.rays,
+                self.scene,
+                self.desk(),
+                listed,
+                count,
+                patch_stride,
+                stride,
+                bounced,
+                surface,
+                rows=band,
+            )
+        return bounced.numpy(), surface.numpy()
+
+    def light(self, cells=None, rows=None, **forms):
+        out = wp.full(self.size, wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
+        relight.relight(
+            dataclasses.replace(self.relight, **forms),
+            self.params,
+            self.rays,
+            self.frame,
+            tables()[0],
+            self.table,
+            self.scene,
+            self.probes,
+            self.lights,
+            self.keys,
+            self.room,
+            out,
+            cells=cells,
+            rows=rows,
+        )
+        return out.numpy()
+
+
+def patches_of(positions, normals, radiance, areas):
+    """One row of patches."""
+    positions = np.atleast_2d(positions)
+    out = np.zeros((1, len(positions)), np.dtype(Patch.numpy_dtype()))
+    out["position"], out["normal"], out["area"] = positions, normals, areas
+    out["flux"] = np.asarray(radiance, float) * np.reshape(areas, (-1, 1))
+    return wp.array(out, dtype=Patch)
+
+
+def middles(stride, size=SIZE_OF_FRAME):
+    return np.ix_(*(np.minimum(np.arange(-(-n // stride)) * stride + stride // 2, n - 1) for n in size))
+
+
+def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
+    cells = relight.DeskCells()
+    cells.share_stride = cells.bounced_stride = stride
+    for name, values in (("share", share), ("bounced", bounced)):
+        if values is not None:
+            values = np.broadcast_to(np.asarray(values, np.float32), (*view.cells(stride), 3)).copy()
+            setattr(cells, name, wp.array(values, dtype=wp.vec3))
+    for name, values in (("share_surface", share_surface), ("bounced_surface", bounced_surface)):
+        values = np.zeros(view.cells(stride), np.int32) if values is None else values
+        setattr(cells, name, wp.array(values, dtype=wp.int32))
+    return cells
+
+
+# --- Share: closed forms ----------------------------------------------------------------------------------------------
+
+
+def test_planes_leave_all_of_the_light_to_the_bit(device):
+    wall = {**shape(PLANE, (0, 0.2, 0.2), (0.3, 0.3, 0)), "rotation": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])}
+    samples = draw(with_sun(6, 20, 500.0))[2]
+    share, surface = View((DESK, wall)).share(samples)
+    assert (share[surface >= 0] == 1.0).all()
+    assert set(np.unique(surface)) == {-1, 0, 8} or set(np.unique(surface)) == {0, 8}
+    below = View((DESK, box((-1, -1, -3), (1, 1, -2))), [ball((0, 0, -2), 0.05)]).share(samples)[0]
+    assert (below == 1.0).all()
+
+
+@pytest.mark.parametrize("height", [0.06, 0.2], ids=["touching", "above"])
+def test_a_ball_takes_its_form_factor(device, height):
+    """White room; the ball reflects 0.2 of what it faces, which is white."""
+    center, radius = (0.05, -0.02, height), 0.06
+    share, surface = View(probes=[ball(center, radius, 0.2)]).share(list_texels(sky(1.0, (64, 128)))[2])
+    expected = 1 - sphere_form_factor(POINTS, center, radius) * (1 - 0.2)
+    seen = surface >= 0
+    assert 0.9 < seen.mean() < 1.0, "the ball hides some of the desk"
+    np.testing.assert_allclose(share[seen][:, 0], expected[middles(4)][seen], atol=OUTLINE)
+    assert share[seen].min() < 0.95
+
+
+def test_a_hidden_lamp_leaves_what_grey_paper_sends(device):
+    """One sample is all the light: hidden it leaves 0.5 x 0.7 of radiance 20, where nothing stands all of it."""
+    sample = records(RoomSample, {"direction": (0, 0, 1), "radiance": (20,) * 3, "measure": 0.1, "distance": 1e30})
+    share, _ = View((DESK, box((-0.04, -0.04, 0.2), (0.04, 0.04, 0.3))), room=0.7 * WHITE, camera=(0, 0, 0.15)).share(
+        sample
+    )
+    inside = (np.abs(POINTS * 0.25)[..., :2] < 0.04).all(-1)[middles(4)]
+    np.testing.assert_allclose(share[inside], GREY * 0.7 / 20, rtol=SUM_ERROR)
+    assert (share[~inside] == 1.0).all()
+    assert inside.any()
+    assert not inside.all()
+
+
+def test_beside_a_long_box(device):
+    """A wall of height h at distance d hides (1 - d / sqrt(d^2 + h^2)) / 2 of an even sky; its paper sends half."""
+    h = 0.1
+    share, surface = View((DESK, box((0.2, -5, 0), (0.4, 5, h)))).share(list_texels(sky(1.0, (64, 128)))[2])
+    d = 0.2 - POINTS[middles(4)][..., 0]
+    expected = 1 - (1 - GREY) * 0.5 * (1 - d / np.hypot(d, h))
+    seen = (surface == 0) & (d > 0.01)
+    assert seen.sum() > 100
+    np.testing.assert_allclose(share[..., 0][seen], expected[seen], atol=OUTLINE)
+
+
+def test_the_end_of_a_long_box_is_not_passed_by(device):
+    """Beside the end of a bar, inside the ball around it: rays that leave its middle behind still meet it."""
+    bar = box((-0.5, 0.02, 0.0), (0.1, 0.06, 0.1))
+    samples = list_texels(sky(1.0, (32, 64)))[2]
+    share, surface = View((DESK, bar)).share(samples)
+    expected = brute_force(samples, View().size, boxes=[((-0.5, 0.02, 0.0), (0.1, 0.06, 0.1))])
+    at = surface == 0
+    np.testing.assert_allclose(share[at], expected[at], atol=2e-3)
+
+
+def test_inside_a_box(device):
+    """A camera and a desk in a box of grey paper: half of the light; the box's own faces are seen from behind."""
+    room = box((-3, -3, -1), (3, 3, 2))
+    share, surface = View((DESK, room)).share(draw(sky())[2])
+    assert (surface == 0).all()
+    np.testing.assert_allclose(share, GREY, rtol=SUM_ERROR)
+    _, surface = View((room,)).share(draw(sky())[2])
+    assert (surface == -1).all()
+
+
+def test_only_where_light_may_fall(device):
+    """Not where lights shine away, and not outside the rectangle; then where bounced light is."""
+    samples = draw(sky())[2]
+    away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
+    assert (View(lights=[away]).share(samples)[1] == -1).all()
+    view = View(lights=[away], share=True)
+    out = wp.zeros(view.cells(4), wp.vec3), wp.full(view.cells(4), -1, dtype=wp.int32)
+    bounced = np.zeros((*view.cells(4), 3))
+    bounced[5, 6] = 0.1
+    _, surface = view.share(samples, out=out, bounced=True, cells=cells_of(view, 4, bounced=bounced))
+    assert np.argwhere(surface >= 0).tolist() == [[5, 6]]
+    rect = 10, 20, 30, 40
+    i, j = (grid * 4 for grid in np.indices(view.cells(4)))
+    near = (i >= 10 - 8) & (i < 20 + 8) & (j >= 30 - 8) & (j < 40 + 8)
+    np.testing.assert_array_equal(View(rect=rect).share(samples)[1] >= 0, near)
+
+
+# --- Share: twins -----------------------------------------------------------------------------------------------------
+
+
+def brute_force(samples, size, boxes=(), balls=(), facing=1.0, stride=4):
+    """Shares of a plane's cells, and no ball in front."""
+    found = samples.numpy()
+    points = reference_relight.plane_points(CAMERA, pixel_rays(size), LOOK_DOWN)[middles(stride, size)]
+    out = np.ones((*points.shape[:2], 3))
+    for index in np.ndindex(points.shape[:2]):
+        directions = found["direction"].astype(float)
+        measure, distances = found["measure"].astype(float), np.full(len(found), np.inf)
+        near = found["distance"] < 1e29
+        way = found["origin"] + found["distance"][:, None].astype(float) * directions - points[index]
+        distance = np.linalg.norm(way, axis=-1)
+        directions = np.where(near[:, None], way / distance[:, None], directions)
+        measure = np.where(near, measure * (found["distance"].astype(float) / distance) ** 2, measure)
+        distances = np.where(near, distance, np.inf)
+        out[index] = reference.share_room(
+            points[index],
+            np.array([0, 0, 1.0]),
+            directions,
+            measure,
+            found["radiance"],
+            distances,
+            boxes,
+            balls,
+            lambda normals: np.broadcast_to(facing, normals.shape),
+        )
+    return out
+
+
+def test_share_matches_twin(device):
+    """A sun, a lamp at a place, a box and a ball; the twin asks every sample at every cell."""
+    environment = with_sun(9, 40, 300.0, np.float32(np.random.default_rng(1).uniform(0.2, 1, (32, 64, 3))))
+    samples = draw(environment, 256)[2]
+    room_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
+    corners, (center, radius) = ((0.1, -0.1, 0), (0.22, 0.14, 0.08)), ((-0.1, 0.03, 0.05), 0.04)
+    facing = np.array([0.6, 0.5, 0.4])
+    share, surface = View((DESK, box(*corners)), [ball(center, radius)], room=facing).share(samples)
+    expected = brute_force(samples, SIZE_OF_FRAME, [corners], [(center, radius, 0.85)], facing)
+    on_desk = surface == 0
+    # A sample at an outline falls to either side in float32: a few cells of the desk differ by one of them.
+    off = np.abs(share - expected)[on_desk].max(-1)
+    assert (off > SUM_ERROR).mean() < 0.02
+    assert off.max() < 0.05
+    check_error("relight", share[on_desk][off <= SUM_ERROR], expected[on_desk][off <= SUM_ERROR])
+    assert expected[on_desk].min() < 0.7
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_share_agrees_with_random_directions(device, seed):
+    """An even room: the mean over 4,096 directions by the cosine, of what each meets, within five standard errors."""
+    rng = np.random.default_rng(seed)
+    corners, (center, radius) = ((0.05, -0.1, 0), (0.2, 0.15, 0.2)), ((-0.1, 0.03, 0.05), 0.05)
+    share, surface = View((DESK, box(*corners)), [ball(center, radius)]).share(list_texels(sky(1.0, (64, 128)))[2])
+    for index in rng.permutation(np.argwhere(surface == 0))[:12]:
+        at = POINTS[middles(4)][tuple(index)]
+        u, phi = rng.random(4096), 2 * np.pi * rng.random(4096)
+        directions = np.stack([np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi), np.sqrt(1 - u)], -1)
+        ball_t, box_t = (
+            reference.meet_ball(at, directions, center, radius)[0],
+            reference.meet_box(at, directions, *corners)[0],
+        )
+        met = np.where(np.isinf(ball_t) & np.isinf(box_t), 1.0, np.where(ball_t < box_t, 0.85, GREY))
+        error = met.std() / math.sqrt(len(met))
+        assert abs(share[tuple(index)][0] - met.mean()) < 5 * error + OUTLINE
+
+
+def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
+    trimesh.creation.box(bounds=[(0.1, -0.1, 0.0), (0.2, 0.1, 0.08)]).export(tmp_path / "box.ply")
+    camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
+    things = Proxy("plane", size=(10.0, 10.0)), Proxy("mesh", file=tmp_path / "box.ply")
+    host = HostScene(Scene(camera, proxies=things), wp.get_device(device))
+    samples = draw(sky())[2]
+    share, surface = View(scene=host.ray_scene).share(samples)
+    expected, boxed = View((DESK, box((0.1, -0.1, 0), (0.2, 0.1, 0.08)))).share(samples)
+    both = (surface == 0) & (boxed == 0)
+    assert both.mean() > 0.8
+    np.testing.assert_allclose(share[both], expected[both], atol=2e-3)
+    assert expected[both].min() < 0.9
+    assert set(np.unique(surface)) == {0, 15}
+
+
+# --- Bounced light: closed forms --------------------------------------------------------------------------------------
+
+
+def test_a_small_patch(device):
+    """L A cos cos' / r^2."""
+    at, normal, area = np.array([0.05, 0.02, 0.3]), np.array([0.96, 0.0, -0.28]), 1e-6
+    bounced, surface = View(room=0 * WHITE).gather(patches_of(at, normal, (0.5, 1.0, 2.0), area), patch_stride=48)
+    way = at - POINTS[middles(4)]
+    r2 = (way**2).sum(-1)
+    expected = area * way[..., 2] * np.maximum(-(way @ normal), 0) / r2**2
+    assert (surface == 0).all()
+    np.testing.assert_allclose(bounced, expected[..., None] * (0.5, 1.0, 2.0), rtol=1e-4, atol=1e-12)
+    assert (expected == 0).any()
+
+
+def test_a_patch_that_fills_the_hemisphere(device):
+    """Pi L, straight before it."""
+    bounced, _ = View(size=(1, 1)).gather(patches_of((0, 0, 0.01), (0, 0, -1), WHITE, 1e6), patch_stride=1, stride=1)
+    np.testing.assert_allclose(bounced, np.pi, rtol=FLOAT_ERROR)
+
+
+def test_at_the_edge_of_a_lit_strip(device):
+    """Two faces at right angles: the desk, and at x = -0.45 a wall of which a strip of 0.2 is lit, 8 m long."""
+    size = 0.01
+    z, y = np.meshgrid(np.arange(size / 2, 0.2, size), np.arange(-4, 4, size) + size / 2)
+    positions = np.stack([np.full(z.size, -0.45), y.ravel(), z.ravel()], -1)
+    bounced, _ = View().gather(patches_of(positions, (1, 0, 0), WHITE, size**2), patch_stride=48, stride=8)
+    expected = np.pi * reference.strip_form_factor(POINTS[middles(8)][..., 0] + 0.45, 0.2)
+    np.testing.assert_allclose(bounced, np.broadcast_to(expected[..., None], bounced.shape), rtol=PATCHES)
+
+
+@pytest.mark.parametrize(("height", "area"), [(0.06, 1e-4), (0.005, 1e-2), (1e-3, 1.0)])
+def test_no_more_is_received_than_sent(device, height, area):
+    """A patch of pi L A watts: from the frame, nearly all that a small one sees, comes nearly all."""
+    patch = patches_of((0, 0, height), (0, 0, -1), WHITE, area)
+    bounced, _ = View(size=(96, 128), room=0 * WHITE).gather(patch, patch_stride=96, stride=1)
+    received = bounced[..., 0].sum() * (CAMERA[2] / FOCAL) ** 2
+    assert received <= np.pi * area
+    if area < height**2:
+        assert received > 0.95 * np.pi * area
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_flat_surface_does_not_light_itself(device, seed):
+    """However it stands, and 100 m away: rounding puts its points above each other, and nothing comes of it."""
+    rng = np.random.default_rng(seed)
+    turn = rotation_matrix((*rng.uniform(-30, 30, 2), rng.uniform(0, 360)))
+    shift = np.array([60.0, -80.0, 0]) * (seed % 2)
+    slab = {**shape(PLANE, shift, (5, 5, 0)), "rotation": turn}
+    view = View(
+        (slab,), room=0 * WHITE, lights=[point(shift + np.array([0, 0, 0.3]), (50.0,) * 3)], camera=CAMERA + shift
+    )
+    bounced, surface = view.gather(view.send(4))
+    assert (surface == 0).all()
+    assert (bounced == 0).all()
+
+
+def test_gather_matches_twin(device):
+    rng = np.random.default_rng(2)
+    positions = rng.uniform((-0.3, -0.3, -0.05), (0.3, 0.3, 0.4), (300, 3))
+    normals = rng.normal(size=(300, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    radiance, areas = rng.uniform(0, 1, (300, 3)), rng.uniform(1e-5, 1e-2, 300)
+    bounced, _ = View(room=0 * WHITE).gather(patches_of(positions, normals, radiance, areas), patch_stride=48)
+    points = POINTS[middles(4)].reshape(-1, 3)
+    up = np.broadcast_to((0, 0, 1.0), points.shape)
+    expected = reference.gather_light(points, up, positions, normals, radiance * areas[:, None], areas)
+    check_error("relight", bounced.reshape(-1, 3), expected)
+    assert expected.max() > 0.1
+
+
+def test_what_no_picture_shows_is_none(device):
+    """Over the room's light by less than 1 / 1024: nothing; in the dark every bit counts."""
+    patch = patches_of((0, 0, 0.3), (0, 0, -1), WHITE, 1e-4)
+    lit = View(room=0 * WHITE).gather(patch, patch_stride=48)[0]
+    kept = View(room=WHITE).gather(patch, patch_stride=48)[0]
+    limit = float(desk_cells.NEGLIGIBLE) * np.pi
+    assert (lit > 0).all()
+    assert (lit < 0.9 * limit).any()
+    assert (kept[lit < 0.999 * limit] == 0).all()
+    bright = patches_of((0, 0, 0.3), (0, 0, -1), 100 * WHITE, 1e-4)
+    np.testing.assert_array_equal(
+        View(room=WHITE).gather(bright, patch_stride=48)[0], View(room=0 * WHITE).gather(bright, patch_stride=48)[0]
+    )
+
+
+# --- Patches ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(48, 64), (47, 61), (1, 1), (3, 50)])
+@pytest.mark.parametrize("stride", [1, 4, 16])
+def test_patches_cover_what_the_frame_shows(device, size, stride):
+    """Looking straight down, areas sum to the desk's in the picture, patches at the border are smaller."""
+    sent = View(size=size).send(stride).numpy()
+    pixel = (CAMERA[2] / FOCAL) ** 2
+    # Toward the corners a pixel shows the same area of the desk: t^2 cos / (f^2 cos).
+    assert sent["area"].sum() == pytest.approx(size[0] * size[1] * pixel, rel=1e-5)
+    np.testing.assert_allclose(sent["normal"].reshape(-1, 3), np.broadcast_to((0, 0, 1), (sent.size, 3)))
+
+
+def test_patches_send_what_pixels_gain(device):
+    """The radiance that relighting adds at their middles."""
+    frame = np.random.default_rng(3).integers(60, 200, (*SIZE_OF_FRAME, 3)).astype(np.uint8)
+    view = View(frame=frame)
+    sent = view.send(4).numpy()
+    np.testing.assert_allclose(sent["flux"] / sent["area"][..., None], view.light()[middles(4)], rtol=1e-5)
+
+
+def test_lists_keep_the_order(device):
+    rng = np.random.default_rng(4)
+    areas = np.where(rng.random((7, 33)) < 0.4, 0, 1 + np.arange(7 * 33).reshape(7, 33)).astype(np.float32)
+    areas[3] = 0
+    values = np.zeros(areas.shape, np.dtype(Patch.numpy_dtype()))
+    values["area"] = areas
+    listed, count = wp.full(areas.shape, Patch(), dtype=Patch), wp.full(7, 99, dtype=wp.int32)
+    desk_cells.list_patches(wp.array(values, dtype=Patch), listed, count)
+    for row, found, number in zip(areas, listed.numpy()["area"], count.numpy(), strict=True):
+        np.testing.assert_array_equal(found[:number], row[row > 0])
+
+
+# --- Looking cells up -------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def look_up_kernel(
+    values: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    key: wp.int32,
+    found_out: wp.array2d[wp.vec4],
+):
+    i, j = wp.tid()
+    size = wp.vec2i(found_out.shape[0], found_out.shape[1])
+    found_out[i, j] = relight.look_up_cells(values, surface, stride, key, size, i, j)
+
+
+def look_up(values, surface, stride, key, size):
+    out = wp.zeros(size, wp.vec4)
+    arrays = wp.array(np.asarray(values, np.float32), dtype=wp.vec3), wp.array(surface, dtype=wp.int32)
+    wp.launch(look_up_kernel, size, [*arrays, stride, key], [out])
+    return out.numpy()
+
+
+FRAMES = [(48, 64, 4), (47, 61, 4), (45, 66, 8), (30, 40, 3), (9, 7, 1), (1, 1, 4), (2, 3, 16), (1, 17, 5)]
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_constant_stays_constant_under_any_mask(device, frame):
+    *size, stride = frame
+    shape_of = tuple(-(-n // stride) for n in size)
+    surface = np.random.default_rng(5).integers(-1, 2, shape_of).astype(np.int32)
+    found = look_up(np.where((surface == 1)[..., None], np.ones(3), np.nan), surface, stride, 1, size)
+    known = found[..., 3] > 0
+    assert (found[known] == 1.0).all()
+    assert (found[~known] == 0.0).all()
+    assert known.any() == (surface == 1).any()
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_ramp_is_where_it_belongs(device, frame):
+    """Between the middles of the outermost cells to a rounding, constant beyond."""
+    *size, stride = frame
+    i, j = middles(stride, size)
+    values = np.stack(np.broadcast_arrays(i, j, 2.0 * i - j), -1).astype(float)
+    found = look_up(values, np.zeros(values.shape[:2], np.int32), stride, 0, size)
+    rows, columns = np.clip(np.arange(size[0]), i.min(), i.max()), np.clip(np.arange(size[1]), j.min(), j.max())
+    expected = np.stack(np.broadcast_arrays(rows[:, None], columns[None], 2.0 * rows[:, None] - columns), -1)
+    np.testing.assert_allclose(found[..., :3], expected, atol=1e-4)
+    assert (found[..., 3] == 1).all()
+
+
+def test_surfaces_do_not_mix(device):
+    """Two ramps of other heights, one on each surface, and holes: each pixel has a mean of its own."""
+    size, stride = (47, 61), 4
+    i, j = np.indices((12, 16))
+    surface = np.where(j < 8, 0, 9).astype(np.int32)
+    surface[4:6, 3] = -1
+    values = np.where((surface == 0)[..., None], np.ones(3), 100 + np.stack([i, j, i], -1))
+    values[surface == -1] = np.nan
+    for key in (0, 9, 5):
+        found = look_up(values, surface, stride, key, size)
+        for row, col in np.ndindex(size):
+            expected = reference.look_up_cells(values, surface, stride, key, size, row, col)
+            if expected is None:
+                assert (found[row, col] == 0).all()
+            else:
+                np.testing.assert_allclose(found[row, col], [*expected, 1], rtol=1e-5)
+
+
+# --- Relighting with cells --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.2, 0.7, 1.0])
+def test_reflectance_of_a_shaded_desk(device, share):
+    """What the camera sees over what arrives: rho = pi L / (share E), and no more than 1."""
+    view = View(share=True)
+    got = view.light(cells_of(view, 4, share=share))
+    radiance = np.asarray(tables()[0].numpy()[128], float)
+    kd = reference_relight.reflectance(radiance, share * np.pi)
+    _, n_dot_l, e = reference_relight.point_light(POINTS, np.array([0, 0, 0.5]), 0.3)
+    np.testing.assert_allclose(got, kd / np.pi * n_dot_l * e, rtol=2 * FLOAT_ERROR)
+
+
+def test_bounced_light_is_added(device):
+    """Kd / pi times the irradiance, where no light shines and where one does."""
+    away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
+    kd = reference_relight.reflectance(np.asarray(tables()[0].numpy()[128], float), np.pi)
+    for lights in ([away], [ABOVE]):
+        view = View(lights=lights, bounced=True)
+        cells = cells_of(view, 4, bounced=(0.1, 0.2, 0.3))
+        extra = view.light(cells).astype(float) - view.light(bounced=False)
+        np.testing.assert_allclose(extra, np.broadcast_to(kd / np.pi * (0.1, 0.2, 0.3), extra.shape), rtol=1e-4)
+
+
+def test_where_nothing_is_hidden_and_nothing_bounces_nothing_changes(device):
+    """To the bit on CPU; CUDA may join other products and sums where more is compiled in."""
+    frame = np.random.default_rng(6).integers(60, 200, (*SIZE_OF_FRAME, 3)).astype(np.uint8)
+    view = View(frame=frame, share=True, bounced=True)
+    got, plain = view.light(cells_of(view, 4, share=1.0, bounced=0.0)), view.light(share=False, bounced=False)
+    unknown = np.full(view.cells(4), -1, np.int32)
+    lost = view.light(cells_of(view, 4, share=0.1, share_surface=unknown, bounced=1.0, bounced_surface=unknown))
+    for one in (got, lost):
+        np.testing.assert_allclose(one, plain, rtol=0 if device == "cpu" else 1e-6)
+
+
+def full(view, samples=None, strides=(4, 4, 4), rows=None):
+    """All passes, as the stage has them; (light, share, bounced) and the surfaces of both."""
+    samples = draw(sky())[2] if samples is None else samples
+    share = wp.full(view.cells(strides[0]), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.full(view.cells(strides[0]), 7)
+    share = share[0], wp.full(view.cells(strides[0]), 7, dtype=wp.int32)
+    for band in rows or [None]:
+        view.share(samples, strides[0], out=share, rows=band)
+    cells = relight.DeskCells()
+    cells.share, cells.share_surface, cells.share_stride = *share, strides[0]
+    patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
+    for band in rows or [None]:
+        view.send(strides[2], out=patches, cells=cells, rows=band)
+    bounced = wp.full(view.cells(strides[1]), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3)
+    bounced = bounced, wp.full(view.cells(strides[1]), 7, dtype=wp.int32)
+    view.gather(patches, strides[2], strides[1], out=bounced, rows=rows)
+    cells.bounced, cells.bounced_surface, cells.bounced_stride = *bounced, strides[1]
+    for band in rows or [None]:
+        view.share(samples, strides[0], out=share, cells=cells, bounced=True, rows=band)
+    return [view.light(cells), *(array.numpy() for array in (*share, *bounced))]
+
+
+def tilted():
+    """From the front and above: world_from_camera of a camera at (0, -0.5, 0.4) that looks at (0, 0.1, 0)."""
+    forward = np.array([0, 0.6, -0.4]) / math.hypot(0.6, 0.4)
+    right = np.array([1.0, 0, 0])
+    return {"camera": (0, -0.5, 0.4), "turn": np.stack([right, np.cross(forward, right), forward], -1)}
+
+
+SPOT_ON_DESK = {
+    "kind": 2,
+    "position": (0, 0.0, 0.4),
+    "direction": (0, 0, -1),
+    "intensity": (2.0,) * 3,
+    "attenuation": (0, 0, 1),
+    "inner_angle": 0.25,
+    "outer_angle": 0.3,
+}
+WALL = {**shape(PLANE, (0, 0.2, 0.2), (0.3, 0.2, 0)), "rotation": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]])}
+
+
+def test_a_lit_floor_lights_the_wall_and_not_itself(device):
+    view = View((DESK, WALL), lights=[SPOT_ON_DESK], share=True, bounced=True, **tilted())
+    light, _, _, bounced, surface = full(view)
+    assert (bounced[surface == 0] == 0).all()
+    assert (bounced[surface == 8] > 0).mean() > 0.9
+    plain = view.light(share=False, bounced=False)
+    on_wall = (surface == 8).repeat(4, 0).repeat(4, 1) & (plain.sum(-1) == 0)
+    assert (light[on_wall] > 0).mean() > 0.8
+    # Patches a quarter as long say the same, but at the edge: a patch next to it is one point.
+    fine = full(view, strides=(4, 4, 1))[3]
+    far = (surface == 8) & (np.roll(surface, -3, 0) == 8)
+    assert far.sum() > 20
+    np.testing.assert_allclose(bounced[far], fine[far], rtol=0.1)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])
+def test_any_size(device, size):
+    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+    view = View((DESK, thing), [ball((0.15, 0, 0.03), 0.03)], size=size, share=True, bounced=True, **tilted())
+    light, share, share_surface, bounced, surface = full(view, strides=(4, 8, 16))
+    assert np.isfinite(light).all()
+    assert ((share[share_surface >= 0] >= 0) & (share[share_surface >= 0] <= 1)).all()
+    assert np.isfinite(bounced[surface >= 0]).all()
+    assert (surface >= 0).any()
+
+
+def test_bands_and_runs_give_the_same_bits(device):
+    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+    view = View((DESK, thing), [ball((0.15, 0, 0.03), 0.03)], share=True, bounced=True, **tilted())
+    once, again, bands = full(view), full(view), full(view, rows=[(0, 5), (5, 5), (5, 6), (6, 12)])
+    for one, other, third in zip(once, again, bands, strict=True):
+        assert one.tobytes() == other.tobytes() == third.tobytes()
+    assert (once[3][once[4] >= 0] > 0).any()
+
+
+# --- Garbage ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -5.0, 1e38])
+@pytest.mark.parametrize("where", ["radiance", "irradiance"])
+def test_garbage_in_the_room(device, bad, where):
+    """Shares stay within 0..1, light finite and not negative."""
+    samples = draw(sky())[2]
+    irradiance = np.full((8, 16, 3), np.pi, np.float32)
+    if where == "irradiance":
+        irradiance[3:] = bad
+    else:
+        values = samples.numpy()
+        values["radiance"][7] = bad
+        samples = wp.array(values, dtype=RoomSample)
+    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+    probes = [ball((0.15, 0, 0.03), 0.03)]
+    view = View((DESK, thing), probes, irradiance=irradiance, share=True, bounced=True, **tilted())
+    light, share, known, bounced, surface = full(view, samples)
+    assert ((share[known >= 0] >= 0) & (share[known >= 0] <= 1)).all()
+    assert ((bounced[surface >= 0] >= 0) & np.isfinite(bounced[surface >= 0])).all()
+    assert ((light >= 0) & np.isfinite(light)).all()
+
+
+def test_a_pixel_changes_only_what_its_patch_lights(device):
+    """A black pixel in the middle of a patch: that patch, and no share."""
+    image = np.full((*SIZE_OF_FRAME, 3), 180, np.uint8)
+    bad = image.copy()
+    bad[22, 30] = 0
+    clean, spoilt = (View((DESK, WALL), frame=one, **tilted()).send(4).numpy() for one in (image, bad))
+    changed = (clean["flux"] != spoilt["flux"]).any(-1)
+    assert np.argwhere(changed).tolist() == [[5, 7]]
+
+
+# --- In the pipeline --------------------------------------------------------------------------------------------------
+
+RUNGS = ("bounce", "brute_force")
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+def test_eager_equals_replayed(device, rung):
+    pictures = frames(SIZE[1], SIZE[0])
+    with Rig(device, "relight", rung) as replayed, Rig(device, "relight", rung) as eager:
+        eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
+        for name in ("noise", "noise", "white", "ramp", "noise"):
+            np.testing.assert_array_equal(replayed.frame(pictures[name]), eager.frame(pictures[name]), err_msg=name)
+        assert_same_bits(replayed.written("relight"), eager.written("relight"))
+        assert (eager.get("relight_share_surface") >= 0).any()
+        assert eager.get("relight_bounced").max() > 0
+
+
+@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("rect", [(12, 20, 10, 30), (0, 36, 0, 48), (0, 5, 0, 48), (31, 36, 40, 48), (0, 0, 0, 0)])
+def test_nothing_of_an_earlier_frame_is_read(device, rung, rect):
+    """Cells and patches outside the rows that a frame's light reaches may hold anything."""
+    with Rig(device, "relight", rung) as rig:
+        rig.frame(frames(SIZE[1], SIZE[0])["noise"])
+        rig.set_params(light_rect=rect)
+        rig.pipeline._light_rows = rect[:2]
+        found = []
+        for old in (-1, 0):
+            for name in ("share", "bounced"):
+                rig.poke(f"relight_{name}", 7.0)
+                rig.arrays[f"relight_{name}_surface"].fill_(old)
+            for name in ("patches", "listed"):
+                values = np.zeros(rig.arrays[f"relight_{name}"].shape, np.dtype(Patch.numpy_dtype()))
+                if old == 0:
+                    values["area"], values["flux"], values["position"] = 1.0, 1e3, (0, 0, 0.2)
+                    values["normal"] = (0, 0, -1)
+                rig.arrays[f"relight_{name}"].assign(values)
+            rig.arrays["relight_count"].fill_((old + 1) * rig.arrays["relight_patches"].shape[1])
+            rig.poke("physical_added", 0.0)
+            for step in rig.stage("relight")[1]:
+                step.launch(step.extent())
+            found.append(rig.get("physical_added"))
+        np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_which_proxies_face():
+    camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
+    plane, thing = Proxy("plane", size=(1.0, 1.0)), Proxy("box", size=(0.1, 0.1, 0.1))
+    over = dataclasses.replace(plane, at=(0.0, 0.0, 0.5))
+    ceiling, wall = (dataclasses.replace(over, rotate=(turn, 0.0, 0.0)) for turn in (180.0, 90.0))
+    for proxies, expected in (
+        ((plane,), False),
+        ((thing,), False),
+        ((plane, over), False),
+        ((plane, ceiling), True),
+        ((plane, wall), True),
+        ((plane, thing), True),
+        ((thing, thing), True),
+    ):
+        assert proxies_face(Scene(camera, proxies=proxies)) == expected
