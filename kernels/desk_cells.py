@@ -19,7 +19,7 @@ gets
 
 which is a disc's form factor on its axis: finite where a box stands on the lit desk, and pi L for a patch that fills
 the hemisphere. One bounce; what the camera does not show sends nothing, and nothing stands between. Points of one flat
-surface lie above each other by rounding alone: what is no higher than a hit's error sends nothing.
+surface, which rounding puts above or below each other, share a normal: of two the upper one turns its back.
 """
 
 from __future__ import annotations
@@ -363,7 +363,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
                 way = patch.position - hit.point
                 here = wp.dot(way, hit.normal)
                 there = -wp.dot(way, patch.normal)
-                if here > hit.error and there > hit.error:
+                if here > 0.0 and there > 0.0:
                     squared = wp.dot(way, way)
                     total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
         room = wp.pi * mean_facing(desk, hit.normal)

@@ -408,6 +408,14 @@ def test_at_the_edge_of_a_lit_strip(device):
     np.testing.assert_allclose(bounced, np.broadcast_to(expected[..., None], bounced.shape), rtol=PATCHES)
 
 
+def test_nothing_receives_more_than_a_white_sky_of_its_radiance(device):
+    """A patch as near as 1 mm, 100 times as large as it is far: pi L and no more, as a point it would give 10,000 L."""
+    bounced, _ = View(size=(5, 5), room=0 * WHITE).gather(
+        patches_of((0, 0, 1e-3), (0, 0, -1), WHITE, 1e-2), patch_stride=5, stride=1
+    )
+    assert 0.99 * np.pi < bounced.max() <= np.pi * (1 + FLOAT_ERROR)
+
+
 @pytest.mark.parametrize(("height", "area"), [(0.06, 1e-4), (0.005, 1e-2), (1e-3, 1.0)])
 def test_no_more_is_received_than_sent(device, height, area):
     """A patch of pi L A watts: from the frame, nearly all that a small one sees, comes nearly all."""
@@ -421,7 +429,7 @@ def test_no_more_is_received_than_sent(device, height, area):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_flat_surface_does_not_light_itself(device, seed):
-    """However it stands, and 100 m away: rounding puts its points above each other, and nothing comes of it."""
+    """However it stands, and 100 m away: what rounding puts above a point turns its back on it."""
     rng = np.random.default_rng(seed)
     turn = rotation_matrix((*rng.uniform(-30, 30, 2), rng.uniform(0, 360)))
     shift = np.array([60.0, -80.0, 0]) * (seed % 2)
