@@ -207,6 +207,20 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
         if not needed:
             return
         surface_out[ci, cj] = key
+        # One ball around all that can hide light and is no mirror ball: most samples pass it by.
+        middle = wp.vec3()
+        solid = float(0.0)
+        reach = float(0.0)
+        if wp.static(not only_planes):
+            for index in range(scene.proxies.shape[0]):
+                if scene.proxies[index].kind != PLANE:
+                    middle += scene.proxies[index].position
+                    solid += 1.0
+            middle = middle / wp.max(solid, 1.0)
+            for index in range(scene.proxies.shape[0]):
+                shape = scene.proxies[index]
+                if shape.kind != PLANE:
+                    reach = wp.max(reach, wp.length(shape.position - middle) + shape.scale * wp.length(shape.extent))
         whole = wp.vec3()
         lost = wp.vec3()
         for k in range(count):
@@ -230,14 +244,7 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
                             normal = (t * toward.direction - away) / probe.radius
                             radiance = wp.cw_mul(probe.reflectance, mean_facing(desk, normal))
                 if wp.static(not only_planes):
-                    near_some = bool(False)
-                    for index in range(scene.proxies.shape[0]):
-                        shape = scene.proxies[index]
-                        if shape.kind != PLANE:
-                            radius = shape.scale * wp.length(shape.extent)
-                            if near_ball(shape.position - hit.point, radius, toward.direction):
-                                near_some = True
-                    if near_some:
+                    if near_ball(middle - hit.point, reach, toward.direction):
                         origin = offset_origin(hit.point, hit.geometric_normal, toward.direction, hit.error)
                         hidden = closest_proxy(scene, origin, toward.direction, nearest)
                         if hidden.shape >= 0:
