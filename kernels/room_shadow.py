@@ -22,11 +22,24 @@ rays are traced, and cells that have none are done. Tiles of cells in which a ra
 number: elsewhere the ratio is 1, and need not be averaged. Nor need it be spread to pixels where it stays within
 ``NEGLIGIBLE`` of 1; that is made exactly 1.
 
-Bounce. What a ray meets is not black: an object reflects one of its two lobes, picked by their reflectance. Its rough
-lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an object, that object's own colour; the desk,
-1 if a ray from there leaves the scene, else a share of the object's reflectance, so that light dies out between an
-object and the ground that it stands on, the slower the whiter the object. Its glossy lobe gives what is in the mirror
-direction.
+Bounce. What a ray meets is not black. Either a ray finds out (``traced``): an object reflects one of its two lobes,
+picked by their reflectance. Its rough lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an
+object, that object's own colour; the desk, 1 if a ray from there leaves the scene, else a share of the object's
+reflectance, so that light dies out between an object and the ground that it stands on, the slower the whiter the
+object. Its glossy lobe gives what is in the mirror direction.
+
+Or it is an estimate without a ray (``estimated``). Both lobes reflect the distant room, whose part behind the cell's
+own surface is that surface: the desk. Let h be the share of the light that objects hide, u what they send of the room
+before the cell's surface, d of the desk if it were not shaded. The desk that they see is near the cell and shaded as
+it is, so the ratio r is that of
+
+    r = 1 - h + u + d r,    r = (1 - h + u) / (1 - d)
+
+with all the light that goes to and fro between an object and the ground: white objects in a white room (u + d = h)
+leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
+
+The physical. A ray that meets a proxy or a mirror ball, with objects or without them, finds its light: the camera's
+picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
 
 References:
     [Deb98] Debevec 1998, Rendering Synthetic Objects into Real Scenes.
@@ -37,6 +50,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Literal
 
 import warp as wp
 
@@ -44,13 +58,13 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
-from warp_ar.kernels.prefilter import level_from_alpha
+from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_mirrored, make_shade_unoccluded
 from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
 from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
-from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset_origin
+from warp_ar.kernels.visibility import FAR, Hit, inside_rect, intersect_sphere, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,6 +84,8 @@ CPU_RUN = 32
 """Pixels of a row that one thread of a CPU does: it looks once whether any of them can be shaded."""
 WARP_LANES = 32
 """Threads of a CUDA device that go the same way or wait for each other."""
+KINDS = wp.constant(4)
+"""Sums per part of a cell: light without the objects, what they hide, what they send of the room and of the desk."""
 CHUNK = 64
 """Samples that are culled together: the bits of a mask."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
@@ -77,11 +93,19 @@ MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 MAX_RATIO = wp.constant(wp.float32(4.0))
 """Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
 CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
-"""Least width of an object's lobe as the desk sees it.
+"""Least width of an object's lobe as the desk sees it, near the object.
 
 A mirror's image of a lamp on the desk is too fine for the few rays that look for it: it would come out as specks. This
-blurs it to what they can carry, and keeps its energy.
+blurs it to what they can carry, and keeps its energy. From afar fewer rays meet the object and each stands for more of
+what it shows: the width grows as the distance over the object's size.
 """
+MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
+"""Largest radiance of an object, estimated, over the mean of what its surroundings send to the cell's surface.
+
+The sides of things are dark beside a top that a lamp lights, and few samples show them: a brighter object is specks.
+"""
+MAX_RETURN = wp.constant(wp.float32(0.99))
+"""Largest share of its light that the desk gets back from objects, estimated: what goes to and fro stays finite."""
 FURTHER = wp.constant(wp.float32(0.5))
 """Light of an object close above the desk, over that in the open: half of what it sees is its own shadow."""
 MESH_KEY = wp.constant(7)
@@ -100,8 +124,10 @@ class RoomShadowConfig:
     """Samples per set: up to 64, or a multiple of it."""
     side: int
     """Pixels along a tile; there are side^2 sets."""
-    bounce: bool
-    """Whether objects reflect light onto the desk."""
+    bounce: Literal["estimated", "traced"]
+    """How what objects reflect onto the desk is found."""
+    asking: float = 1.0
+    """Share of a set, its first samples, that is asked what the object that it meets sends; others only stop there."""
     near: bool = False
     """Whether some samples are lamps at a known distance."""
     parts: int = 1
@@ -114,6 +140,12 @@ def bounding_radius(shape: Shape) -> wp.float32:
     if shape.kind == SPHERE:
         return shape.scale * shape.extent[0]
     return shape.scale * wp.length(shape.extent)
+
+
+@wp.func
+def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
+    """Least width of the lobe of an object as a point of the desk sees it."""
+    return wp.clamp(CAUSTIC_ALPHA * wp.length(shape.position - point) / bounding_radius(shape), CAUSTIC_ALPHA, 1.0)
 
 
 @wp.func
@@ -153,11 +185,92 @@ def make_mask_cone(count: int, near: bool) -> wp.Function:
     return mask_cone
 
 
+@wp.struct
+class Sent:
+    """What an object reflects along a ray."""
+
+    room: wp.vec3  # radiance that it has from the room
+    desk: wp.vec3  # radiance that it would have from a desk without shadows
+
+
+@functools.cache
+def make_look_wide(config: RoomConfig) -> wp.Function:
+    """``look_wide(room, direction) -> vec3``: the distant room around a direction, as few rays can carry it."""
+
+    @wp.func(module="unique")
+    def look_wide(room: Room, direction: wp.vec3) -> wp.vec3:
+        radiance = wp.vec3(0.0)
+        if wp.static(config.specular):
+            level = level_from_alpha(CAUSTIC_ALPHA, room.level_height)
+            radiance = sample_levels(room.levels, direction, level, room.level_height)
+        elif wp.static(config.diffuse == "sh"):
+            radiance = sh_irradiance(room.irradiance_sh, direction) / wp.pi
+        elif wp.static(config.diffuse == "map"):
+            radiance = sample_latlong(room.irradiance_map, direction) / wp.pi
+        return radiance
+
+    return look_wide
+
+
+@functools.cache
+def make_estimated(config: RoomConfig) -> wp.Function:
+    """``estimated(scene, room, hit, direction, alpha, up, from_desk) -> Sent``.
+
+    What an object sends back along a ray that met it at ``hit``, without a further ray: both lobes of the distant room,
+    the glossy one ``alpha`` wide or more. What lies below ``up`` is the desk; ``from_desk`` is the irradiance that a
+    surface above it has from there.
+    """
+    surface_at = make_surface(config.models, config.textures)
+    mirrored = make_mirrored(config)
+
+    @wp.func(module="unique")
+    def estimated(
+        scene: RayScene,
+        room: Room,
+        hit: Hit,
+        direction: wp.vec3,
+        alpha: wp.float32,
+        up: wp.vec3,
+        from_desk: wp.vec3,
+    ) -> Sent:
+        wo = -direction
+        normal = hit.normal
+        if wp.dot(hit.geometric_normal, wo) < 0.0:
+            normal = -normal
+        cosine = wp.max(wp.dot(normal, wo), 0.0)
+        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cosine)
+        sent = Sent()
+        if wp.static(config.diffuse != "none"):
+            irradiance = wp.vec3(0.0)
+            if wp.static(config.diffuse == "sh"):
+                irradiance = sh_irradiance(room.irradiance_sh, normal)
+            else:
+                irradiance = sample_latlong(room.irradiance_map, normal)
+            # A surface sees (1 - n.up) / 2 of what an even desk sends to one that faces it.
+            desk = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_desk, irradiance)
+            sent.desk = wp.cw_mul(surface.diffuse, desk) / wp.pi
+            sent.room = wp.cw_mul(surface.diffuse, irradiance - desk) / wp.pi
+        if wp.static(config.specular):
+            outward = reflect(wo, normal)
+            floor = level_from_alpha(alpha, room.level_height)
+            radiance = wp.cw_mul(
+                surface.reflectance,
+                mirrored(room, surface.model, surface.roughness, surface.shininess, outward, floor),
+            )
+            share = wp.clamp(0.5 - 0.5 * wp.dot(outward, up) / CAUSTIC_ALPHA, 0.0, 1.0)
+            sent.desk += share * radiance
+            sent.room += (1.0 - share) * radiance
+        return sent
+
+    return estimated
+
+
 @functools.cache
 def make_bounced(config: RoomConfig) -> wp.Function:
-    """``bounced(params, frame, decode_table, scene, room, hit, direction, seed) -> vec3``.
+    """``bounced(params, frame, decode_table, scene, room, hit, direction, alpha, seed) -> vec3``.
 
-    Radiance that an object sends back along a ray that met it at ``hit``: one lobe, one ray; a Monte-Carlo estimate.
+    Radiance that an object sends back along a ray that met it at ``hit``: one lobe, the glossy one ``alpha`` wide or
+    more, one ray; a Monte-Carlo estimate.
     """
     trace = make_trace(config.trace)
     closest_object, closest_proxy, occluded_by_objects = (
@@ -179,6 +292,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
         room: Room,
         hit: Hit,
         direction: wp.vec3,
+        alpha: wp.float32,
         seed: wp.vec3ui,
     ) -> wp.vec3:
         wo = -direction
@@ -243,7 +357,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
                 received = sample_latlong(room.irradiance_map, normal) / wp.pi
         else:
             if wp.static(config.specular):
-                floor = level_from_alpha(CAUSTIC_ALPHA, room.level_height)
+                floor = level_from_alpha(alpha, room.level_height)
                 received = mirrored(room, surface.model, surface.roughness, surface.shininess, outward, floor)
         return wp.cw_mul(weight, received)
 
@@ -296,12 +410,15 @@ def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
 
 
 @wp.func
-def bounced_of(without: wp.vec3, sent: wp.vec3) -> wp.vec3:
-    """What objects send, relative to the room's light."""
+def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.vec3) -> wp.vec3:
+    """What objects send, relative to the room's light; ``returned`` is the part that the desk itself must light."""
     ratio = wp.vec3(0.0)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
-            ratio[channel] = wp.min(sent[channel] / without[channel], MAX_RATIO)
+            left = wp.clamp(1.0 - hidden[channel] / without[channel], 0.0, 1.0)
+            back = wp.min(returned[channel] / without[channel], MAX_RETURN)
+            total = (left + sent[channel] / without[channel]) / (1.0 - back)
+            ratio[channel] = wp.min(total - left, MAX_RATIO)
     return ratio
 
 
@@ -312,16 +429,21 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         raise ValueError(f"count is {config.count}; expected up to {CHUNK} or a multiple of it")
     trace = make_trace(config.room.trace)
     closest_proxy, closest_object = trace.closest_proxy, trace.closest_object
-    occluded_by_objects, occluded_by_proxies = trace.occluded_by_objects, trace.occluded_by_proxies
+    occluded_by_objects = trace.occluded_by_objects
     mask_cone = make_mask_cone(min(config.count, CHUNK), config.near)
     seen_proxy = make_seen_proxy(config.room)
-    bounced = make_bounced(config.room)
-    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
+    traced = config.bounce == "traced"
+    bounced = make_bounced(config.room) if traced else None
+    estimated = None if traced else make_estimated(config.room)
+    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes) if traced else None
+    look_wide = make_look_wide(config.room)
     side = config.side
     chunk = min(config.count, CHUNK)
+    asked = round(config.count * config.asking)
+    if asked < 1 or asked > config.count:
+        raise ValueError(f"asking is {config.asking}; expected a share of {config.count} samples")
     if chunk % config.parts:
         raise ValueError(f"parts is {config.parts}; expected a divisor of {chunk}")
-    kinds = sum_kinds(config.bounce)
 
     @wp.kernel(module="unique", enable_backward=False)
     def room_shadow_kernel(
@@ -370,11 +492,10 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
             return
         surface_out[i, j] = surface_key(scene, hit)
         ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
-        if wp.static(config.bounce):
-            bounced_out[i, j] = wp.vec3(0.0)
+        bounced_out[i, j] = wp.vec3(0.0)
         if wp.static(config.parts > 1):
-            for kind in range(wp.static(kinds)):
-                sums_out[part * wp.static(kinds) + kind, i, j] = wp.vec3(0.0)
+            for kind in range(KINDS):
+                sums_out[part * KINDS + kind, i, j] = wp.vec3(0.0)
 
         point = hit.point
         own = hit.shape
@@ -382,6 +503,10 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         without = wp.vec3(0.0)
         hidden = wp.vec3(0.0)
         sent = wp.vec3(0.0)
+        returned = wp.vec3(0.0)
+        up = wp.vec3(0.0)
+        from_desk = wp.vec3(0.0)
+        brightest = float(0.0)
         # A set is in the order of its sequence: any first part of it is a smaller set.
         first = samples.shape[0] / wp.static(side * side) * ((i % side) * side + j % side)
         for block in range(wp.static(config.count // chunk)):
@@ -435,15 +560,13 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         weight = cosine * grown * measure
                         origin = offset_origin(point, hit.geometric_normal, direction, hit.error)
                         radiance = samples[at + k].radiance
-                        if (ball_mask & bit) != wp.uint64(0):
-                            radiance = wp.vec3(0.0)
-                        elif (proxy_mask & bit) != wp.uint64(0):
-                            if wp.static(config.bounce):
-                                proxy = closest_proxy(scene, origin, direction, reach)
-                                if proxy.shape >= 0:
-                                    reach = proxy.t
-                                    radiance = wp.vec3(0.0)
-                                    pixel = find_in_frame(
+                        if (proxy_mask & bit) != wp.uint64(0):
+                            proxy = closest_proxy(scene, origin, direction, reach)
+                            if proxy.shape >= 0:
+                                reach = proxy.t
+                                seen = wp.vec2(-1.0, -1.0)
+                                if wp.static(traced):
+                                    seen = find_in_frame(
                                         params[0],
                                         frame.shape[0],
                                         frame.shape[1],
@@ -452,36 +575,77 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                                         proxy.point,
                                         proxy.geometric_normal,
                                     )
-                                    if pixel[0] >= 0.0:
-                                        radiance = look_up(frame, decode_table, pixel[0], pixel[1])
-                            else:
-                                if occluded_by_proxies(scene, origin, direction, reach):
-                                    radiance = wp.vec3(0.0)
+                                if seen[0] >= 0.0:
+                                    radiance = look_up(frame, decode_table, seen[0], seen[1])
+                                else:
+                                    # Where the ball saw it; a lamp right beside it is not its light.
+                                    radiance = wp.min(
+                                        sample_latlong(room.environment, proxy.point - samples[at + k].origin),
+                                        wp.vec3(1.0, 1.0, 1.0),
+                                    )
+                        if wp.static(config.room.probes):
+                            if (ball_mask & bit) != wp.uint64(0):
+                                for index in range(room.probes.shape[0]):
+                                    probe = room.probes[index]
+                                    t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
+                                    if t < reach:
+                                        reach = t
+                                        normal = (origin + t * direction - probe.center) / probe.radius
+                                        radiance = wp.cw_mul(
+                                            probe.reflectance, look_wide(room, reflect(-direction, normal))
+                                        )
                         without += weight * radiance
                         if (virtual_mask & bit) != wp.uint64(0):
-                            if wp.static(config.bounce):
+                            other = Hit()
+                            other.shape = -1
+                            if wp.static(asked == config.count) or block * wp.static(chunk) + k < wp.static(asked):
                                 other = closest_object(scene, origin, direction, reach)
                                 if other.shape >= 0:
+                                    hidden += weight * radiance
+                            elif occluded_by_objects(scene, origin, direction, reach):
+                                hidden += weight * radiance
+                            if other.shape >= 0:
+                                stands_for = weight * wp.static(config.count / asked)
+                                alpha = caustic_alpha(scene.objects[other.shape], point)
+                                if wp.static(traced):
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
-                                    light = bounced(params[0], frame, decode_table, scene, room, other, direction, seed)
-                                    hidden += weight * radiance
-                                    sent += weight * light
-                            else:
-                                if occluded_by_objects(scene, origin, direction, reach):
-                                    hidden += weight * radiance
+                                    sent += stands_for * bounced(
+                                        params[0], frame, decode_table, scene, room, other, direction, alpha, seed
+                                    )
+                                else:
+                                    if up == wp.vec3(0.0, 0.0, 0.0):
+                                        up = hit.geometric_normal
+                                        if wp.dot(up, direction) < 0.0:
+                                            up = -up
+                                        brightest = MAX_BRIGHTNESS * wp.max(look_wide(room, up))
+                                        if wp.static(config.room.diffuse == "sh"):
+                                            from_desk = sh_irradiance(room.irradiance_sh, -up)
+                                            brightest = (
+                                                MAX_BRIGHTNESS * wp.max(sh_irradiance(room.irradiance_sh, up)) / wp.pi
+                                            )
+                                        if wp.static(config.room.diffuse == "map"):
+                                            from_desk = sample_latlong(room.irradiance_map, -up)
+                                            brightest = (
+                                                MAX_BRIGHTNESS * wp.max(sample_latlong(room.irradiance_map, up)) / wp.pi
+                                            )
+                                    light = estimated(scene, room, other, direction, alpha, up, from_desk)
+                                    stands_for *= wp.min(
+                                        brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0
+                                    )
+                                    sent += stands_for * light.room
+                                    returned += stands_for * light.desk
                 bit = bit << wp.uint64(1)
         unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
         if shaded_out.shape[0] > 0 and not unchanged:
             shaded_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
         if wp.static(config.parts > 1):
-            sums_out[part * wp.static(kinds), i, j] = without
-            sums_out[part * wp.static(kinds) + 1, i, j] = hidden
-            if wp.static(config.bounce):
-                sums_out[part * wp.static(kinds) + 2, i, j] = sent
+            sums_out[part * KINDS, i, j] = without
+            sums_out[part * KINDS + 1, i, j] = hidden
+            sums_out[part * KINDS + 2, i, j] = sent
+            sums_out[part * KINDS + 3, i, j] = returned
         else:
             ratio_out[i, j] = ratio_of(without, hidden, hit.t)
-            if wp.static(config.bounce):
-                bounced_out[i, j] = bounced_of(without, sent)
+            bounced_out[i, j] = bounced_of(without, hidden, sent, returned)
 
     return room_shadow_kernel
 
@@ -491,7 +655,6 @@ def join_parts_kernel(
     # In:
     surface: wp.array2d[wp.int32],
     sums: wp.array3d[wp.vec3],
-    kinds: wp.int32,
     # Out:
     ratio_out: wp.array2d[wp.vec4],
     bounced_out: wp.array2d[wp.vec3],
@@ -503,14 +666,14 @@ def join_parts_kernel(
     without = wp.vec3(0.0)
     hidden = wp.vec3(0.0)
     sent = wp.vec3(0.0)
-    for part in range(sums.shape[0] / kinds):
-        without += sums[part * kinds, i, j]
-        hidden += sums[part * kinds + 1, i, j]
-        if kinds > 2:
-            sent += sums[part * kinds + 2, i, j]
+    returned = wp.vec3(0.0)
+    for part in range(sums.shape[0] / KINDS):
+        without += sums[part * KINDS, i, j]
+        hidden += sums[part * KINDS + 1, i, j]
+        sent += sums[part * KINDS + 2, i, j]
+        returned += sums[part * KINDS + 3, i, j]
     ratio_out[i, j] = ratio_of(without, hidden, ratio_out[i, j][3])
-    if kinds > 2:
-        bounced_out[i, j] = bounced_of(without, sent)
+    bounced_out[i, j] = bounced_of(without, hidden, sent, returned)
 
 
 @wp.func
@@ -530,7 +693,7 @@ def window_weight(offset: int, reach: int) -> float:
 
 
 @functools.cache
-def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
+def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     """Kernel of ``filter_ratio`` for tiles of so many cells along."""
     wide, narrow = side // 2, side // 4
     width = 2 * wide + 1
@@ -585,11 +748,10 @@ def make_filter_ratio_kernel(side: int, bounce: bool) -> wp.Kernel:
                             if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
                                 near_left += wp.static(narrow_weights[a] * narrow_weights[b]) * value
                                 squares += wp.static(narrow_weights[a] * narrow_weights[b]) * wp.cw_mul(value, value)
-                            if wp.static(bounce):
-                                sent = bounced[ni, nj]
-                                far_sent += wp.static(wide_weights[a] * wide_weights[b]) * sent
-                                if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
-                                    near_sent += wp.static(narrow_weights[a] * narrow_weights[b]) * sent
+                            sent = bounced[ni, nj]
+                            far_sent += wp.static(wide_weights[a] * wide_weights[b]) * sent
+                            if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
+                                near_sent += wp.static(narrow_weights[a] * narrow_weights[b]) * sent
         left = wp.vec3(far_left[0], far_left[1], far_left[2]) / far_left[3]
         mean = left + far_sent / far_left[3]
         if wp.static(wide > 1):
@@ -697,7 +859,7 @@ def shade_room(
     samples: wp.array[RoomSample],
     stride: int,
     ratio_out: wp.array2d[wp.vec4],
-    bounced_out: wp.array2d[wp.vec3] | None,
+    bounced_out: wp.array2d[wp.vec3],
     surface_out: wp.array2d[wp.int32],
     *,
     shaded_out: wp.array2d[wp.int32] | None = None,
@@ -710,7 +872,7 @@ def shade_room(
         config: What the scene calls for.
         params: (1,) FrameParams: camera and shadow_rect.
         rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
-        frame: (H, W) the camera's frame, RGB.
+        frame: (H, W) the camera's frame, RGB; needed if bounces are traced.
         decode_table: (256,) of ``color.decode_table``.
         scene: Objects and proxies.
         room: The room's light; what ``config.room`` leaves out may be empty.
@@ -719,7 +881,7 @@ def shade_room(
         samples: (the same) the samples.
         stride: Pixels from one estimate to the next.
         ratio_out: (ceil(H / stride), ceil(W / stride)) RGB share of the room's light that is not hidden, and depth.
-        bounced_out: (the same) what objects send there, relative to the room's light; needed if ``config.bounce``.
+        bounced_out: (the same) what objects send there, relative to the room's light.
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         sums_out: Scratch of ``sums_shape``; needed if ``config.parts`` is not 1, and then ``rows`` must be None.
@@ -736,13 +898,7 @@ def shade_room(
         device=rays.device,
     )
     if config.parts > 1:
-        inputs = [surface_out, sums_out, sum_kinds(config.bounce)]
-        wp.launch(join_parts_kernel, cells, inputs, [ratio_out, bounced_out], device=rays.device)
-
-
-def sum_kinds(bounce: bool) -> int:
-    """Sums per part of a cell: light without the objects, light that they hide, light that they send."""
-    return 3 if bounce else 2
+        wp.launch(join_parts_kernel, cells, [surface_out, sums_out], [ratio_out, bounced_out], device=rays.device)
 
 
 def count_parts(rows: int, columns: int) -> int:
@@ -753,9 +909,9 @@ def count_parts(rows: int, columns: int) -> int:
     return parts
 
 
-def sums_shape(parts: int, bounce: bool, rows: int, columns: int) -> tuple[int, int, int]:
+def sums_shape(parts: int, rows: int, columns: int) -> tuple[int, int, int]:
     """Shape of the array that holds the sums of all parts of so many cells."""
-    return parts * sum_kinds(bounce), rows, columns
+    return parts * int(KINDS), rows, columns
 
 
 def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
@@ -765,7 +921,7 @@ def shaded_shape(rows: int, columns: int) -> tuple[int, int]:
 
 def filter_ratio(
     ratio: wp.array2d[wp.vec4],
-    bounced: wp.array2d[wp.vec3] | None,
+    bounced: wp.array2d[wp.vec3],
     surface: wp.array2d[wp.int32],
     side: int,
     filtered_out: wp.array2d[wp.vec3],
@@ -779,7 +935,7 @@ def filter_ratio(
 
     Args:
         ratio: From ``shade_room``.
-        bounced: From ``shade_room``, or None if nothing is bounced.
+        bounced: From ``shade_room``.
         surface: From ``shade_room``.
         side: Cells along a tile.
         filtered_out: As ``ratio``, without the depth; written only where a surface is seen.
@@ -789,7 +945,7 @@ def filter_ratio(
         rows: Band of rows; None means all.
     """
     launch_rows(
-        make_filter_ratio_kernel(side, bounced is not None),
+        make_filter_ratio_kernel(side),
         surface.shape,
         [params, shaded, ratio, bounced, surface],
         [filtered_out, seen_out],

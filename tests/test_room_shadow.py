@@ -88,8 +88,9 @@ def run(
     count=COUNT,
     side=SIDE,
     stride=1,
-    bounce=False,
-    albedo=1.0,
+    bounce="estimated",
+    asking=1.0,
+    albedo=0.0,
     rect=(0, H, 0, W),
     rows=None,
     filtered=True,
@@ -98,8 +99,8 @@ def run(
     parts=1,
 ):
     kinds = tuple(tuple(sorted({thing["kind"] for thing in things})) for things in (objects, proxies))
-    forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh" if bounce else "none", False, bool(probes))
-    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, near, parts)
+    forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
+    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, asking, near, parts)
     params = records(
         FrameParams,
         {
@@ -125,7 +126,7 @@ def run(
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     cells = -(-H // stride), -(-W // stride)
     ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
-    bounced = wp.zeros(cells, wp.vec3) if bounce else None
+    bounced = wp.zeros(cells, wp.vec3)
     shaded = wp.full(room_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
     rays = wp.array(RAYS, dtype=wp.vec2)
     room_shadow.shade_room(
@@ -142,7 +143,7 @@ def run(
         bounced,
         surface,
         shaded_out=shaded,
-        sums_out=wp.full(room_shadow.sums_shape(parts, bounce, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
+        sums_out=wp.full(room_shadow.sums_shape(parts, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
         rows=rows,
     )
     if not filtered:
@@ -383,10 +384,11 @@ def test_black_room_and_deep_contact(device):
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.8, 1.0])
-def test_bounce(device, albedo):
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_bounce(device, bounce, albedo):
     item = [sphere((0, 0, 0.08), 0.05)]
     drawn = draw(sky(1.0))
-    black, lit = run(drawn, item)[..., 0], run(drawn, item, bounce=True, albedo=albedo)[..., 0]
+    black, lit = run(drawn, item)[..., 0], run(drawn, item, bounce=bounce, albedo=albedo)[..., 0]
     if albedo == 0.0:
         np.testing.assert_allclose(lit, black, atol=SUM_ERROR)
     else:
@@ -395,6 +397,104 @@ def test_bounce(device, albedo):
         back = (lit - black)[hidden > 0.1] / hidden[hidden > 0.1]
         assert back.max() < albedo + SET_ERROR
         assert albedo * 0.7 < back.mean() < albedo + MEAN_ERROR
+
+
+def test_estimated_bounce_keeps_the_energy_of_a_white_room(device):
+    """To and fro between white objects and the desk nothing is lost, however close they are."""
+    for item in (sphere((0, 0, 0.08), 0.05), sphere((0.03, 0.02, 0.06), 0.05), shape(BOX, (0, 0, 0.07), (0.05,) * 3)):
+        got = run(draw(sky(1.0)), [item], albedo=1.0)
+        np.testing.assert_allclose(got, 1.0, atol=10 * SUM_ERROR)
+
+
+def test_estimated_bounce_is_the_sum_of_its_series(device):
+    """A grey sphere high above the desk: its lower half sees the desk, its upper half the sky."""
+    center, radius, albedo = (0.0, 0.0, 0.2), 0.03, 0.6
+    drawn = list_texels(sky(1.0))
+    got = run(drawn, [sphere(center, radius)], albedo=albedo, count=2048, side=1)[..., 0]
+    at = np.unravel_index(np.linalg.norm(POINTS, axis=-1).argmin(), (H, W))
+    point = POINTS[at]
+    # Directions of the texels that meet the sphere, and its normals there.
+    wi, flux = drawn[0].numpy().astype(np.float64), drawn[1].numpy()[:, 0].astype(np.float64)
+    weight = np.maximum(wi[:, 2], 0) * flux
+    met = reference.meets_sphere(point, wi, center, radius)
+    to_center = np.asarray(center) - point
+    along = wi[met] @ to_center
+    t = along - np.sqrt(radius**2 - (to_center @ to_center - along**2))
+    up = ((point + t[:, None] * wi[met] - center) / radius)[:, 2]
+    hidden, desk = weight[met].sum() / weight.sum(), albedo * (weight[met] @ (0.5 - 0.5 * up)) / weight.sum()
+    room = albedo * hidden - desk
+    assert hidden > 0.01
+    assert 0.005 < desk < albedo * hidden
+    assert got[at] == pytest.approx((1 - hidden + room) / (1 - desk), abs=SUM_ERROR)
+
+
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_the_physical_is_not_black(device, bounce):
+    """In a white room with a white box and a perfect ball only the virtual object, a black one, takes light."""
+    center, radius = (0.02, -0.03, 0.03), 0.02
+    drawn = draw(sky(1.0))
+    probes = [{"center": (0.1, -0.03, 0.03), "radius": 0.03, "reflectance": (1, 1, 1)}]
+    wall = shape(BOX, (-0.1, -0.03, 0.04), (0.03, 0.1, 0.04))
+    alone = run(drawn, [sphere(center, radius)], bounce=bounce)[..., 0]
+    among = run(drawn, [sphere(center, radius)], proxies=(DESK, wall), probes=probes, bounce=bounce)[..., 0]
+    # Of what they stand on, and hide from the camera; and where they stand between the desk and the object.
+    clear = (np.abs(POINTS[..., 1] + 0.03) < 0.05) & (POINTS[..., 0] > -0.03) & (POINTS[..., 0] < 0.05)
+    assert clear.sum() > 20
+    assert alone[clear].min() < 0.7
+    np.testing.assert_allclose(among[clear], alone[clear], atol=10 * SUM_ERROR)
+    # A white object changes nothing: nothing that it hides is darker or lighter than itself.
+    if bounce == "estimated":
+        white = run(drawn, [sphere(center, radius)], proxies=(DESK, wall), probes=probes, albedo=1.0)
+        np.testing.assert_allclose(white, 1.0, atol=10 * SUM_ERROR)
+
+
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_the_physical_among_samples_matches_the_reference(device, bounce):
+    """Sets of 64 samples beside every texel, with a box and a ball that differ from the room behind them."""
+    environment = sky(0.3)
+    environment[8:14, 10:30] = 4.0
+    probes = [{"center": (0.1, 0.02, 0.03), "radius": 0.03, "reflectance": (0.8, 0.8, 0.8)}]
+    wall = shape(BOX, (-0.1, 0.0, 0.04), (0.03, 0.1, 0.04))
+    scene = {"proxies": (DESK, wall), "probes": probes, "albedo": 0.6, "bounce": bounce}
+    item = [sphere((0.0, -0.02, 0.06), 0.04)]
+    got = run(draw(environment), item, **scene)
+    expected = run(list_texels(environment), item, **scene, count=2048, side=1)
+    assert expected.min() < 0.8
+    assert abs((got - expected).mean()) < MEAN_ERROR
+    assert np.abs(got - expected).max() < SET_ERROR
+
+
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_half_of_a_set_speaks_for_all_of_it(device, bounce):
+    environment = with_sun(6, 20, 100.0)
+    item = [sphere((0, 0, 0.07), 0.05)]
+    whole, half = (run(draw(environment), item, albedo=0.8, bounce=bounce, asking=share) for share in (1.0, 0.5))
+    assert (half != whole).any()
+    assert abs((half - whole).mean()) < MEAN_ERROR
+    assert np.abs(half - whole).max() < SET_ERROR
+    black = [run(draw(environment), item, bounce=bounce, asking=share) for share in (1.0, 0.5)]
+    np.testing.assert_array_equal(*black)
+
+
+@pytest.mark.parametrize("asking", [0.0, 1.5])
+def test_asking_is_a_share(asking):
+    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+    with pytest.raises(ValueError, match="asking is"):
+        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 64, 4, "traced", asking))
+
+
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
+def test_what_the_ball_hides_is_not_there(device, bounce):
+    """Seen from the desk in front of the ball, an object behind it neither takes light nor sends any."""
+    ball = np.array([0.0, 0.0, 0.035])
+    probes = [{"center": ball, "radius": 0.035, "reflectance": (0.5, 0.5, 0.5)}]
+    point = POINTS[H // 2, W // 4]
+    toward = (ball - point) / np.linalg.norm(ball - point)
+    item = [sphere(point + 0.4 * toward, 0.07)]
+    scene = {"bounce": bounce, "albedo": 0.9, "count": 2048, "side": 1, "filtered": False}
+    drawn = list_texels(sky(1.0))
+    assert run(drawn, item, **scene)[0][H // 2, W // 4].max() < 0.995
+    assert (run(drawn, item, probes=probes, **scene)[0][H // 2, W // 4] == 1).all()
 
 
 def test_near_lamps_cast_their_own_shadow(device):
@@ -434,11 +534,11 @@ def test_bands_of_rows_and_rectangles(device, stride):
     assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
 
 
-@pytest.mark.parametrize("bounce", [False, True])
+@pytest.mark.parametrize("bounce", ["estimated", "traced"])
 def test_threads_that_share_a_cell_find_the_same(device, bounce):
     drawn = draw(with_sun(6, 20, 100.0))
     item, balls = [sphere((0, 0, 0.05), 0.05)], [{"center": (0.1, 0, 0.03), "radius": 0.03}]
-    one, eight = (run(drawn, item, probes=balls, stride=2, bounce=bounce, parts=parts) for parts in (1, 8))
+    one, eight = (run(drawn, item, probes=balls, stride=2, bounce=bounce, albedo=0.5, parts=parts) for parts in (1, 8))
     assert one.min() < 0.7
     np.testing.assert_allclose(eight, one, atol=SUM_ERROR)
 
@@ -468,7 +568,8 @@ def test_filter_keeps_surfaces_apart(device):
     surface[:, 8:] = 8
     surface[3, :] = -1
     out = wp.full((16, 16), wp.vec3(5.0, 5.0, 5.0), dtype=wp.vec3)
-    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), None, wp.array(surface, dtype=wp.int32), 4, out)
+    bounced = wp.zeros((16, 16), wp.vec3)
+    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), bounced, wp.array(surface, dtype=wp.int32), 4, out)
     expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
     expected[3] = 5.0
     np.testing.assert_array_equal(out.numpy(), expected)
@@ -480,7 +581,7 @@ def filtered(ratio, side=4):
     surface = wp.zeros(cells.shape[:2], wp.int32)
     out = wp.zeros(surface.shape, wp.vec3)
     cells = wp.array(cells, dtype=wp.vec4)
-    room_shadow.filter_ratio(cells, None, surface, side, out)
+    room_shadow.filter_ratio(cells, wp.zeros(surface.shape, wp.vec3), surface, side, out)
     return out.numpy()[..., 0]
 
 
@@ -557,7 +658,7 @@ def test_pixels_between_surfaces_find_their_own(device):
 def test_count_must_fill_chunks():
     forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
     with pytest.raises(ValueError, match="count is 100"):
-        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 100, 4, False))
+        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 100, 4, "estimated"))
 
 
 # --- Stage ------------------------------------------------------------------------------------------------------------

@@ -412,8 +412,8 @@ MUTATIONS = (
         18,
         "objects that take light from the desk give none back",
         "kernels/room_shadow.py",
-        "sent += weight * light\n",
-        "sent += 0.0 * light\n",
+        "sent += stands_for * light.room\n",
+        "sent += 0.0 * light.room\n",
         f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
     ),
     Mutation(

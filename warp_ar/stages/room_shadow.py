@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import warp as wp
 
@@ -30,15 +30,17 @@ class Rung:
     """Estimates along a tile."""
     stride: int
     """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
-    bounce: bool
-    """Whether objects reflect light onto the desk."""
+    bounce: Literal["estimated", "traced"]
+    """How what objects reflect onto the desk is found."""
+    asking: float = 1.0
+    """Share of the rays that asks for it: light that takes rays to find is smooth, and half of them find it."""
 
 
 RUNGS: Mapping[str, Rung] = {
-    "coarse": Rung(32, 4, 4, False),
-    "bounce": Rung(64, 4, 2, True),
-    "fine": Rung(64, 4, 1, True),
-    "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, True),
+    "coarse": Rung(32, 4, 5, "estimated"),
+    "bounce": Rung(64, 4, 2, "traced", 0.5),
+    "fine": Rung(64, 4, 1, "traced", 0.5),
+    "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
 """Cheapest first, after ``none``."""
 
@@ -57,7 +59,7 @@ def cell_size(rung: Rung, rows: int) -> int:
 
 def bounces_light(request: Request) -> bool:
     """Whether virtual objects reflect light onto the desk, for which every material's light is read as a wide lobe."""
-    return shades_room(request) and RUNGS[request.quality.rung("room_shadow")].bounce
+    return shades_room(request)
 
 
 def room_config(request: Request) -> RoomConfig:
@@ -118,9 +120,9 @@ class RoomShadow(Stage):
             return LeftOut("the scene has no probe, so the room's light is unknown")
         if not shades_room(request):
             return LeftOut(f"the quality {request.quality.name!r} leaves out shadows of the room's light")
-        reads = ["pose", "objects", "room_samples"]
-        if RUNGS[request.quality.rung(cls.name)].bounce:
-            reads += ["frame", "environment", *room_reads(room_config(request))]
+        reads = ["pose", "objects", "room_samples", "environment", *room_reads(room_config(request))]
+        if RUNGS[request.quality.rung(cls.name)].bounce == "traced":
+            reads.append("frame")
         return Wiring(tuple(reads), ("physical_ratio",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -135,12 +137,11 @@ class RoomShadow(Stage):
             "room_shadow_surface": ArraySpec(cells, wp.int32, -1),
             "room_shadow_shaded": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
             "room_shadow_seen": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
+            "room_shadow_bounced": ArraySpec(cells, wp.vec3),
         }
-        if RUNGS[self.rung].bounce:
-            specs["room_shadow_bounced"] = ArraySpec(cells, wp.vec3)
         parts = room_shadow.count_parts(*cells)
         specs["room_shadow_sums"] = ArraySpec(
-            room_shadow.sums_shape(parts, RUNGS[self.rung].bounce, *cells) if parts > 1 else (0, 0, 0), wp.vec3
+            room_shadow.sums_shape(parts, *cells) if parts > 1 else (0, 0, 0), wp.vec3
         )
         if METALLIC_ROUGHNESS in room_config(self.request).models:
             specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
@@ -150,24 +151,22 @@ class RoomShadow(Stage):
         """Estimates, then their mean."""
         rung = RUNGS[self.rung]
         forms = room_config(self.request)
-        if not rung.bounce:
-            forms = dataclasses.replace(forms, diffuse="none", specular=False)
         near = knows_lamps(self.request)
         parts = 1 if device.is_cpu else room_shadow.count_parts(*arrays["room_shadow_ratio"].shape)
-        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, near, parts)
+        config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, rung.asking, near, parts)
         room_shadow.make_room_shadow_kernel(config)
-        room_shadow.make_filter_ratio_kernel(rung.side, rung.bounce)
+        room_shadow.make_filter_ratio_kernel(rung.side)
         room_shadow.make_spread_ratio_kernel(forms)
         dfg = arrays.get("room_shadow_dfg")
         if dfg is not None:
             integrate_dfg(dfg)
         room = make_room(forms, self.request, arrays, dfg)
-        if rung.bounce:
-            room.environment = arrays["environment"]
-        ratio, surface, filtered = (arrays[f"room_shadow_{name}"] for name in ("ratio", "surface", "filtered"))
-        bounced = arrays.get("room_shadow_bounced")
+        room.environment = arrays["environment"]
+        ratio, bounced, surface, filtered = (
+            arrays[f"room_shadow_{name}"] for name in ("ratio", "bounced", "surface", "filtered")
+        )
         out = arrays["physical_ratio"]
-        frame = arrays["frame"] if rung.bounce else None
+        frame = arrays["frame"] if rung.bounce == "traced" else None
         inputs = [arrays["params"], arrays["rays"], frame, arrays["decode"], arrays["ray_scene"]]
         shadow_rows, stride = arrays["shadow_rows"], cell_size(rung, self.request.size[1])
 
