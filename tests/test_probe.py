@@ -558,7 +558,7 @@ def test_light_directions_of_real_photographs(device, shared, number):
     view.rotation = np.diag([1.0, -1.0, -1.0])
     radiance, confidence, _ = unwrap(view, image, [((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))], height=64)
     lights = wp.zeros(1, dtype=KeyLight)
-    cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec3)
+    cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec4)
     environment.find_key_lights(filled(radiance, confidence), wp.zeros(64, dtype=wp.vec4), cells, lights)
     light = lights.numpy()[0]
     cosine = light["direction"] @ expected / np.linalg.norm(expected)
