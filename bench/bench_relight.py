@@ -93,7 +93,12 @@ def main(device: str) -> None:
     table = wp.zeros((H, W), wp.uint32, device=device)
     summed_area.sum_area(frame, table)
     look_down = np.diag([1.0, -1.0, -1.0])
-    camera = {"camera_position": (0, 0, 0.6), "world_from_camera": look_down, "light_rect": (0, H, 0, W)}
+    camera = {
+        "camera_position": (0, 0, 0.6),
+        "world_from_camera": look_down,
+        "light_rect": (0, H, 0, W),
+        "direct_rect": (0, H, 0, W),
+    }
     params = _records(FrameParams, device, {**camera, "focal": (600, 600)})
     light = {"kind": POINT, "position": (0.1, 0.1, 0.3), "intensity": (0.3,) * 3, "attenuation": (0, 0, 1)}
     lights = _records(Light, device, light)

@@ -70,7 +70,7 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, intersect_sphere, make_trace, surface_key
+from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, inside_rect, intersect_sphere, make_trace, surface_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -277,6 +277,27 @@ def look_up_cells(
     return wp.vec4(mean[0], mean[1], mean[2], 1.0)
 
 
+@wp.func
+def is_bounced_to(
+    values: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    size: wp.vec2i,
+    row: wp.int32,
+    col: wp.int32,
+) -> wp.bool:
+    """Whether any cell that ``look_up_cells`` may read for a pixel receives light."""
+    i0 = wp.int32(cell_place(row, stride, size[0]))
+    j0 = wp.int32(cell_place(col, stride, size[1]))
+    for a in range(2):
+        for b in range(2):
+            i = wp.min(i0 + a, values.shape[0] - 1)
+            j = wp.min(j0 + b, values.shape[1] - 1)
+            if surface[i, j] >= 0 and wp.max(values[i, j]) > 0.0:
+                return True
+    return False
+
+
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
     """``find_matter(scene, desk, hit, row, col, mirror) -> Matter``; arguments as those of ``lit_by``."""
@@ -425,6 +446,12 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         rect = params[0].light_rect
         if i < rect[0] or i >= rect[1] or j < rect[2] or j >= rect[3]:
             return
+        if wp.static(config.bounced):
+            if not inside_rect(i, j, params[0].direct_rect):
+                cells = desk.cells
+                size = wp.vec2i(rays.shape[0], rays.shape[1])
+                if not is_bounced_to(cells.bounced, cells.bounced_surface, cells.bounced_stride, size, i, j):
+                    return
         ray = rays[i, j]
         direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
         hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
@@ -490,7 +517,7 @@ def relight(
 
     Args:
         config: Rung and kinds of shape.
-        params: (1,) FrameParams.
+        params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
         rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         frame: (H, W) vec3ub, the camera's frame, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.

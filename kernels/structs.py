@@ -44,6 +44,7 @@ class FrameParams:
     environment_reset: wp.int32  # 1: forget the accumulated environment
     object_rect: wp.vec4i  # row_start, row_stop, col_start, col_stop: where virtual objects can be on screen
     light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
+    direct_rect: wp.vec4i  # the part of light_rect that light reaches without a bounce
     shadow_rect: wp.vec4i  # the same for what virtual objects do to the room's light on the physical
     ball_rect: wp.vec4i  # the same for mirror balls
 

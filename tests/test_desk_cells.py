@@ -86,6 +86,7 @@ class View:
                 "world_from_camera": turn,
                 "focal": (FOCAL, FOCAL),
                 "light_rect": rect or (0, size[0], 0, size[1]),
+                "direct_rect": rect or (0, size[0], 0, size[1]),
             },
         )
         self.rays = wp.array(pixel_rays(size), dtype=wp.vec2)
@@ -742,7 +743,7 @@ def test_nothing_of_an_earlier_frame_is_read(device, rung, rect):
     """Cells and patches outside the rows that a frame's light reaches may hold anything."""
     with Rig(device, "relight", rung) as rig:
         rig.frame(frames(SIZE[1], SIZE[0])["noise"])
-        rig.set_params(light_rect=rect)
+        rig.set_params(light_rect=rect, direct_rect=rect)
         rig.pipeline._light_rows = rect[:2]
         found = []
         for old in (-1, 0):

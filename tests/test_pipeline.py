@@ -13,6 +13,7 @@ import warp as wp
 from warp_ar.errors import UsageError
 from warp_ar.pipeline import Pipeline, Result, resample_light
 from warp_ar.quality import PRESETS
+from warp_ar.ray_scene import HostScene
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -429,3 +430,25 @@ def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: s
             before = pipeline(frames[0], time_seconds=index / 30).image
         assert pipeline.update(dataclasses.replace(scene, objects=(painted, torus)))
         assert (pipeline(frames[0], time_seconds=2.0).image != before).any()
+
+
+def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, frames, monkeypatch):
+    """Looking at every pixel that bounced light might reach gives the picture of looking where it does."""
+    quality = PRESETS["medium"].with_rungs(relight="bounce")
+    spot = Light(
+        "spot", at=(0.0, 0.05, 0.2), target=(0.0, 0.05, 0.0), inner_angle=10.0, outer_angle=12.0, intensity=0.2
+    )
+    scene = make_scene(lights=(spot,))
+    pictures, looked = [], []
+    rect = HostScene.light_rect
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(
+                HostScene, "light_rect", lambda self, *pose, bounced=False: rect(self, *pose, bounced=True)
+            )
+        with Pipeline(scene, device=device, quality=quality) as pipeline:
+            pictures.append([pipeline(frame).image.copy() for frame in frames[:2]])
+            params = pipeline._block.host("params")
+            looked.append((params["direct_rect"].tolist(), params["light_rect"].tolist()))
+    assert looked[0][0] != looked[0][1] == looked[1][0] == looked[1][1]
+    np.testing.assert_array_equal(pictures[0], pictures[1])

@@ -546,7 +546,9 @@ class Pipeline:
         if pose is not None:
             params["object_rect"] = self._host_scene.object_rect(pose, self.camera)
             bounced = "relight_bounced" in self._arrays
-            params["light_rect"] = self._host_scene.light_rect(pose, self.camera, bounced=bounced)
+            params["direct_rect"] = params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
+            if bounced:
+                params["light_rect"] = self._host_scene.light_rect(pose, self.camera, bounced=True)
             self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
             self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
             if "mirrored" in self._arrays:

@@ -67,7 +67,7 @@ def set_lights(rig, **fields):
     for field, value in fields.items():
         records[field] = value
     rig.arrays["light_array"].assign(records)
-    rig.set_params(light_rect=WHOLE, object_rect=WHOLE, ball_rect=WHOLE)
+    rig.set_params(light_rect=WHOLE, direct_rect=WHOLE, object_rect=WHOLE, ball_rect=WHOLE)
 
 
 def run_until(rig, stage):

@@ -33,7 +33,7 @@ class Grain:
     """The same, of what sends it."""
 
 
-GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(256, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
+GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
 """Rungs that know the room's own shadows on the desk and one bounce of virtual light; else they are ``reflectance``."""
 STRIDE_ROWS = 480
 
