@@ -63,8 +63,18 @@ from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_fram
 from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
-from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
-from warp_ar.kernels.visibility import FAR, Hit, inside_rect, intersect_sphere, make_trace, offset_origin
+from warp_ar.kernels.structs import BOX, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
+from warp_ar.kernels.visibility import (
+    FACES,
+    FAR,
+    MESH_KEY,
+    Hit,
+    inside_rect,
+    intersect_sphere,
+    make_trace,
+    offset_origin,
+    surface_key,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -108,8 +118,6 @@ MAX_RETURN = wp.constant(wp.float32(0.99))
 """Largest share of its light that the desk gets back from objects, estimated: what goes to and fro stays finite."""
 FURTHER = wp.constant(wp.float32(0.5))
 """Light of an object close above the desk, over that in the open: half of what it sees is its own shadow."""
-MESH_KEY = wp.constant(7)
-"""``surface_key`` modulo 8 of a mesh."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
 """Relative change of depth from which neighbours on a mesh belong to different parts of it."""
 
@@ -364,21 +372,6 @@ def make_bounced(config: RoomConfig) -> wp.Function:
     return bounced
 
 
-@wp.func
-def surface_key(scene: RayScene, hit: Hit) -> wp.int32:
-    """Number that neighbours on one surface share: the proxy, and the face of a box."""
-    shape = scene.proxies[hit.shape]
-    key = 8 * hit.shape
-    if shape.kind == MESH:
-        key += MESH_KEY
-    if shape.kind == BOX:
-        local = wp.transpose(shape.rotation) * hit.geometric_normal
-        for axis in range(3):
-            if wp.abs(local[axis]) > 0.7:
-                key += 2 * axis + wp.where(local[axis] > 0.0, 1, 0)
-    return key
-
-
 @functools.cache
 def make_seen_proxy(config: RoomConfig) -> wp.Function:
     """``seen_proxy(params, ray, scene, probes) -> Hit``: the surface of the desk that a pixel shows, or shape -1."""
@@ -490,7 +483,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
         if hit.shape < 0:
             return
-        surface_out[i, j] = surface_key(scene, hit)
+        surface_out[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
         ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
         bounced_out[i, j] = wp.vec3(0.0)
         if wp.static(config.parts > 1):
@@ -742,7 +735,7 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
                     if surface[ni, nj] == key:
                         value = ratio[ni, nj]
                         # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
-                        if key % 8 != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
+                        if key % FACES != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
                             value[3] = 1.0
                             far_left += wp.static(wide_weights[a] * wide_weights[b]) * value
                             if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
@@ -820,7 +813,7 @@ def make_spread_ratio_kernel(config: RoomConfig) -> wp.Kernel:
                     hit = seen_proxy(params[0], rays[i, j], scene, probes)
                     key = wp.int32(-1)
                     if hit.shape >= 0:
-                        key = surface_key(scene, hit)
+                        key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
                 if key >= 0:
                     total = wp.vec3(0.0)
                     weights = float(0.0)
