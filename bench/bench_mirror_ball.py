@@ -7,6 +7,7 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import color, mirror_ball
+from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.relight import RelightConfig, make_desk
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
@@ -69,7 +70,9 @@ def main(device: str) -> None:
     ratio = wp.full((H, W), wp.vec3(SHADOW, SHADOW, SHADOW), dtype=wp.vec3, device=device)
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479
-    room = wp.array(sh, dtype=wp.vec3, device=device)
+    irradiance = wp.array(sh, dtype=wp.vec3, device=device)
+    room = Room()
+    room.irradiance_sh = irradiance
     out = wp.zeros((H, W), wp.vec3, device=device)
     # A pixel on the left, away from the sphere, whose ray goes down to the desk outside the ball's shadow.
     pixel = H // 2, W // 2 - round(0.9 * radius * FOCAL / 0.56)
@@ -80,21 +83,22 @@ def main(device: str) -> None:
         contenders = {}
         for rung, samples in SAMPLES.items():
             trace = TraceConfig((SPHERE,), (PLANE,))
+            forms = RoomConfig(trace, (LAMBERT,), False, "sh", False, True)
             relighting = RelightConfig("reflectance", trace, "sh", True)
             config = mirror_ball.MirrorBallConfig(
                 trace,
                 samples,
-                ShadeConfig(trace, (LAMBERT,), (DIRECTIONAL,), False, "sh", False, 1) if objects else None,
+                ShadeConfig(forms, (DIRECTIONAL,), 1) if objects else None,
                 relighting if lit else None,
                 shaded,
             )
             probes = _records(Probe, device, {"center": center, "radius": radius, "reflectance": (RHO,) * 3})
             keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "dominance": 0.5})
             decode = wp.array(decode_table, dtype=wp.vec3, device=device)
-            desk = make_desk(relighting, frame, decode, None, probes, keys, room)
+            desk = make_desk(relighting, frame, decode, None, probes, keys, irradiance)
 
             def call(config: mirror_ball.MirrorBallConfig = config, desk: object = desk) -> None:
-                inputs = (params, rays, scene, lights, room, None, None, 8, None, desk, ratio)
+                inputs = (params, rays, scene, lights, room, desk, ratio)
                 mirror_ball.mirror_ball(config, *inputs, out)
 
             call()

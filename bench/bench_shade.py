@@ -12,6 +12,7 @@ from bench.bench_visibility import Frame, H, W
 from bench.common import measure, report
 from warp_ar.kernels import structs
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
+from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
 
 LEVEL_HEIGHT = 64
@@ -41,10 +42,12 @@ CASES = (
 def main(device: str) -> None:
     sh = np.zeros((9, 3), np.float32)
     sh[0] = math.pi / 0.28209479
-    sh = wp.array(sh, dtype=wp.vec3, device=device)
-    levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0), dtype=wp.vec3, device=device)
     dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
     integrate_dfg(dfg)
+    room = Room()
+    room.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
+    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    room.level_height, room.dfg = LEVEL_HEIGHT, dfg
     for case in CASES:
         frame = Frame(case.shape, case.share, device)
         material = np.zeros(1, np.dtype(structs.Material.numpy_dtype()))
@@ -60,18 +63,18 @@ def main(device: str) -> None:
         light["kind"], light["direction"], light["attenuation"] = structs.SPOT, (0, 0.6, 0.8), (0, 0, 1)
         light["position"], light["inner_angle"], light["outer_angle"] = (0, -0.6, 0.2), 0.4, 0.6
         glossy = case.model != structs.LAMBERT
-        config = ShadeConfig(
+        forms = RoomConfig(
             trace=frame.config,
             models=(case.model,),
-            lights=case.lights,
             textures=False,
-            room_diffuse="none" if glossy else "sh",
-            room_specular=glossy,
-            edge_samples=case.edge_samples,
+            diffuse="none" if glossy else "sh",
+            specular=glossy,
+            probes=False,
         )
+        config = ShadeConfig(forms, case.lights, case.edge_samples)
         light_array = wp.array(light, dtype=structs.Light, device=device)
         virtual = wp.zeros((H, W), dtype=wp.vec4, device=device)
-        inputs = (frame.params, frame.rays, frame.scene, light_array, sh, None, levels, LEVEL_HEIGHT, dfg)
+        inputs = (frame.params, frame.rays, frame.scene, light_array, room)
 
         def call(config=config, inputs=inputs, frame=frame, virtual=virtual):
             shade(config, *inputs, frame.found, frame.hits, virtual, rows=frame.launch_rows)

@@ -23,9 +23,9 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import reflect
-from warp_ar.kernels.reflect import look_up_layer, make_find_in_frame
+from warp_ar.kernels.reflect import Room, look_up_layer, make_find_in_frame
 from warp_ar.kernels.relight import Desk, RelightConfig, make_lit_by
-from warp_ar.kernels.shade import ShadeConfig, make_shade_hit
+from warp_ar.kernels.shade import Nearby, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.visibility import (
@@ -99,11 +99,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        levels: wp.array[wp.vec3],
-        level_height: wp.int32,
-        dfg: wp.array2d[wp.vec2],
+        room: Room,
         desk: Desk,
         physical_ratio: wp.array2d[wp.vec3],
         # Out:
@@ -154,21 +150,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
             if wp.static(config.shade is not None):
                 if thing.shape >= 0:
-                    radiance = shade_hit(
-                        scene,
-                        lights,
-                        irradiance_sh,
-                        irradiance_map,
-                        levels,
-                        level_height,
-                        dfg,
-                        thing,
-                        outward,
-                        False,
-                        wp.vec3(),
-                        wp.vec4(),
-                        tile_turn(i, j),
-                    )
+                    radiance = shade_hit(scene, lights, room, thing, outward, Nearby(), tile_turn(i, j))
                     change += wp.cw_mul(rho, radiance) - seen
                     continue
             if surface.shape < 0 or wp.dot(surface.geometric_normal, outward) >= 0.0:
@@ -199,11 +181,7 @@ def mirror_ball(
     rays: wp.array,
     scene: RayScene,
     lights: wp.array | None,
-    irradiance_sh: wp.array | None,
-    irradiance_map: wp.array | None,
-    levels: wp.array | None,
-    level_height: int,
-    dfg: wp.array | None,
+    room: Room,
     desk: Desk,
     physical_ratio: wp.array | None,
     mirrored_out: wp.array,
@@ -218,11 +196,7 @@ def mirror_ball(
         rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         scene: Objects and proxies.
         lights: (n,) Light.
-        irradiance_sh: Nine coefficients of the room's irradiance, as ``shade`` reads them.
-        irradiance_map: The room's irradiance as a latlong map, likewise.
-        levels: The room's prefiltered light, likewise.
-        level_height: Rows of its level 0.
-        dfg: Table of ``integrate_dfg``.
+        room: The room's light, as ``shade`` reads it; empty if ``config.shade`` is None.
         desk: From ``make_desk``; frame, decode table and probes are always needed.
         physical_ratio: (H, W) vec3 of ``room_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
@@ -231,19 +205,7 @@ def mirror_ball(
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [
-            params,
-            rays,
-            scene,
-            lights,
-            irradiance_sh,
-            irradiance_map,
-            levels,
-            level_height,
-            dfg,
-            desk,
-            physical_ratio,
-        ],
+        [params, rays, scene, lights, room, desk, physical_ratio],
         [mirrored_out],
         rows=rows,
         device=rays.device,

@@ -29,6 +29,8 @@ wp.set_module_options({"enable_backward": False})
 HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
 """Share of the camera's distance within which a proxy is the point itself and does not hide it."""
 
+RoomDiffuse = Literal["none", "sh", "map"]
+
 
 @dataclasses.dataclass(frozen=True)
 class RoomConfig:
@@ -40,8 +42,8 @@ class RoomConfig:
     """Sorted material models of the objects."""
     textures: bool
     """Whether any material has a texture."""
-    diffuse: Literal["none", "sh", "map"]
-    """Where the room's irradiance comes from."""
+    diffuse: RoomDiffuse
+    """Where the room's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
     specular: bool
     """Whether the prefiltered environment is read."""
     probes: bool
@@ -50,14 +52,14 @@ class RoomConfig:
 
 @wp.struct
 class Room:
-    """The room's light in all its forms; what a ``RoomConfig`` leaves out may be empty."""
+    """The room's light in all its forms; what a ``RoomConfig`` leaves out, or a kernel does not read, may be empty."""
 
     environment: wp.array2d[wp.vec3]
-    irradiance_sh: wp.array[wp.vec3]
-    irradiance_map: wp.array2d[wp.vec3]
-    levels: wp.array[wp.vec3]
-    level_height: wp.int32
-    dfg: wp.array2d[wp.vec2]
+    irradiance_sh: wp.array[wp.vec3]  # nine coefficients
+    irradiance_map: wp.array2d[wp.vec3]  # latlong
+    levels: wp.array[wp.vec3]  # prefiltered, as ``sample_levels`` reads them
+    level_height: wp.int32  # rows of level 0
+    dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Literal
 
 import warp as wp
 
@@ -26,11 +25,10 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
-from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
-from warp_ar.kernels.reflect import nearest_of_object
+from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, nearest_of_object
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
-from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import Hit, TraceConfig, inside_rect, make_primary
+from warp_ar.kernels.structs import FrameParams, Light, RayScene
+from warp_ar.kernels.visibility import Hit, inside_rect, make_primary
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,25 +42,15 @@ MIN_FACING = wp.constant(wp.float32(1.0e-3))
 EDGE_THREADS = 1 << 16
 """Threads that share the samples of all edges."""
 
-RoomDiffuse = Literal["none", "sh", "map"]
-
 
 @dataclasses.dataclass(frozen=True)
 class ShadeConfig:
     """What a scene calls for; everything else is not compiled in."""
 
-    trace: TraceConfig
-    """Kinds of shape."""
-    models: tuple[int, ...]
-    """Sorted material models that exist."""
+    room: RoomConfig
+    """Kinds of shape, of material and of the room's light."""
     lights: tuple[int, ...]
     """Sorted kinds of virtual light that exist."""
-    textures: bool
-    """Whether any material has a texture."""
-    room_diffuse: RoomDiffuse
-    """Where the room's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
-    room_specular: bool
-    """Whether the prefiltered environment is read."""
     edge_samples: int
     """Samples per pixel along edges: a square number; 1 leaves edges hard."""
     soft: bool = False
@@ -71,33 +59,37 @@ class ShadeConfig:
     """Whether ``object_light`` says what surrounds the objects at close range."""
 
 
+@wp.struct
+class Nearby:
+    """What surrounds a point of an object at close range, of ``object_light``."""
+
+    known: wp.bool  # False: the distant room is all that the point receives
+    irradiance: wp.vec3
+    mirrored: wp.vec4  # premultiplied radiance of what is near, and its share of the lobe
+
+
 @functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
-    Where ``surrounded``, ``near_irradiance`` and ``near_mirrored`` of ``object_light`` are what the object receives;
     ``turn`` is for ``visible_share``.
     """
-    surface_at = make_surface(config.models, config.textures)
-    reflect_direct = make_reflect_direct(config.models)
+    forms = config.room
+    surface_at = make_surface(forms.models, forms.textures)
+    glossy = make_mirrored(forms)
+    reflect_direct = make_reflect_direct(forms.models)
     sample_light = make_sample_light(config.lights)
-    is_lit = make_shadow(config.trace)
-    visible_share = make_visible_share(config.trace) if config.soft else None
+    is_lit = make_shadow(forms.trace)
+    visible_share = make_visible_share(forms.trace) if config.soft else None
 
     @wp.func(module="unique")
     def shade_hit(
         scene: RayScene,
         lights: wp.array[Light],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        levels: wp.array[wp.vec3],
-        level_height: wp.int32,
-        dfg: wp.array2d[wp.vec2],
+        room: Room,
         hit: Hit,
         direction: wp.vec3,
-        surrounded: wp.bool,
-        near_irradiance: wp.vec3,
-        near_mirrored: wp.vec4,
+        near: Nearby,
         turn: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
@@ -110,33 +102,27 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if facing < MIN_FACING:
             normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
         cos_o = wp.dot(normal, wo)
-        surface = surface_at(scene, dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
 
         radiance = wp.vec3(0.0)
-        if wp.static(config.room_diffuse != "none"):
+        if wp.static(forms.diffuse != "none"):
             irradiance = wp.vec3(0.0)
-            if wp.static(config.room_diffuse == "sh"):
-                irradiance = sh_irradiance(irradiance_sh, normal)
-            if wp.static(config.room_diffuse == "map"):
-                irradiance = sample_latlong(irradiance_map, normal)
+            if wp.static(forms.diffuse == "sh"):
+                irradiance = sh_irradiance(room.irradiance_sh, normal)
+            if wp.static(forms.diffuse == "map"):
+                irradiance = sample_latlong(room.irradiance_map, normal)
             if wp.static(config.near):
-                if surrounded:
-                    irradiance = near_irradiance
+                if near.known:
+                    irradiance = near.irradiance
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
-        if wp.static(config.room_specular):
+        if wp.static(forms.specular):
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
-                level = level_from_roughness(surface.roughness, level_height)
-                if wp.static(PHONG in config.models):
-                    if surface.model == PHONG:
-                        level = level_from_shininess(surface.shininess, level_height)
-                if wp.static(MIRROR in config.models):
-                    if surface.model == MIRROR:
-                        level = 0.0
-                mirrored = sample_levels(levels, reflect(wo, normal), level, level_height)
+                outward = reflect(wo, normal)
+                mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, outward, 0.0)
                 if wp.static(config.near):
-                    if surrounded:
-                        close = wp.vec3(near_mirrored[0], near_mirrored[1], near_mirrored[2])
-                        mirrored = (1.0 - near_mirrored[3]) * mirrored + close
+                    if near.known:
+                        close = wp.vec3(near.mirrored[0], near.mirrored[1], near.mirrored[2])
+                        mirrored = (1.0 - near.mirrored[3]) * mirrored + close
                 radiance += wp.cw_mul(surface.reflectance, mirrored)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
@@ -183,7 +169,7 @@ def differs(
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
     """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
     shade_hit = make_shade_hit(config)
-    closest_visible = make_primary(config.trace)
+    closest_visible = make_primary(config.room.trace)
     side = math.isqrt(config.edge_samples)
 
     @wp.func(module="unique")
@@ -192,11 +178,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        levels: wp.array[wp.vec3],
-        level_height: wp.int32,
-        dfg: wp.array2d[wp.vec2],
+        room: Room,
         hit_object: wp.array2d[wp.int32],
         near_irradiance: wp.array2d[wp.vec3],
         near_mirrored: wp.array2d[wp.vec4],
@@ -222,32 +204,16 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
                 hit = closest_visible(scene, params[0].camera_position, direction)
         if hit.shape < 0:
             return wp.vec4(0.0)
-        surrounded = bool(False)
-        irradiance = wp.vec3()
-        mirrored = wp.vec4()
+        near = Nearby()
         if wp.static(config.near):
             pixel = nearest_of_object(hit_object, i, j, hit.shape)
-            surrounded = pixel[0] >= 0
-            if surrounded:
-                if wp.static(config.room_diffuse != "none"):
-                    irradiance = near_irradiance[pixel[0], pixel[1]]
-                if wp.static(config.room_specular):
-                    mirrored = near_mirrored[pixel[0], pixel[1]]
-        radiance = shade_hit(
-            scene,
-            lights,
-            irradiance_sh,
-            irradiance_map,
-            levels,
-            level_height,
-            dfg,
-            hit,
-            direction,
-            surrounded,
-            irradiance,
-            mirrored,
-            tile_turn(i, j),
-        )
+            near.known = pixel[0] >= 0
+            if near.known:
+                if wp.static(config.room.diffuse != "none"):
+                    near.irradiance = near_irradiance[pixel[0], pixel[1]]
+                if wp.static(config.room.specular):
+                    near.mirrored = near_mirrored[pixel[0], pixel[1]]
+        radiance = shade_hit(scene, lights, room, hit, direction, near, tile_turn(i, j))
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 
     return shade_sample
@@ -269,11 +235,7 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        levels: wp.array[wp.vec3],
-        level_height: wp.int32,
-        dfg: wp.array2d[wp.vec2],
+        room: Room,
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
@@ -312,11 +274,7 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
                     rays,
                     scene,
                     lights,
-                    irradiance_sh,
-                    irradiance_map,
-                    levels,
-                    level_height,
-                    dfg,
+                    room,
                     hit_object,
                     near_irradiance,
                     near_mirrored,
@@ -346,11 +304,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        irradiance_sh: wp.array[wp.vec3],
-        irradiance_map: wp.array2d[wp.vec3],
-        levels: wp.array[wp.vec3],
-        level_height: wp.int32,
-        dfg: wp.array2d[wp.vec2],
+        room: Room,
         hit_object: wp.array2d[wp.int32],
         near_irradiance: wp.array2d[wp.vec3],
         near_mirrored: wp.array2d[wp.vec4],
@@ -368,11 +322,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
                 rays,
                 scene,
                 lights,
-                irradiance_sh,
-                irradiance_map,
-                levels,
-                level_height,
-                dfg,
+                room,
                 hit_object,
                 near_irradiance,
                 near_mirrored,
@@ -427,11 +377,7 @@ def shade(
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
     lights: wp.array[Light] | None,
-    irradiance_sh: wp.array[wp.vec3] | None,
-    irradiance_map: wp.array2d[wp.vec3] | None,
-    levels: wp.array[wp.vec3] | None,
-    level_height: int,
-    dfg: wp.array2d[wp.vec2] | None,
+    room: Room,
     hit_object: wp.array2d[wp.int32],
     hits: wp.array2d[Hit],
     virtual_out: wp.array2d[wp.vec4],
@@ -452,11 +398,7 @@ def shade(
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
         scene: What rays meet, and what it is made of.
         lights: Virtual lights.
-        irradiance_sh: Nine coefficients of the room's irradiance.
-        irradiance_map: The room's irradiance as a latlong map.
-        levels: The room's prefiltered light, as ``sample_levels`` reads it.
-        level_height: Rows of its level 0.
-        dfg: Table of ``integrate_dfg``, for metallic-roughness.
+        room: The room's light; neither its environment nor its probes are read.
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
@@ -465,7 +407,7 @@ def shade(
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    inputs = [params, rays, scene, lights, irradiance_sh, irradiance_map, levels, level_height, dfg, hit_object]
+    inputs = [params, rays, scene, lights, room, hit_object]
     near = [near_irradiance, near_mirrored]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:

@@ -19,6 +19,7 @@ from tests.test_composite import tables
 from tests.test_relight import constant_room, records
 from warp_ar.graph import make_plan
 from warp_ar.kernels import color, mirror_ball
+from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.relight import RUNGS as RELIGHT_RUNGS
 from warp_ar.kernels.relight import RelightConfig, make_desk
 from warp_ar.kernels.shade import ShadeConfig
@@ -127,9 +128,9 @@ def run(
     trace = TraceConfig(kinds(objects), kinds(proxies))
     models = tuple(sorted({one["model"] for one in materials}))
     if config is None:
-        shading = ShadeConfig(
-            trace, models, kinds(lights), False, "none" if irradiance is None else "sh", irradiance is not None, 1
-        )
+        lit = irradiance is not None
+        forms = RoomConfig(trace, models, False, "sh" if lit else "none", lit, True)
+        shading = ShadeConfig(forms, kinds(lights), 1)
         relighting = RelightConfig(rung, trace, "sh", True) if lights and proxies else None
         config = mirror_ball.MirrorBallConfig(
             trace, samples, shading if objects else None, relighting, ratio is not None
@@ -158,18 +159,19 @@ def run(
         wp.array(constant_room(ROOM), dtype=wp.vec3),
     )
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    room = np.ones(3) if irradiance is None else irradiance
+    light = np.ones(3) if irradiance is None else irradiance
+    room = Room()
+    room.irradiance_sh = wp.array(constant_room(light), dtype=wp.vec3)
+    room.levels = wp.full(4096, wp.vec3(*map(float, light)), dtype=wp.vec3)
+    room.level_height = 8
+    room.dfg = wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2)
     mirror_ball.mirror_ball(
         config,
         params,
         wp.array(rays, dtype=wp.vec2),
         scene,
         records(Light, *lights),
-        wp.array(constant_room(room), dtype=wp.vec3),
-        None,
-        wp.full(4096, wp.vec3(*map(float, room)), dtype=wp.vec3),
-        8,
-        wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2),
+        room,
         desk,
         None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
         out,
@@ -533,7 +535,7 @@ def test_specialised_is_the_general_kernel(device):
     """A kernel that knows every shape, material and light gives the same picture as one made for the scene."""
     trace = TraceConfig((BOX, MESH, SPHERE), (PLANE, BOX, MESH))
     models = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
-    shading = ShadeConfig(trace, models, (POINT, SPOT, DIRECTIONAL), True, "sh", True, 1)
+    shading = ShadeConfig(RoomConfig(trace, models, True, "sh", True, True), (POINT, SPOT, DIRECTIONAL), 1)
     relighting = RelightConfig("reflectance", trace, "sh", True)
     general = mirror_ball.MirrorBallConfig(trace, 4, shading, relighting, True)
     scene = {**BUSY, "irradiance": ROOM, "rung": "reflectance", "samples": 4}

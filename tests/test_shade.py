@@ -14,6 +14,7 @@ from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
+from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.shade import EdgeLists, ShadeConfig, shade
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
@@ -22,14 +23,19 @@ SIZE = (48, 64)
 FOCAL = 60.0
 LEVEL_HEIGHT = 16
 EVERYTHING = ShadeConfig(
-    trace=GENERAL,
-    models=(LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR),
+    room=RoomConfig(
+        trace=GENERAL,
+        models=(LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR),
+        textures=True,
+        diffuse="sh",
+        specular=True,
+        probes=False,
+    ),
     lights=(structs.POINT, structs.SPOT, structs.DIRECTIONAL),
-    textures=True,
-    room_diffuse="sh",
-    room_specular=True,
     edge_samples=4,
 )
+DARK = dataclasses.replace(EVERYTHING.room, diffuse="none", specular=False)
+"""A room without light."""
 
 # Nine coefficients and the packed levels each hold a constant to a few roundings.
 FURNACE_TOLERANCE = 1e-5
@@ -38,12 +44,20 @@ TWIN_TOLERANCE = 2e-5
 TWIN_OUTLIERS = 4e-3
 
 
-def room(device, radiance=1.0):
-    """Irradiance coefficients and levels of a constant room."""
+def make_room(models, device, radiance=1.0):
+    """A constant room for the given material models."""
+    room = Room()
     sh = np.zeros((9, 3), np.float32)
     sh[0] = math.pi * radiance / 0.28209479
+    room.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
     levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), radiance, np.float32)
-    return wp.array(sh, dtype=wp.vec3, device=device), wp.array(levels, dtype=wp.vec3, device=device)
+    room.levels = wp.array(levels, dtype=wp.vec3, device=device)
+    room.level_height = LEVEL_HEIGHT
+    if METALLIC_ROUGHNESS in models:
+        table = wp.zeros((32, 32), dtype=wp.vec2, device=device)
+        integrate_dfg(table)
+        room.dfg = table
+    return room
 
 
 def materials(*fields, device):
@@ -95,19 +109,16 @@ def render(
     depth = wp.zeros(SIZE, dtype=wp.float32, device=device)
     hits = wp.zeros(SIZE, dtype=Hit, device=device)
     virtual = wp.full(SIZE, wp.vec4(9.0), dtype=wp.vec4, device=device)
-    sh, levels = room(device, light_room)
-    dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
-    if METALLIC_ROUGHNESS in config.models:
-        integrate_dfg(dfg)
+    room = make_room(config.room.models, device, light_room)
     light_array = lights(device=device) if light_array is None else light_array
-    trace_pixels(config.trace, params, rays, scene, found, depth, hits)
+    trace_pixels(config.room.trace, params, rays, scene, found, depth, hits)
     lists = None
     if listed:
         samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
         count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
         lists = EdgeLists(count, edges, samples)
     for rows in bands:
-        inputs = (params, rays, scene, light_array, sh, None, levels, LEVEL_HEIGHT, dfg, found, hits)
+        inputs = (params, rays, scene, light_array, room, found, hits)
         shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 
@@ -147,7 +158,7 @@ def test_lambert_under_a_point_light(device):
     """A white box that faces the light at distance d has radiance I / (pi d^2)."""
     world = World(device).add("box", extent=(5, 5, 0.5), at=(0, 0, 3.5))
     scene = scene_of(world, {"model": LAMBERT, "base_color": 1.0}, device=device)
-    config = dataclasses.replace(EVERYTHING, room_diffuse="none", room_specular=False)
+    config = dataclasses.replace(EVERYTHING, room=DARK)
     light = {"kind": structs.POINT, "position": (1 / FOCAL * 1.5, 1 / FOCAL * 1.5, 1.0), "intensity": (1, 2, 3)}
     image = render(scene, config, device, light_array=lights(light, device=device))
     np.testing.assert_allclose(image[24, 32, :3], np.array([1, 2, 3]) / (math.pi * 4), rtol=1e-4)
@@ -198,9 +209,7 @@ def test_matches_reference(device):
     world.add("box", extent=(3, 3, 0.1), at=(0, 0, 3.2), rotate=(20, 10, 0))
     base = np.array([[0.8, 0.2, 0.1], [0.1, 0.7, 0.2], [0.5, 0.5, 0.5]])
     scene = scene_of(world, *({"model": LAMBERT, "base_color": color} for color in base), device=device)
-    config = dataclasses.replace(
-        EVERYTHING, room_diffuse="none", room_specular=False, models=(LAMBERT,), textures=False
-    )
+    config = dataclasses.replace(EVERYTHING, room=dataclasses.replace(DARK, models=(LAMBERT,), textures=False))
     position, intensity = np.array([-1.2, -0.9, 0.6]), np.array([3.0, 2.0, 1.0])
     light = lights({"kind": structs.POINT, "position": position, "intensity": intensity}, device=device)
     image = render(scene, config, device, light_array=light)
@@ -254,15 +263,15 @@ def test_specialised_equals_general(device, kind):
     spot = {"kind": structs.SPOT, "position": (0, -2, 0), "direction": (0, 0.7, 0.7), "intensity": 4.0}
     spot.update(inner_angle=0.3, outer_angle=0.6)
     light = lights(spot, device=device)
-    special = ShadeConfig(
+    forms = RoomConfig(
         trace=TraceConfig((structs.SPHERE,), ()),
         models=(fields["model"],),
-        lights=(structs.SPOT,),
         textures=False,
-        room_diffuse="none" if kind in ("metal", "mirror") else "sh",
-        room_specular=kind != "lambert",
-        edge_samples=4,
+        diffuse="none" if kind in ("metal", "mirror") else "sh",
+        specular=kind != "lambert",
+        probes=False,
     )
+    special = ShadeConfig(forms, lights=(structs.SPOT,), edge_samples=4)
     general = render(scene, EVERYTHING, device, light_array=light, light_room=0.5)
     image = render(scene, special, device, light_array=light, light_room=0.5)
     # The compiler may fuse other products in another kernel.

@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import mirror_ball
-from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.reflect import Room
 from warp_ar.kernels.relight import RelightConfig, make_desk
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names, mirrors_virtual
+from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
 from warp_ar.stages.relight import Relight, irradiance_name, relight_config
-from warp_ar.stages.shade import DFG_SIZE, room_light_names, shade_config
+from warp_ar.stages.shade import shade_config
 from warp_ar.stages.visibility import GrowingRows
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
@@ -63,7 +63,7 @@ class MirrorBall(Stage):
         reads = {"pose", "frame"}
         if "virtual" in layers:
             config = shade_config(request)
-            reads |= {"objects", *room_light_names(config)}
+            reads |= {"objects", *room_reads(config.room)}
             reads |= {"lights"} if config.lights else set()
         if "physical_added" in layers:
             # The ball shows the desk too small for a pixel's surroundings to mean anything.
@@ -77,21 +77,18 @@ class MirrorBall(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""
         width, height = self.request.size
-        specs = {"mirrored": ArraySpec((height, width), wp.vec3)}
-        if METALLIC_ROUGHNESS in shade_config(self.request).models:
-            specs["mirror_ball_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
-        return specs
+        return {
+            "mirrored": ArraySpec((height, width), wp.vec3),
+            **room_arrays(room_config(self.request), self.name),
+        }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows in which a ball can be."""
         config = mirror_config(self.request)
         mirror_ball.make_mirror_ball_kernel(config)
-        dfg = arrays.get("mirror_ball_dfg")
-        if dfg is not None:
-            integrate_dfg(dfg)
         reads = self.wiring.reads
         relighting = mirrored_relighting(self.request)
-        room = irradiance_name(self.request)
+        irradiance = irradiance_name(self.request)
         lit = config.relight is not None
         desk = make_desk(
             relighting,
@@ -100,21 +97,17 @@ class MirrorBall(Stage):
             None,
             arrays["probes"],
             arrays["key_lights"] if "key_lights" in reads else None,
-            arrays[room] if lit and room in reads else None,
+            arrays[irradiance] if lit and irradiance in reads else None,
             arrays["lamps"] if "lamps" in reads else None,
         )
         shading = config.shade
-        diffuse = "none" if shading is None else shading.room_diffuse
+        room = Room() if shading is None else make_room(shading.room, self.request, arrays, self.name)
         inputs = (
             arrays["params"],
             arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if "lights" in reads else None,
-            arrays["irradiance_sh"] if diffuse == "sh" else None,
-            arrays["irradiance_map"] if diffuse == "map" else None,
-            arrays["specular_levels"] if shading is not None and shading.room_specular else None,
-            self.request.quality.environment_height,
-            dfg,
+            room,
             desk,
             arrays["physical_ratio"] if config.ratio else None,
         )

@@ -8,12 +8,10 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import object_light
-from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names
-from warp_ar.stages.room_shadow import make_room, room_config, room_reads
-from warp_ar.stages.shade import DFG_SIZE, near_names, sees_near, shade_config
+from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
+from warp_ar.stages.shade import near_names, sees_near
 
 SIDE = 4
 """Pixels along a tile."""
@@ -44,7 +42,7 @@ class ObjectLight(Stage):
         if config.diffuse != "none":
             reads.append("room_samples")
         reads += [name for name in layer_names(request) if name not in ("virtual", "mirrored")]
-        return Wiring(tuple(reads), tuple(name for name, used in near_names(shade_config(request)) if used))
+        return Wiring(tuple(reads), near_names(config))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
@@ -55,9 +53,7 @@ class ObjectLight(Stage):
             specs["object_irradiance"] = specs["object_light_irradiance"] = ArraySpec((height, width), wp.vec3)
         if config.specular:
             specs["object_mirrored"] = specs["object_light_mirrored"] = ArraySpec((height, width), wp.vec4)
-        if METALLIC_ROUGHNESS in config.models:
-            specs["object_light_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
-        return specs
+        return {**specs, **room_arrays(config, self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
@@ -68,10 +64,7 @@ class ObjectLight(Stage):
         )
         object_light.make_object_light_kernel(config)
         object_light.make_filter_kernel(config)
-        dfg = arrays.get("object_light_dfg")
-        if dfg is not None:
-            integrate_dfg(dfg)
-        room = make_room(forms, self.request, arrays, dfg)
+        room = make_room(forms, self.request, arrays, self.name)
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
         inputs += [arrays.get("physical_ratio"), arrays.get("physical_added"), arrays["ray_scene"], room]
         inputs += [arrays["room_samples"] if forms.diffuse != "none" else None, arrays["hit_object"], arrays["hits"]]

@@ -12,7 +12,8 @@ from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room, shares_room
 from warp_ar.stages.recover import Recover
-from warp_ar.stages.shade import sees_near, shade_config
+from warp_ar.stages.reflect import room_config
+from warp_ar.stages.shade import sees_near
 
 SAMPLES = 1024
 """Of all sets together: what an 8-bit picture of their mean can tell apart, four times over."""
@@ -47,7 +48,7 @@ class RoomSamples(Stage):
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Read the environment, write samples."""
-        gathers = sees_near(request) and shade_config(request).room_diffuse != "none"
+        gathers = sees_near(request) and room_config(request).diffuse != "none"
         if not shades_room(request) and not shares_room(request) and not gathers:
             return LeftOut("nothing traces rays to the room's light")
         lamps = ("lamps",) if knows_lamps(request) else ()

@@ -10,13 +10,10 @@ from typing import Any, ClassVar, Literal
 import warp as wp
 
 from warp_ar.kernels import room_shadow
-from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.reflect import Room, RoomConfig
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room
+from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
 from warp_ar.stages.room_samples import REFERENCE_SIZE, knows_lamps, sample_names
-from warp_ar.stages.shade import DFG_SIZE, shade_config
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -62,45 +59,6 @@ def bounces_light(request: Request) -> bool:
     return shades_room(request)
 
 
-def room_config(request: Request) -> RoomConfig:
-    """Forms of the room's light that exist for the objects of a request."""
-    shading = shade_config(request)
-    return RoomConfig(
-        trace=shading.trace,
-        models=shading.models,
-        textures=shading.textures,
-        diffuse=shading.room_diffuse,
-        specular=shading.room_specular,
-        probes=bool(request.scene.probes),
-    )
-
-
-def room_reads(config: RoomConfig) -> tuple[str, ...]:
-    """Resources that hold the forms of a ``RoomConfig``."""
-    reads = []
-    if config.diffuse != "none":
-        reads.append(f"irradiance_{config.diffuse}")
-    if config.specular:
-        reads.append("specular_levels")
-    return tuple(reads)
-
-
-def make_room(config: RoomConfig, request: Request, arrays: Arrays, dfg: Any) -> Room:
-    """The room's light as kernels read it."""
-    room = Room()
-    if config.diffuse == "sh":
-        room.irradiance_sh = arrays["irradiance_sh"]
-    if config.diffuse == "map":
-        room.irradiance_map = arrays["irradiance_map"]
-    if config.specular:
-        room.levels = arrays["specular_levels"]
-    room.level_height = request.quality.environment_height
-    if dfg is not None:
-        room.dfg = dfg
-    room.probes = arrays["probes"]
-    return room
-
-
 class RoomShadow(Stage):
     """A factor on the frame: the room's light with the virtual objects over that without them."""
 
@@ -143,9 +101,7 @@ class RoomShadow(Stage):
         specs["room_shadow_sums"] = ArraySpec(
             room_shadow.sums_shape(parts, *cells) if parts > 1 else (0, 0, 0), wp.vec3
         )
-        if METALLIC_ROUGHNESS in room_config(self.request).models:
-            specs["room_shadow_dfg"] = ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)
-        return specs
+        return {**specs, **room_arrays(room_config(self.request), self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
@@ -157,10 +113,7 @@ class RoomShadow(Stage):
         room_shadow.make_room_shadow_kernel(config)
         room_shadow.make_filter_ratio_kernel(rung.side)
         room_shadow.make_spread_ratio_kernel(forms)
-        dfg = arrays.get("room_shadow_dfg")
-        if dfg is not None:
-            integrate_dfg(dfg)
-        room = make_room(forms, self.request, arrays, dfg)
+        room = make_room(forms, self.request, arrays, self.name)
         room.environment = arrays["environment"]
         ratio, bounced, surface, filtered = (
             arrays[f"room_shadow_{name}"] for name in ("ratio", "bounced", "surface", "filtered")
