@@ -25,7 +25,7 @@ from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import Room, look_up_layer, make_find_in_frame
 from warp_ar.kernels.relight import Desk, RelightConfig, make_lit_by
-from warp_ar.kernels.shade import Nearby, ShadeConfig, make_shade_hit
+from warp_ar.kernels.shade import Nearby, ShadeConfig, make_sample_direction, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.visibility import (
@@ -51,7 +51,7 @@ class MirrorBallConfig:
     trace: TraceConfig
     """Kinds of shape in the scene."""
     samples: int = 1
-    """Rays per pixel: a square number."""
+    """Rays per pixel, spread as ``shade``'s along edges: a square number."""
     shade: ShadeConfig | None = None
     """How virtual objects look; None: there are none."""
     relight: RelightConfig | None = None
@@ -81,15 +81,12 @@ def nearest_ball(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t
 def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     trace = make_trace(config.trace)
-    closest_object, closest_proxy, occluded_by_proxies = (
-        trace.closest_object,
-        trace.closest_proxy,
-        trace.occluded_by_proxies,
-    )
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    occluded_by_proxies = trace.occluded_by_proxies
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
     lit_by = make_lit_by(config.relight) if config.relight is not None else None
     find_in_frame = make_find_in_frame(config.trace, True)
-    side = math.isqrt(config.samples)
+    sample_direction = make_sample_direction(config.samples)
 
     @wp.kernel(module="unique", enable_backward=False)
     def mirror_ball_kernel(
@@ -116,15 +113,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         change = wp.vec3(0.0, 0.0, 0.0)
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
-            inner = wp.vec3(ray[0], ray[1], 1.0)
-            if wp.static(side > 1):
-                # n-rooks in both axes, as along the edges of objects.
-                n = wp.static(float(side))
-                a = wp.float32(sample % wp.static(side))
-                b = wp.float32(sample / wp.static(side))
-                inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
-                inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
-            direction = params[0].world_from_camera * inner
+            direction = sample_direction(params, ray, sample)
             ball = nearest_ball(desk.probes, origin, direction, FAR)
             if ball < 0:
                 continue

@@ -58,6 +58,10 @@ class ShadeConfig:
     near: bool = False
     """Whether ``object_light`` says what surrounds the objects at close range."""
 
+    def __post_init__(self) -> None:
+        if self.edge_samples < 1 or math.isqrt(self.edge_samples) ** 2 != self.edge_samples:
+            raise ValueError(f"edge_samples is {self.edge_samples}; expected a square number such as 1, 4 or 16")
+
 
 @wp.struct
 class Nearby:
@@ -166,11 +170,34 @@ def differs(
 
 
 @functools.cache
+def make_sample_direction(count: int) -> wp.Function:
+    """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
+
+    Args:
+        count: Samples of a pixel, a square number; the only one is at the centre.
+    """
+    side = math.isqrt(count)
+
+    @wp.func(module="unique")
+    def sample_direction(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32) -> wp.vec3:
+        inner = wp.vec3(ray[0], ray[1], 1.0)
+        if wp.static(side > 1):
+            n = wp.static(float(side))
+            a = wp.float32(sample % wp.static(side))
+            b = wp.float32(sample / wp.static(side))
+            inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
+            inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
+        return params[0].world_from_camera * inner
+
+    return sample_direction
+
+
+@functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
     """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.room.trace)
-    side = math.isqrt(config.edge_samples)
+    center_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
 
     @wp.func(module="unique")
     def shade_sample(
@@ -188,19 +215,11 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         alone: wp.bool,
         centre: Hit,
     ) -> wp.vec4:
-        ray = rays[i, j]
-        inner = wp.vec3(ray[0], ray[1], 1.0)
-        if wp.static(side > 1):
-            if not alone:
-                n = wp.static(float(side))
-                a = wp.float32(sample % wp.static(side))
-                b = wp.float32(sample / wp.static(side))
-                inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
-                inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
-        direction = params[0].world_from_camera * inner
+        direction = center_direction(params, rays[i, j], 0)
         hit = centre
-        if wp.static(side > 1):
+        if wp.static(config.edge_samples > 1):
             if not alone:
+                direction = sample_direction(params, rays[i, j], sample)
                 hit = closest_visible(scene, params[0].camera_position, direction)
         if hit.shape < 0:
             return wp.vec4(0.0)
@@ -223,9 +242,6 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
 def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
     """Kernel of ``shade``, specialised to ``config``; one that is ``deferred`` lists edges instead of sampling them."""
     shade_sample = make_shade_sample(config)
-    side = math.isqrt(config.edge_samples)
-    if side * side != config.edge_samples or side < 1:
-        raise ValueError(f"edge_samples is {config.edge_samples}; expected a square number such as 1, 4 or 16")
 
     @wp.kernel(module="unique", enable_backward=False)
     def shade_kernel(
@@ -255,13 +271,13 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
             if found >= 0:
                 hit = hits[i, j]
             samples = wp.where(found >= 0, 1, 0)
-            if wp.static(side > 1):
+            if wp.static(config.edge_samples > 1):
                 reach = EDGE_FOOTPRINTS * hit.t / params[0].focal[0]
                 for k in range(4):
                     row = i + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
                     column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
                     if differs(row, column, found, reach, rect, hit_object, hits, hit):
-                        samples = wp.static(side * side)
+                        samples = wp.static(config.edge_samples)
             if wp.static(deferred):
                 if samples > 1:
                     place = wp.atomic_add(edge_count_out, 0, 1)
