@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -13,8 +15,8 @@ H, W = 480, 640
 CASES = (("untouched", 0), ("quarter", H // 4), ("whole", H))
 
 
-def frame_and_layers(device: str, rows: int) -> tuple[wp.array, ...]:
-    """Frame, virtual objects and added light over the first ``rows`` rows, FrameParams, tables."""
+def frame_and_layers(device: str, rows: int) -> tuple[Any, ...]:
+    """FrameParams, frame, tables, and layers: virtual objects and added light over the first ``rows`` rows."""
     rng = np.random.default_rng(0)
     frame = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
     virtual = np.zeros((H, W, 4), np.float32)
@@ -29,8 +31,9 @@ def frame_and_layers(device: str, rows: int) -> tuple[wp.array, ...]:
         wp.array(frame, dtype=wp.vec3ub, device=device),
         wp.array(color.decode_table("srgb"), dtype=wp.vec3, device=device),
         wp.array(color.encode_table("srgb"), dtype=wp.vec3, device=device),
-        wp.array(virtual, dtype=wp.vec4, device=device),
-        wp.array(added, dtype=wp.vec3, device=device),
+        composite.make_layers(
+            wp.array(virtual, dtype=wp.vec4, device=device), wp.array(added, dtype=wp.vec3, device=device)
+        ),
     )
 
 
@@ -39,7 +42,7 @@ def main(device: str) -> None:
     for name, rows in CASES:
         inputs = frame_and_layers(device, rows)
         image = wp.zeros((H, W), wp.vec3ub, device=device)
-        call = lambda inputs=inputs, image=image: composite.composite(config, *inputs, None, image)  # noqa: E731
+        call = lambda inputs=inputs, image=image: composite.composite(config, *inputs, image)  # noqa: E731
         call()
         np.testing.assert_array_equal(image.numpy()[rows:], inputs[1].numpy()[rows:])
         report(f"composite {W}x{H} {name}", measure({"ours": call}, device)["ours"], device)

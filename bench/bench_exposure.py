@@ -1,7 +1,8 @@
-"""Exposure of a 640x480 frame: the frame alone and with layers, plain and by the box, a tenth of it saturated."""
+"""Exposure of a 640x480 frame: the frame alone and with layers, every rung, a tenth of it saturated."""
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 from bench.bench_composite import H, W, frame_and_layers
@@ -12,12 +13,14 @@ LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.Composite
 
 
 def main(device: str) -> None:
-    params, frame, decode, encode, virtual, added = frame_and_layers(device, H)
+    params, frame, decode, encode, over = frame_and_layers(device, H)
     picture = frame.numpy()
     picture[: H // 10] = 255
     frame = wp.array(picture, dtype=wp.vec3ub, device=device)
     table, image = wp.zeros((H, W), wp.uint32, device=device), wp.zeros((H, W), wp.vec3ub, device=device)
     scale, codes = wp.zeros(1, wp.float32, device=device), wp.zeros(256, wp.vec3ub, device=device)
+    light = decode.numpy()[picture, np.arange(3)]
+    declipped = wp.array(np.where(picture >= 254, 2.0 * light, light), dtype=wp.vec3, device=device)
     summed_area.sum_area(frame, table)
     for name, layers in LAYERS:
         contenders = {}
@@ -26,12 +29,11 @@ def main(device: str) -> None:
             def call(config: exposure.ExposureConfig = exposure.ExposureConfig(rung, layers)) -> None:  # noqa: B008
                 exposure.read_scale(params, scale)
                 exposure.expose_codes(decode, encode, scale, codes)
-                exposure.expose(config, params, frame, decode, encode, virtual, added, None, table, scale, codes, image)
+                inputs = (params, frame, decode, encode, over, table, scale, codes, image)
+                exposure.expose(config, *inputs, declipped=declipped)
 
             call()
-            if (
-                not layers.virtual
-            ):  # away from saturation both rungs scale plainly: black stays black, nothing brightens
+            if not layers.virtual:  # black stays black, nothing that was not clipped brightens
                 assert (image.numpy()[H // 10 :] <= picture[H // 10 :]).all()
             contenders[rung] = call
         for rung, times in measure(contenders, device).items():

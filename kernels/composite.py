@@ -27,6 +27,7 @@ from warp_ar.kernels.codes import (
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.visibility import inside_rect
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,64 +49,68 @@ class CompositeConfig:
     """What mirror balls show of what is virtual, a change of the frame."""
 
 
-@wp.func
-def in_rect(rect: wp.vec4i, row: wp.int32, col: wp.int32) -> wp.bool:
-    """Whether a pixel lies in (row_start, row_stop, col_start, col_stop)."""
-    return row >= rect[0] and row < rect[1] and col >= rect[2] and col < rect[3]
+@wp.struct
+class Layers:
+    """What is laid over the frame, (H, W) each; what a ``CompositeConfig`` leaves out may be empty."""
+
+    objects: wp.array2d[wp.vec4]  # ``virtual``, which C++ keeps for itself: premultiplied linear radiance and coverage
+    added: wp.array2d[wp.vec3]  # linear radiance
+    ratio: wp.array2d[wp.vec3]  # factor on the frame's linear radiance
+    mirrored: wp.array2d[wp.vec3]  # change of linear radiance
+
+
+@wp.struct
+class LayersAt:
+    """``Layers`` at one pixel."""
+
+    objects: wp.vec4
+    added: wp.vec3
+    ratio: wp.vec3
+    mirrored: wp.vec3
 
 
 @functools.cache
 def make_read_layers(config: CompositeConfig) -> wp.Function:
-    """``virtual, added, ratio, change = read_layers(params, virtual, added, ratio, mirrored, row, col)`` of a pixel.
+    """``read_layers(params, layers, row, col) -> LayersAt``.
 
     A layer that is not there, or does not reach the pixel, changes nothing: it is 0, or a ratio of 1. All are read
     before any is looked at: one after another would be as many times the memory's latency.
     """
 
     @wp.func(module="unique")
-    def read_layers(
-        params: wp.array[FrameParams],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec3],
-        row: wp.int32,
-        col: wp.int32,
-    ):
-        virtual = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        added = wp.vec3(0.0, 0.0, 0.0)
-        ratio = wp.vec3(1.0, 1.0, 1.0)
-        change = wp.vec3(0.0, 0.0, 0.0)
+    def read_layers(params: wp.array[FrameParams], layers: Layers, row: wp.int32, col: wp.int32) -> LayersAt:
+        at = LayersAt()
+        at.ratio = wp.vec3(1.0, 1.0, 1.0)
         if wp.static(config.virtual):
-            if in_rect(params[0].object_rect, row, col):
-                virtual = virtual_layer[row, col]
+            if inside_rect(row, col, params[0].object_rect):
+                at.objects = layers.objects[row, col]
         if wp.static(config.added):
-            if in_rect(params[0].light_rect, row, col):
-                added = physical_added[row, col]
+            if inside_rect(row, col, params[0].light_rect):
+                at.added = layers.added[row, col]
         if wp.static(config.ratio):
-            if in_rect(params[0].shadow_rect, row, col):
-                ratio = physical_ratio[row, col]
+            if inside_rect(row, col, params[0].shadow_rect):
+                at.ratio = layers.ratio[row, col]
         if wp.static(config.mirrored):
-            if in_rect(params[0].ball_rect, row, col):
-                change = mirrored[row, col]
-        return virtual, added, ratio, change
+            if inside_rect(row, col, params[0].ball_rect):
+                at.mirrored = layers.mirrored[row, col]
+        return at
 
     return read_layers
 
 
 @wp.func
-def is_changed(virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3, mirrored: wp.vec3) -> wp.bool:
+def is_changed(at: LayersAt) -> wp.bool:
     """Whether layers touch a pixel; NaN does."""
-    neutral = virtual == wp.vec4(0.0, 0.0, 0.0, 0.0) and added == wp.vec3(0.0, 0.0, 0.0)
-    neutral = neutral and ratio == wp.vec3(1.0, 1.0, 1.0) and mirrored == wp.vec3(0.0, 0.0, 0.0)
+    neutral = at.objects == wp.vec4(0.0, 0.0, 0.0, 0.0) and at.added == wp.vec3(0.0, 0.0, 0.0)
+    neutral = neutral and at.ratio == wp.vec3(1.0, 1.0, 1.0) and at.mirrored == wp.vec3(0.0, 0.0, 0.0)
     return not neutral
 
 
 @wp.func
-def compose(radiance: wp.vec3, virtual: wp.vec4, added: wp.vec3, ratio: wp.vec3, mirrored: wp.vec3) -> wp.vec3:
+def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     """All layers over the frame's radiance; no more is taken from it than there is."""
-    physical = wp.max(wp.cw_mul(radiance, ratio) + added + mirrored, wp.vec3(0.0, 0.0, 0.0))
-    return (1.0 - virtual[3]) * physical + wp.vec3(virtual[0], virtual[1], virtual[2])
+    physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirrored, wp.vec3(0.0, 0.0, 0.0))
+    return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 
 
 @functools.cache
@@ -121,10 +126,7 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         encode_table: wp.array[wp.vec3],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec3],
+        layers: Layers,
         run: wp.int32,
         # Out:
         image_out: wp.array2d[wp.vec3ub],
@@ -138,25 +140,36 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
             while k < WARP_PIXELS:
                 j = first + k
                 if j < frame.shape[1]:
-                    virtual, added, ratio, change = read_layers(
-                        params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
-                    )
-                    if is_changed(virtual, added, ratio, change):
-                        radiance = compose(decode(decode_table, get_code(codes, k)), virtual, added, ratio, change)
+                    at = read_layers(params, layers, i, j)
+                    if is_changed(at):
+                        radiance = compose(decode(decode_table, get_code(codes, k)), at)
                         set_code(codes, k, encode(encode_table, radiance))
                 k += WARP_LANES
             store_codes(codes, image_out, i, first)
         else:
             for j in range(part * run, wp.min(part * run + run, frame.shape[1])):
                 code = frame[i, j]
-                virtual, added, ratio, change = read_layers(
-                    params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
-                )
-                if is_changed(virtual, added, ratio, change):
-                    code = encode(encode_table, compose(decode(decode_table, code), virtual, added, ratio, change))
+                at = read_layers(params, layers, i, j)
+                if is_changed(at):
+                    code = encode(encode_table, compose(decode(decode_table, code), at))
                 image_out[i, j] = code
 
     return composite_kernel
+
+
+def make_layers(
+    virtual: wp.array | None = None,
+    physical_added: wp.array | None = None,
+    physical_ratio: wp.array | None = None,
+    mirrored: wp.array | None = None,
+) -> Layers:
+    """Layers as kernels read them; None leaves one empty."""
+    layers = Layers()
+    given = {"objects": virtual, "added": physical_added, "ratio": physical_ratio, "mirrored": mirrored}
+    for name, array in given.items():
+        if array is not None:
+            setattr(layers, name, array)
+    return layers
 
 
 def composite(
@@ -165,27 +178,21 @@ def composite(
     frame: wp.array,
     decode_table: wp.array,
     encode_table: wp.array,
-    virtual: wp.array | None,
-    physical_added: wp.array | None,
-    physical_ratio: wp.array | None,
+    layers: Layers,
     image_out: wp.array,
     *,
-    mirrored: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the picture.
 
     Args:
-        config: Layers; those that it leaves out may be None.
+        config: Which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
         frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
         decode_table: (256,) vec3 of ``color.decode_table``.
         encode_table: Table of ``color.encode_table``.
-        virtual: (H, W) vec4, premultiplied linear radiance and coverage.
-        physical_added: (H, W) vec3, linear radiance.
-        physical_ratio: (H, W) vec3, factor on the frame's linear radiance.
+        layers: From ``make_layers``.
         image_out: (H, W) vec3ub, contiguous; values above clipping give 255, NaN gives 0.
-        mirrored: (H, W) vec3, change of linear radiance.
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
@@ -194,7 +201,7 @@ def composite(
     launch_rows(
         make_composite_kernel(config, warps),
         (height, warp_threads(width) if warps else -(-width // run)),
-        [params, frame, decode_table, encode_table, virtual, physical_added, physical_ratio, mirrored, run],
+        [params, frame, decode_table, encode_table, layers, run],
         [image_out],
         rows=rows,
         device=frame.device,

@@ -64,7 +64,7 @@ from warp_ar.kernels.codes import (
     warp_threads,
 )
 from warp_ar.kernels.color import decode, encode
-from warp_ar.kernels.composite import CompositeConfig, compose, is_changed, make_read_layers
+from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.probe import is_clipped
 from warp_ar.kernels.structs import FrameParams
@@ -172,9 +172,9 @@ def level_of(peak: wp.float32) -> wp.int32:
 
 
 @functools.cache
-def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
+def make_count_levels_kernel(config: CompositeConfig) -> wp.Kernel:
     """Kernel that counts, per sampled row, how many pixels under virtual light fall into each level."""
-    read_layers = make_read_layers(layers)
+    read_layers = make_read_layers(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def count_levels_kernel(
@@ -183,10 +183,7 @@ def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
         params: wp.array[FrameParams],
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec3],
+        layers: Layers,
         # Out:
         levels_out: wp.array2d[wp.int32],
     ):
@@ -200,13 +197,10 @@ def make_count_levels_kernel(layers: CompositeConfig) -> wp.Kernel:
         for j in range(rect[2], rect[3], _AUTO_STRIDE):
             code = frame[i, j]
             clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
-            virtual, added, ratio, change = read_layers(
-                params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
-            )
-            dark = added == wp.vec3(0.0, 0.0, 0.0)
-            if not clipped and not virtual[3] > 0.5 and not dark:
-                radiance = compose(decode(decode_table, code), virtual, added, ratio, change)
-                level = level_of(wp.max(radiance))
+            at = read_layers(params, layers, i, j)
+            dark = at.added == wp.vec3(0.0, 0.0, 0.0)
+            if not clipped and not at.objects[3] > 0.5 and not dark:
+                level = level_of(wp.max(compose(decode(decode_table, code), at)))
                 levels_out[strip, level] = levels_out[strip, level] + 1
 
     return count_levels_kernel
@@ -254,10 +248,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         params: wp.array[FrameParams],
         decode_table: wp.array[wp.vec3],
         encode_table: wp.array[wp.vec3],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec3],
+        layers: Layers,
         table: wp.array2d[wp.uint32],
         max_box: wp.int32,
         declipped: wp.array2d[wp.vec3],
@@ -273,16 +264,14 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         guessed = bool(gain != 1.0)
         if wp.static(config.rung == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
-        virtual, added, ratio, change = read_layers(
-            params, virtual_layer, physical_added, physical_ratio, mirrored, i, j
-        )
-        if not guessed and not is_changed(virtual, added, ratio, change):
+        at = read_layers(params, layers, i, j)
+        if not guessed and not is_changed(at):
             return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
         radiance = gain * decode(decode_table, code)
         if wp.static(config.rung == "declipped"):
             if guessed:
                 radiance = declipped[i, j]
-        return encode(encode_table, s * compose(radiance, virtual, added, ratio, change))
+        return encode(encode_table, s * compose(radiance, at))
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(
@@ -292,10 +281,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         encode_table: wp.array[wp.vec3],
-        virtual_layer: wp.array2d[wp.vec4],
-        physical_added: wp.array2d[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec3],
+        layers: Layers,
         table: wp.array2d[wp.uint32],
         max_box: wp.int32,
         declipped: wp.array2d[wp.vec3],
@@ -320,10 +306,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
                         params,
                         decode_table,
                         encode_table,
-                        virtual_layer,
-                        physical_added,
-                        physical_ratio,
-                        mirrored,
+                        layers,
                         table,
                         max_box,
                         declipped,
@@ -341,10 +324,7 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
                 params,
                 decode_table,
                 encode_table,
-                virtual_layer,
-                physical_added,
-                physical_ratio,
-                mirrored,
+                layers,
                 table,
                 max_box,
                 declipped,
@@ -366,36 +346,30 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
 
 
 def count_levels(
-    layers: CompositeConfig,
+    config: CompositeConfig,
     params: wp.array,
     frame: wp.array,
     decode_table: wp.array,
-    virtual: wp.array | None,
-    physical_added: wp.array,
-    physical_ratio: wp.array | None,
+    layers: Layers,
     levels_out: wp.array,
     *,
-    mirrored: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Count how bright the desk is under virtual light, for ``auto``.
 
     Args:
-        layers: Layers there are; virtual light on the desk must be among them.
+        config: Which layers there are; virtual light on the desk must be among them.
         params: (1,) FrameParams.
         frame: (H, W) vec3ub, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.
-        virtual: (H, W) vec4, premultiplied.
-        physical_added: (H, W) vec3.
-        physical_ratio: (H, W) vec3.
+        layers: From ``make_layers``.
         levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
-        mirrored: (H, W) vec3.
         rows: Band of rows of ``levels_out``; None means all.
     """
     launch_rows(
-        make_count_levels_kernel(layers),
+        make_count_levels_kernel(config),
         (levels_out.shape[0],),
-        [params, frame, decode_table, virtual, physical_added, physical_ratio, mirrored],
+        [params, frame, decode_table, layers],
         [levels_out],
         rows=rows,
         device=frame.device,
@@ -418,34 +392,28 @@ def expose(
     frame: wp.array,
     decode_table: wp.array,
     encode_table: wp.array,
-    virtual: wp.array | None,
-    physical_added: wp.array | None,
-    physical_ratio: wp.array | None,
+    layers: Layers,
     table: wp.array | None,
     scale: wp.array,
     codes: wp.array,
     image_out: wp.array,
     *,
-    mirrored: wp.array | None = None,
     declipped: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the picture at another exposure, layers composed.
 
     Args:
-        config: Rung and layers; layers that it leaves out may be None.
+        config: Rung, and which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
         frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
         decode_table: (256,) vec3 of ``color.decode_table``.
         encode_table: Table of ``color.encode_table``.
-        virtual: (H, W) vec4, premultiplied linear radiance and coverage.
-        physical_added: (H, W) vec3, linear radiance.
-        physical_ratio: (H, W) vec3, factor on the frame's linear radiance.
+        layers: From ``make_layers``.
         table: (H, W) uint32, the frame's summed-area table; needed by ``box``.
         scale: (1,) float32, not negative.
         codes: (256,) vec3ub of ``expose_codes`` for this ``scale``.
         image_out: (H, W) vec3ub, contiguous.
-        mirrored: (H, W) vec3, change of linear radiance.
         declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
         rows: Band of rows; None means all.
     """
@@ -459,10 +427,7 @@ def expose(
             frame,
             decode_table,
             encode_table,
-            virtual,
-            physical_added,
-            physical_ratio,
-            mirrored,
+            layers,
             table,
             largest_box(height),
             declipped,

@@ -52,8 +52,15 @@ def make_layers(seed=0):
     return frame, virtual, added, ratio, mirrored
 
 
-def array(values, dtype):
-    return None if values is None else wp.array(values, dtype=dtype)
+def make_arrays(virtual=None, added=None, ratio=None, mirrored=None):
+    """Layers of what ``make_layers`` draws, or of part of it."""
+    dtypes = (wp.vec4, wp.vec3, wp.vec3, wp.vec3)
+    return composite.make_layers(
+        *(
+            None if values is None else wp.array(values, dtype=dtype)
+            for values, dtype in zip((virtual, added, ratio, mirrored), dtypes, strict=True)
+        )
+    )
 
 
 def run(
@@ -66,11 +73,8 @@ def run(
             params or make_params(),
             wp.array(frame, dtype=wp.vec3ub),
             *tables(transfer),
-            array(virtual, wp.vec4),
-            array(added, wp.vec3),
-            array(ratio, wp.vec3),
+            make_arrays(virtual, added, ratio, mirrored),
             out,
-            mirrored=array(mirrored, wp.vec3),
             rows=rows,
         )
     return out.numpy()

@@ -6,7 +6,7 @@ from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
 from tests.reference import exposure as reference
-from tests.test_composite import CONFIGS, H, array, make_layers, make_params, tables
+from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params, tables
 from warp_ar.kernels import color, exposure, summed_area
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
@@ -27,7 +27,7 @@ def run(
     summed_area.sum_area(frame_array, table)
     exposure.read_scale(params, scale_array)
     exposure.expose_codes(decode, encode, scale_array, codes)
-    over = array(virtual, wp.vec4), array(added, wp.vec3), array(ratio, wp.vec3)
+    over = make_arrays(virtual, added, ratio, mirrored)
     config = exposure.ExposureConfig(rung, layers)
     exposure.expose(
         config,
@@ -35,12 +35,11 @@ def run(
         frame_array,
         decode,
         encode,
-        *over,
+        over,
         table,
         scale_array,
         codes,
         image,
-        mirrored=array(mirrored, wp.vec3),
         declipped=wp.array(declipped(frame, transfer), dtype=wp.vec3),
     )
     return image.numpy()
@@ -176,8 +175,8 @@ def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=Non
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
     layers = exposure.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
     for _ in range(frames):
-        over = array(virtual, wp.vec4), array(added, wp.vec3), None
-        exposure.count_levels(layers, params, frame, decode, *over, levels, mirrored=array(mirrored, wp.vec3))
+        over = make_arrays(virtual, added, None, mirrored)
+        exposure.count_levels(layers, params, frame, decode, over, levels)
         exposure.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
 

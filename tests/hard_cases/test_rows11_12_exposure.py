@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import RUNGS, SIZE
-from warp_ar.kernels import color, exposure, summed_area
+from warp_ar.kernels import color, composite, exposure, summed_area
 from warp_ar.kernels.structs import FrameParams
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -103,7 +103,7 @@ def expose(rung, image, scale, device):
     exposure.read_scale(params, factor)
     exposure.expose_codes(decode, encode, factor, codes)
     exposure.expose(
-        exposure.ExposureConfig(rung), params, frame, decode, encode, None, None, None, table, factor, codes, out
+        exposure.ExposureConfig(rung), params, frame, decode, encode, composite.make_layers(), table, factor, codes, out
     )
     return out.numpy()
 

@@ -39,7 +39,7 @@ class Composite(Stage):
         config = composite_config(layer_names(self.request))
         width, height = self.request.size
         composite.make_composite_kernel(config, by_warps(device, width))
-        image, frame = arrays["image"], arrays["frame"]
+        image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
 
         def launch(rows: Rows | None) -> None:
             composite.composite(
@@ -48,11 +48,8 @@ class Composite(Stage):
                 frame,
                 arrays["decode"],
                 arrays["encode"],
-                arrays.get("virtual"),
-                arrays.get("physical_added"),
-                arrays.get("physical_ratio"),
+                layers,
                 image,
-                mirrored=arrays.get("mirrored"),
                 rows=rows,
             )
 
@@ -101,6 +98,12 @@ def exposes(request: Request) -> bool:
     """Whether the scene asks for another exposure; ``auto`` does where virtual light falls on the desk."""
     scale = request.scene.exposure.scale
     return "physical_added" in layer_names(request) if isinstance(scale, str) else scale != 1.0
+
+
+def layers_of(arrays: Arrays) -> composite.Layers:
+    """The layers that there are, as kernels read them."""
+    names = ("virtual", "physical_added", "physical_ratio", "mirrored")
+    return composite.make_layers(*(arrays.get(name) for name in names))
 
 
 def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:

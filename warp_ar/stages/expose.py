@@ -10,7 +10,7 @@ import warp as wp
 from warp_ar.kernels import exposure
 from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import composite_config, exposes, layer_names
+from warp_ar.stages.composite import composite_config, exposes, layer_names, layers_of
 from warp_ar.stages.declip import declips
 
 
@@ -55,22 +55,20 @@ class Expose(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        layers = composite_config(layer_names(self.request))
+        composed = composite_config(layer_names(self.request))
         config = exposure.ExposureConfig(
-            "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", layers
+            "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
         )
         exposure.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
-        virtual, added, ratio = (arrays.get(name) for name in ("virtual", "physical_added", "physical_ratio"))
-        mirrored = arrays.get("mirrored")
+        layers = layers_of(arrays)
         passes: list[Pass] = []
         if self.request.scene.exposure.scale == "auto":
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                parts = (virtual, added, ratio)
-                exposure.count_levels(layers, params, frame, decode, *parts, levels, mirrored=mirrored, rows=rows)
+                exposure.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
             passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
@@ -85,14 +83,11 @@ class Expose(Stage):
                 frame,
                 decode,
                 encode,
-                virtual,
-                added,
-                ratio,
+                layers,
                 arrays["summed_area"] if "summed_area" in self.wiring.reads else None,
                 scale,
                 codes,
                 arrays["image"],
-                mirrored=mirrored,
                 declipped=arrays.get("declipped"),
                 rows=rows,
             )
