@@ -3,7 +3,8 @@
 A pixel's three bytes by themselves are three loads and three stores of a byte each, and memory writes 32 bytes at a
 time. So a warp takes ``WARP_PIXELS`` neighbours of a row, loads their words side by side into its own part of the
 block's shared memory, works on them there, pixel k of a round to lane k, so that what else is read of a pixel is read
-side by side too, and stores the words side by side. CUDA only, and only where rows begin at words.
+side by side too, and stores the words side by side. CUDA only, and only where rows begin at words; elsewhere a thread
+takes ``row_parts``' run of neighbours, pixel after pixel.
 """
 
 from __future__ import annotations
@@ -16,15 +17,21 @@ WARP_PIXELS = wp.constant(128)
 """Pixels of a row that a warp takes."""
 WARP_LANES = wp.constant(32)
 
+CPU_RUN = 32
+"""Pixels of a row that one thread of a CPU does: to begin a thread costs as much as a pixel on which nothing lies."""
+
 
 def by_warps(device: wp.Device, width: int) -> bool:
     """Whether frames of this width are worked on by warps on ``device``."""
     return bool(device.is_cuda and width % 4 == 0)
 
 
-def warp_threads(width: int) -> int:
-    """Threads that a row of ``width`` pixels takes."""
-    return 32 * -(-width // 128)
+def row_parts(device: wp.Device, width: int) -> tuple[int, int]:
+    """Threads that a row of ``width`` pixels takes, and how many pixels each does where they are not warps."""
+    if by_warps(device, width):
+        return WARP_LANES * -(-width // WARP_PIXELS), 0
+    run = CPU_RUN if device.is_cpu else 1
+    return -(-width // run), run
 
 
 @wp.func_native("""

@@ -20,9 +20,9 @@ from warp_ar.kernels.codes import (
     by_warps,
     get_code,
     load_codes,
+    row_parts,
     set_code,
     store_codes,
-    warp_threads,
 )
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.launch import Rows, launch_rows
@@ -30,9 +30,6 @@ from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.visibility import inside_rect
 
 wp.set_module_options({"enable_backward": False})
-
-CPU_RUN = 32
-"""Pixels of a row that one thread of a CPU does."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,11 +193,10 @@ def composite(
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
-    run = CPU_RUN if frame.device.is_cpu else 1
-    warps = by_warps(frame.device, width)
+    threads, run = row_parts(frame.device, width)
     launch_rows(
-        make_composite_kernel(config, warps),
-        (height, warp_threads(width) if warps else -(-width // run)),
+        make_composite_kernel(config, by_warps(frame.device, width)),
+        (height, threads),
         [params, frame, decode_table, encode_table, layers, run],
         [image_out],
         rows=rows,

@@ -59,9 +59,9 @@ from warp_ar.kernels.codes import (
     by_warps,
     get_code,
     load_codes,
+    row_parts,
     set_code,
     store_codes,
-    warp_threads,
 )
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
@@ -95,7 +95,6 @@ LEVELS = 64
 
 _LEVELS = wp.constant(LEVELS)
 _AUTO_STRIDE = wp.constant(AUTO_STRIDE)
-
 
 NO_LAYERS = CompositeConfig()
 """The frame alone."""
@@ -237,7 +236,7 @@ def adapt_scale_kernel(
 
 @functools.cache
 def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
-    """Kernel specialised to ``config``, by warps (see ``codes``) or by pixels; equal ones share one kernel."""
+    """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
     read_layers = make_read_layers(config.layers)
 
     @wp.func(module="unique")
@@ -287,50 +286,49 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         declipped: wp.array2d[wp.vec3],
         scale: wp.array[wp.float32],
         codes: wp.array[wp.vec3ub],
+        run: wp.int32,
         # Out:
         image_out: wp.array2d[wp.vec3ub],
     ):
-        i, j = wp.tid()
+        i, part = wp.tid()
         i += row_start
         if wp.static(warps):
-            k = j % WARP_LANES
-            first = j // WARP_LANES * WARP_PIXELS
-            run = load_codes(frame, i, first)
-            while k < WARP_PIXELS:
-                j = first + k
-                if j < frame.shape[1]:
-                    code = exposed(
-                        get_code(run, k),
-                        i,
-                        j,
-                        params,
-                        decode_table,
-                        encode_table,
-                        layers,
-                        table,
-                        max_box,
-                        declipped,
-                        scale[0],
-                        codes,
-                    )
-                    set_code(run, k, code)
-                k += WARP_LANES
-            store_codes(run, image_out, i, first)
+            first = part // WARP_LANES * WARP_PIXELS
+            own = load_codes(frame, i, first)
+            k = part % WARP_LANES
+            step, stop = WARP_LANES, WARP_PIXELS
         else:
-            image_out[i, j] = exposed(
-                frame[i, j],
-                i,
-                j,
-                params,
-                decode_table,
-                encode_table,
-                layers,
-                table,
-                max_box,
-                declipped,
-                scale[0],
-                codes,
-            )
+            first = part * run
+            k = wp.int32(0)
+            step, stop = wp.int32(1), run
+        while k < stop:
+            j = first + k
+            if j < frame.shape[1]:
+                if wp.static(warps):  # noqa: SIM108  (of a conditional expression both sides would be compiled)
+                    code = get_code(own, k)
+                else:
+                    code = frame[i, j]
+                code = exposed(
+                    code,
+                    i,
+                    j,
+                    params,
+                    decode_table,
+                    encode_table,
+                    layers,
+                    table,
+                    max_box,
+                    declipped,
+                    scale[0],
+                    codes,
+                )
+                if wp.static(warps):
+                    set_code(own, k, code)
+                else:
+                    image_out[i, j] = code
+            k += step
+        if wp.static(warps):
+            store_codes(own, image_out, i, first)
 
     return expose_kernel
 
@@ -418,10 +416,10 @@ def expose(
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
-    warps = by_warps(frame.device, width)
+    threads, run = row_parts(frame.device, width)
     launch_rows(
-        make_expose_kernel(config, warps),
-        (height, warp_threads(width) if warps else width),
+        make_expose_kernel(config, by_warps(frame.device, width)),
+        (height, threads),
         [
             params,
             frame,
@@ -433,6 +431,7 @@ def expose(
             declipped,
             scale,
             codes,
+            run,
         ],
         [image_out],
         rows=rows,

@@ -197,7 +197,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
     """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.room.trace)
-    center_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
+    centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
 
     @wp.func(module="unique")
     def shade_sample(
@@ -215,7 +215,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         alone: wp.bool,
         centre: Hit,
     ) -> wp.vec4:
-        direction = center_direction(params, rays[i, j], 0)
+        direction = centre_direction(params, rays[i, j], 0)
         hit = centre
         if wp.static(config.edge_samples > 1):
             if not alone:
@@ -245,8 +245,8 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False)
     def shade_kernel(
-        row_start: wp.int32,
         # In:
+        row_start: wp.int32,
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
