@@ -9,7 +9,8 @@ would be taken for darker than it is. So per cell, over the room's samples (``ro
 which is 1 to the bit where nothing is hidden. Only cells that virtual light falls on are asked: first those that a
 light shines on, then, once it is known what these send on, those that are reached by that.
 What hides light sends some itself: a ball its reflectance times the mean of what its normal faces, a box as grey paper
-would. Planes hide nothing: the ball has seen them where the environment has them.
+would. Planes hide nothing: the ball has seen them where the environment has them. A CUDA device has several threads
+share the samples of a cell; their sums are added in one order, so that the same frame gives the same bits.
 
 **Bounced light.** A lit proxy lights the others. Every cell of a coarse grid is a patch: radiance L that virtual light
 adds there (``relight``'s own, direct), and the area A of the surface that its pixels show. A receiver at distance r
@@ -63,6 +64,12 @@ NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
 """Bounced light over the room's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
 MIN_FACING = wp.constant(wp.float32(0.02))
 """Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
+SHARE_PARTS = 16
+"""Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
+SHARE_SUMS = wp.constant(2)
+"""Sums per part of a cell: the room's light, and what is lost of it."""
+PENDING = wp.constant(-2)
+"""What ``surface_out`` holds less the cell's surface while parts of its share are not yet added."""
 
 
 @wp.struct
@@ -123,6 +130,12 @@ def share_of(lost: wp.float32, whole: wp.float32) -> wp.float32:
 
 
 @wp.func
+def shares_of(lost: wp.vec3, whole: wp.vec3) -> wp.vec3:
+    """``share_of`` for each channel."""
+    return wp.vec3(share_of(lost[0], whole[0]), share_of(lost[1], whole[1]), share_of(lost[2], whole[2]))
+
+
+@wp.func
 def near_ball(away: wp.vec3, radius: wp.float32, direction: wp.vec3) -> wp.bool:
     """Whether a direction leads from a point into the ball around ``away``, or the point is in it."""
     beside = wp.dot(away, away) - radius * radius
@@ -175,14 +188,20 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
         count: wp.int32,
         stride: wp.int32,
         bounced: wp.bool,
+        parts: wp.int32,
         # Out:
         share_out: wp.array2d[wp.vec3],
         surface_out: wp.array2d[wp.int32],
+        sums_out: wp.array3d[wp.vec3],
     ):
         ci, cj = wp.tid()
         ci += row_start
+        part = ci / share_out.shape[0]
+        ci = ci % share_out.shape[0]
+        # One part of a cell writes its surface, and no surface that another part may still read as found before.
         if not bounced:
-            surface_out[ci, cj] = -1
+            if part == 0:
+                surface_out[ci, cj] = -1
         elif surface_out[ci, cj] >= 0:
             return
         if not in_lit_cells(ci, cj, stride, params[0].light_rect):
@@ -206,7 +225,8 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
                     needed = True
         if not needed:
             return
-        surface_out[ci, cj] = key
+        if part == 0:
+            surface_out[ci, cj] = wp.where(parts > 1, PENDING - key, key)
         # One ball around all that can hide light and is no mirror ball: most samples pass it by.
         middle = wp.vec3()
         solid = float(0.0)
@@ -223,7 +243,7 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
                     reach = wp.max(reach, wp.length(shape.position - middle) + shape.scale * wp.length(shape.extent))
         whole = wp.vec3()
         lost = wp.vec3()
-        for k in range(count):
+        for k in range(count * part / parts, count * (part + 1) / parts):
             sample = samples[k]
             toward = sample_toward(sample, hit.point)
             cosine = wp.dot(hit.normal, toward.direction)
@@ -256,11 +276,35 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
                                 radiance = DEFAULT_REFLECTANCE * mean_facing(desk, facing)
                 if hides:
                     lost += cosine * toward.measure * (sample.radiance - radiance)
-        share_out[ci, cj] = wp.vec3(
-            share_of(lost[0], whole[0]), share_of(lost[1], whole[1]), share_of(lost[2], whole[2])
-        )
+        if parts > 1:
+            sums_out[part * SHARE_SUMS, ci, cj] = whole
+            sums_out[part * SHARE_SUMS + 1, ci, cj] = lost
+        else:
+            share_out[ci, cj] = shares_of(lost, whole)
 
     return share_room_kernel
+
+
+@wp.kernel(enable_backward=False)
+def join_shares_kernel(
+    # In:
+    sums: wp.array3d[wp.vec3],
+    # Out:
+    share_out: wp.array2d[wp.vec3],
+    surface_out: wp.array2d[wp.int32],
+):
+    """Shares of cells whose samples several threads have just summed."""
+    i, j = wp.tid()
+    pending = surface_out[i, j]
+    if pending > PENDING:
+        return
+    whole = wp.vec3()
+    lost = wp.vec3()
+    for part in range(sums.shape[0] / SHARE_SUMS):
+        whole += sums[part * SHARE_SUMS, i, j]
+        lost += sums[part * SHARE_SUMS + 1, i, j]
+    share_out[i, j] = shares_of(lost, whole)
+    surface_out[i, j] = PENDING - pending
 
 
 @functools.cache
@@ -397,6 +441,7 @@ def share_room(
     surface_out: wp.array,
     *,
     bounced: bool = False,
+    sums_out: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Estimate which part of the room's light reaches the desk, for cells that virtual lights may shine on.
@@ -416,16 +461,26 @@ def share_room(
         share_out: (ceil(H / stride), ceil(W / stride)) vec3, 0..1; undefined where ``surface_out`` is -1.
         surface_out: The same shape, int32: ``surface_key`` of the cell, -1 for none.
         bounced: Whether to add cells that get bounced light to those that were estimated before.
+        sums_out: Scratch of ``share_sums_shape`` in which several threads share a cell; ``rows`` must be None then.
+            None means one thread per cell.
         rows: Band of rows of cells; None means all.
     """
+    parts = 1 if sums_out is None else sums_out.shape[0] // int(SHARE_SUMS)
     launch_rows(
         make_share_room_kernel(config),
-        share_out.shape,
-        [params, rays, scene, lights, desk, samples, min(count, samples.shape[0]), stride, bounced],
-        [share_out, surface_out],
+        (share_out.shape[0] * parts, share_out.shape[1]),
+        [params, rays, scene, lights, desk, samples, min(count, samples.shape[0]), stride, bounced, parts],
+        [share_out, surface_out, sums_out],
         rows=rows,
         device=rays.device,
     )
+    if parts > 1:
+        wp.launch(join_shares_kernel, share_out.shape, [sums_out], [share_out, surface_out], device=rays.device)
+
+
+def share_sums_shape(parts: int, rows: int, columns: int) -> tuple[int, int, int]:
+    """Shape of the array that holds the sums of all parts of so many cells."""
+    return parts * int(SHARE_SUMS), rows, columns
 
 
 def send_light(

@@ -96,8 +96,14 @@ WARP_LANES = 32
 """Threads of a CUDA device that go the same way or wait for each other."""
 KINDS = wp.constant(4)
 """Sums per part of a cell: light without the objects, what they hide, what they send of the room and of the desk."""
-CHUNK = 64
+CHUNK = wp.constant(64)
 """Samples that are culled together: the bits of a mask."""
+WORD = 32
+"""Samples of a part in steps: the bits of a word."""
+MOST_ITEMS = 1 << 24
+"""Samples that may ask in steps: beyond it their list takes too much memory, 16 bytes each and more."""
+ASKING_THREADS = 1 << 17
+"""Threads that ask in steps, each for what is left of the list when the others have theirs."""
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a surface is dark and a shadow on it means nothing."""
 MAX_RATIO = wp.constant(wp.float32(4.0))
@@ -415,21 +421,208 @@ def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.ve
     return ratio
 
 
+@wp.struct
+class Sender:
+    """What sends light along a sample's direction where no virtual object stands."""
+
+    radiance: wp.vec3
+    distance: wp.float32
+
+
+@functools.cache
+def make_find_sender(config: RoomShadowConfig) -> wp.Function:
+    """``find_sender(params, frame, decode_table, scene, room, sample, origin, direction, distance, ...) -> Sender``.
+
+    The sample itself, ``distance`` away, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
+    ``by_ball``; those that the ray cannot meet need not be asked.
+    """
+    closest_proxy = make_trace(config.room.trace).closest_proxy
+    traced = config.bounce == "traced"
+    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes) if traced else None
+    look_wide = make_look_wide(config.room)
+
+    @wp.func(module="unique")
+    def find_sender(
+        params: FrameParams,
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        sample: RoomSample,
+        origin: wp.vec3,
+        direction: wp.vec3,
+        distance: wp.float32,
+        by_proxy: wp.bool,
+        by_ball: wp.bool,
+    ) -> Sender:
+        sender = Sender()
+        sender.radiance = sample.radiance
+        sender.distance = distance
+        if by_proxy:
+            proxy = closest_proxy(scene, origin, direction, distance)
+            if proxy.shape >= 0:
+                sender.distance = proxy.t
+                seen = wp.vec2(-1.0, -1.0)
+                if wp.static(traced):
+                    seen = find_in_frame(
+                        params,
+                        frame.shape[0],
+                        frame.shape[1],
+                        scene,
+                        room.probes,
+                        proxy.point,
+                        proxy.geometric_normal,
+                    )
+                if seen[0] >= 0.0:
+                    sender.radiance = look_up(frame, decode_table, seen[0], seen[1])
+                else:
+                    # Where the ball saw it; a lamp right beside it is not its light.
+                    sender.radiance = wp.min(
+                        sample_latlong(room.environment, proxy.point - sample.origin), wp.vec3(1.0, 1.0, 1.0)
+                    )
+        if wp.static(config.room.probes):
+            if by_ball:
+                for index in range(room.probes.shape[0]):
+                    probe = room.probes[index]
+                    t = intersect_sphere(probe.radius, origin - probe.center, direction, sender.distance)
+                    if t < sender.distance:
+                        sender.distance = t
+                        normal = (origin + t * direction - probe.center) / probe.radius
+                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(room, reflect(-direction, normal)))
+        return sender
+
+    return find_sender
+
+
+@wp.struct
+class Before:
+    """What lies before a cell's surface, for ``estimated``."""
+
+    up: wp.vec3  # the surface's normal, on the side that light comes from
+    from_desk: wp.vec3  # irradiance that a surface above it has from below
+    brightest: wp.float32  # largest radiance that an object is believed to have
+
+
+@functools.cache
+def make_look_before(config: RoomConfig) -> wp.Function:
+    """``look_before(room, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
+    look_wide = make_look_wide(config)
+
+    @wp.func(module="unique")
+    def look_before(room: Room, normal: wp.vec3, direction: wp.vec3) -> Before:
+        before = Before()
+        before.up = normal
+        if wp.dot(normal, direction) < 0.0:
+            before.up = -normal
+        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(room, before.up))
+        if wp.static(config.diffuse == "sh"):
+            before.from_desk = sh_irradiance(room.irradiance_sh, -before.up)
+            before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(room.irradiance_sh, before.up)) / wp.pi
+        if wp.static(config.diffuse == "map"):
+            before.from_desk = sample_latlong(room.irradiance_map, -before.up)
+            before.brightest = MAX_BRIGHTNESS * wp.max(sample_latlong(room.irradiance_map, before.up)) / wp.pi
+        return before
+
+    return look_before
+
+
+@wp.struct
+class Physical:
+    """Samples that may meet a proxy or a mirror ball, a bit each."""
+
+    proxies: wp.uint64
+    balls: wp.uint64
+
+
+@functools.cache
+def make_masks(config: RoomShadowConfig, count: int) -> tuple[wp.Function, wp.Function]:
+    """Which of ``count`` samples from ``first`` on may meet something, a bit each, as a point sees them.
+
+    ``mask_objects(scene, directions, samples, first, point) -> uint64``, and ``mask_physical(scene, room, directions,
+    samples, first, point, own) -> Physical``, ``own`` being the proxy that the point is on.
+    """
+    mask_cone = make_mask_cone(count, config.near)
+
+    @wp.func(module="unique")
+    def mask_objects(
+        scene: RayScene,
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        first: wp.int32,
+        point: wp.vec3,
+    ) -> wp.uint64:
+        mask = wp.uint64(0)
+        for index in range(scene.objects.shape[0]):
+            shape = scene.objects[index]
+            mask = mask | mask_cone(directions, samples, first, point, shape.position - point, bounding_radius(shape))
+        return mask
+
+    @wp.func(module="unique")
+    def mask_physical(
+        scene: RayScene,
+        room: Room,
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        first: wp.int32,
+        point: wp.vec3,
+        own: wp.int32,
+    ) -> Physical:
+        mask = Physical()
+        everywhere = wp.uint64(0) - wp.uint64(1)
+        for index in range(scene.proxies.shape[0]):
+            shape = scene.proxies[index]
+            if shape.kind == PLANE:
+                if index != own:
+                    mask.proxies = everywhere
+            elif shape.kind != BOX or index != own:
+                mask.proxies = mask.proxies | mask_cone(
+                    directions, samples, first, point, shape.position - point, bounding_radius(shape)
+                )
+        if wp.static(config.room.probes):
+            for index in range(room.probes.shape[0]):
+                probe = room.probes[index]
+                mask.balls = mask.balls | mask_cone(
+                    directions, samples, first, point, probe.center - point, probe.radius
+                )
+        return mask
+
+    return mask_objects, mask_physical
+
+
+@wp.func
+def cell_column(thread: wp.int32, columns: wp.int32, side: wp.int32, lanes: wp.int32) -> wp.int32:
+    """Column of the cell that a thread takes: neighbours take those of one set, so that their rays go the same way."""
+    group = lanes * side
+    place = thread % group
+    if thread - place + group > columns:
+        return thread
+    return thread - place + (place % lanes) * side + place / lanes
+
+
+@wp.func
+def first_of_set(i: wp.int32, j: wp.int32, side: wp.int32, count: wp.int32) -> wp.int32:
+    """First sample of a cell's set; ``count`` are all sets together."""
+    return count / (side * side) * ((i % side) * side + j % side)
+
+
+@wp.func
+def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
+    """Row or column at which a cell is estimated."""
+    return wp.min(cell * stride + stride / 2, size - 1)
+
+
 @functools.cache
 def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     if config.count > CHUNK and config.count % CHUNK:
         raise ValueError(f"count is {config.count}; expected up to {CHUNK} or a multiple of it")
     trace = make_trace(config.room.trace)
-    closest_proxy, closest_object = trace.closest_proxy, trace.closest_object
-    occluded_by_objects = trace.occluded_by_objects
-    mask_cone = make_mask_cone(min(config.count, CHUNK), config.near)
-    seen_proxy = make_seen_proxy(config.room)
+    closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
+    mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
+    seen_proxy, find_sender = make_seen_proxy(config.room), make_find_sender(config)
     traced = config.bounce == "traced"
     bounced = make_bounced(config.room) if traced else None
-    estimated = None if traced else make_estimated(config.room)
-    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes) if traced else None
-    look_wide = make_look_wide(config.room)
+    estimated, look_before = (None, None) if traced else (make_estimated(config.room), make_look_before(config.room))
     side = config.side
     chunk = min(config.count, CHUNK)
     asked = round(config.count * config.asking)
@@ -466,13 +659,9 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         if wp.static(config.parts > 1):
             part = i / surface_out.shape[0]
             i = i % surface_out.shape[0]
-        # Neighbouring threads take the cells of one set, so that their rays go the same way.
-        group = lanes * side
-        place = j % group
-        if j - place + group <= ratio_out.shape[1]:
-            j += (place % lanes) * side + place / lanes - place
-        row = wp.min(i * stride + stride / 2, rays.shape[0] - 1)
-        column = wp.min(j * stride + stride / 2, rays.shape[1] - 1)
+        j = cell_column(j, ratio_out.shape[1], side, lanes)
+        row = cell_pixel(i, stride, rays.shape[0])
+        column = cell_pixel(j, stride, rays.shape[1])
         surface_out[i, j] = -1
         rect = params[0].shadow_rect
         # The filter looks half a tile beyond the pixels that it writes.
@@ -492,46 +681,22 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
 
         point = hit.point
         own = hit.shape
-        everywhere = wp.uint64(0) - wp.uint64(1)
         without = wp.vec3(0.0)
         hidden = wp.vec3(0.0)
         sent = wp.vec3(0.0)
         returned = wp.vec3(0.0)
-        up = wp.vec3(0.0)
-        from_desk = wp.vec3(0.0)
-        brightest = float(0.0)
+        before = Before()
         # A set is in the order of its sequence: any first part of it is a smaller set.
-        first = samples.shape[0] / wp.static(side * side) * ((i % side) * side + j % side)
+        first = first_of_set(i, j, side, samples.shape[0])
         for block in range(wp.static(config.count // chunk)):
             at = first + block * wp.static(chunk)
-            virtual_mask = wp.uint64(0)
-            for index in range(scene.objects.shape[0]):
-                shape = scene.objects[index]
-                virtual_mask = virtual_mask | mask_cone(
-                    directions, samples, at, point, shape.position - point, bounding_radius(shape)
-                )
+            virtual_mask = mask_objects(scene, directions, samples, at, point)
             if wp.static(config.count == chunk):
                 if virtual_mask == wp.uint64(0):
                     return
-            proxy_mask = wp.uint64(0)
-            for index in range(scene.proxies.shape[0]):
-                shape = scene.proxies[index]
-                if shape.kind == PLANE:
-                    if index != own:
-                        proxy_mask = everywhere
-                elif shape.kind != BOX or index != own:
-                    proxy_mask = proxy_mask | mask_cone(
-                        directions, samples, at, point, shape.position - point, bounding_radius(shape)
-                    )
-            ball_mask = wp.uint64(0)
-            if wp.static(config.room.probes):
-                for index in range(room.probes.shape[0]):
-                    probe = room.probes[index]
-                    ball_mask = ball_mask | mask_cone(
-                        directions, samples, at, point, probe.center - point, probe.radius
-                    )
+            physical = mask_physical(scene, room, directions, samples, at, point, own)
             # Most samples meet nothing: they are but a sum.
-            met = virtual_mask | proxy_mask | ball_mask
+            met = virtual_mask | physical.proxies | physical.balls
             begin = part * wp.static(chunk // config.parts)
             bit = wp.uint64(1) << wp.uint64(begin)
             # Its end is no constant: unrolled, the kernel would hold its rays many times over.
@@ -552,41 +717,23 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         measure = samples[at + k].measure
                         weight = cosine * grown * measure
                         origin = offset_origin(point, hit.geometric_normal, direction, hit.error)
-                        radiance = samples[at + k].radiance
-                        if (proxy_mask & bit) != wp.uint64(0):
-                            proxy = closest_proxy(scene, origin, direction, reach)
-                            if proxy.shape >= 0:
-                                reach = proxy.t
-                                seen = wp.vec2(-1.0, -1.0)
-                                if wp.static(traced):
-                                    seen = find_in_frame(
-                                        params[0],
-                                        frame.shape[0],
-                                        frame.shape[1],
-                                        scene,
-                                        room.probes,
-                                        proxy.point,
-                                        proxy.geometric_normal,
-                                    )
-                                if seen[0] >= 0.0:
-                                    radiance = look_up(frame, decode_table, seen[0], seen[1])
-                                else:
-                                    # Where the ball saw it; a lamp right beside it is not its light.
-                                    radiance = wp.min(
-                                        sample_latlong(room.environment, proxy.point - samples[at + k].origin),
-                                        wp.vec3(1.0, 1.0, 1.0),
-                                    )
-                        if wp.static(config.room.probes):
-                            if (ball_mask & bit) != wp.uint64(0):
-                                for index in range(room.probes.shape[0]):
-                                    probe = room.probes[index]
-                                    t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
-                                    if t < reach:
-                                        reach = t
-                                        normal = (origin + t * direction - probe.center) / probe.radius
-                                        radiance = wp.cw_mul(
-                                            probe.reflectance, look_wide(room, reflect(-direction, normal))
-                                        )
+                        by_proxy = (physical.proxies & bit) != wp.uint64(0)
+                        by_ball = (physical.balls & bit) != wp.uint64(0)
+                        sender = find_sender(
+                            params[0],
+                            frame,
+                            decode_table,
+                            scene,
+                            room,
+                            samples[at + k],
+                            origin,
+                            direction,
+                            reach,
+                            by_proxy,
+                            by_ball,
+                        )
+                        radiance = sender.radiance
+                        reach = sender.distance
                         without += weight * radiance
                         if (virtual_mask & bit) != wp.uint64(0):
                             other = Hit()
@@ -606,24 +753,11 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                                         params[0], frame, decode_table, scene, room, other, direction, alpha, seed
                                     )
                                 else:
-                                    if up == wp.vec3(0.0, 0.0, 0.0):
-                                        up = hit.geometric_normal
-                                        if wp.dot(up, direction) < 0.0:
-                                            up = -up
-                                        brightest = MAX_BRIGHTNESS * wp.max(look_wide(room, up))
-                                        if wp.static(config.room.diffuse == "sh"):
-                                            from_desk = sh_irradiance(room.irradiance_sh, -up)
-                                            brightest = (
-                                                MAX_BRIGHTNESS * wp.max(sh_irradiance(room.irradiance_sh, up)) / wp.pi
-                                            )
-                                        if wp.static(config.room.diffuse == "map"):
-                                            from_desk = sample_latlong(room.irradiance_map, -up)
-                                            brightest = (
-                                                MAX_BRIGHTNESS * wp.max(sample_latlong(room.irradiance_map, up)) / wp.pi
-                                            )
-                                    light = estimated(scene, room, other, direction, alpha, up, from_desk)
+                                    if before.up == wp.vec3(0.0, 0.0, 0.0):
+                                        before = look_before(room, hit.geometric_normal, direction)
+                                    light = estimated(scene, room, other, direction, alpha, before.up, before.from_desk)
                                     stands_for *= wp.min(
-                                        brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0
+                                        before.brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0
                                     )
                                     sent += stands_for * light.room
                                     returned += stands_for * light.desk
@@ -667,6 +801,315 @@ def join_parts_kernel(
         returned += sums[part * KINDS + 3, i, j]
     ratio_out[i, j] = ratio_of(without, hidden, ratio_out[i, j][3])
     bounced_out[i, j] = bounced_of(without, hidden, sent, returned)
+
+
+# The same in four steps, for a CUDA device. A ray that asks what an object sends traces three more, and few ask: in the
+# one kernel the other threads of its warp wait for it. So rays only stop at first; where one did, the cell's light is
+# summed; those that ask are listed, and as many threads as there are ask side by side.
+
+
+@wp.struct
+class Steps:
+    """What the steps hand on, ``parts`` threads having a share of each cell's samples."""
+
+    hits: wp.array3d[wp.uint32]  # (parts, rows, columns): samples of a part that an object hides, a bit each
+    starts: wp.array3d[wp.int32]  # (parts, rows, columns): place in the list of the first of them that asks
+    items: wp.array[wp.int32]  # the list: number of the cell times CHUNK, and the sample
+    listed: wp.array[wp.int32]  # (1,): its length
+    sums: wp.array3d[wp.vec3]  # (2 * parts, rows, columns): light without the objects, and what they hide
+    sent: wp.array2d[wp.vec3]  # (2, items): what objects send of the room, and of the desk
+
+
+@functools.cache
+def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
+    """Kernel of the first step: samples that objects hide, and the list of those that ask what these send."""
+    size = config.count // config.parts
+    asked = round(config.count * config.asking)
+    side = config.side
+    mask_objects, mask_physical = make_masks(config, size)
+    trace = make_trace(config.room.trace)
+    closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
+    seen_proxy = make_seen_proxy(config.room)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_hits_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        room: Room,
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        stride: wp.int32,
+        # Out:
+        ratio_out: wp.array2d[wp.vec4],
+        bounced_out: wp.array2d[wp.vec3],
+        surface_out: wp.array2d[wp.int32],
+        steps_out: Steps,
+    ):
+        part, i, thread = wp.tid()
+        j = cell_column(thread, surface_out.shape[1], side, WARP_LANES)
+        row = cell_pixel(i, stride, rays.shape[0])
+        column = cell_pixel(j, stride, rays.shape[1])
+        key = wp.int32(-1)
+        found = wp.uint32(0)
+        rect = params[0].shadow_rect
+        # The filter looks half a tile beyond the pixels that it writes.
+        margin = stride * side
+        wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
+        if rect[0] < rect[1] and inside_rect(row, column, wide):
+            hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+            if hit.shape >= 0:
+                key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                if part == 0:
+                    ratio_out[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+                    bounced_out[i, j] = wp.vec3(0.0)
+                begin = part * size
+                at = first_of_set(i, j, side, samples.shape[0]) + begin
+                virtual_mask = mask_objects(scene, directions, samples, at, hit.point)
+                if virtual_mask != wp.uint64(0):
+                    physical = mask_physical(scene, room, directions, samples, at, hit.point, hit.shape)
+                    asking = wp.int32(0)
+                    # Its end is no constant: unrolled, the kernel would hold its rays many times over.
+                    for k in range(begin, begin + size):
+                        bit = wp.uint64(1) << wp.uint64(k - begin)
+                        if (virtual_mask & bit) == wp.uint64(0):
+                            continue
+                        direction = directions[at + k - begin]
+                        reach = float(FAR)
+                        if wp.static(config.near):
+                            toward = sample_toward(samples[at + k - begin], hit.point)
+                            direction = toward.direction
+                            reach = toward.distance
+                        if wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction)) <= 0.0:
+                            continue
+                        origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                        if (physical.proxies & bit) != wp.uint64(0):
+                            proxy = closest_proxy(scene, origin, direction, reach)
+                            reach = wp.min(reach, proxy.t)
+                        if wp.static(config.room.probes):
+                            if (physical.balls & bit) != wp.uint64(0):
+                                for index in range(room.probes.shape[0]):
+                                    probe = room.probes[index]
+                                    t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
+                                    reach = wp.min(reach, t)
+                        if occluded_by_objects(scene, origin, direction, reach):
+                            found = found | (wp.uint32(1) << wp.uint32(k - begin))
+                            if k < asked:
+                                asking += 1
+                    if asking > 0:
+                        start = wp.atomic_add(steps_out.listed, 0, asking)
+                        steps_out.starts[part, i, j] = start
+                        for k in range(begin, wp.min(begin + size, asked)):
+                            if (found & (wp.uint32(1) << wp.uint32(k - begin))) != wp.uint32(0):
+                                steps_out.items[start] = (i * surface_out.shape[1] + j) * CHUNK + k
+                                start += 1
+        if part == 0:
+            surface_out[i, j] = key
+        steps_out.hits[part, i, j] = found
+
+    return find_hits_kernel
+
+
+@wp.func
+def any_hit(hits: wp.array3d[wp.uint32], i: wp.int32, j: wp.int32) -> wp.bool:
+    """Whether an object hides any sample from a cell."""
+    found = wp.uint32(0)
+    for part in range(hits.shape[0]):
+        found = found | hits[part, i, j]
+    return found != wp.uint32(0)
+
+
+@functools.cache
+def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
+    """Kernel of the second step: light of the room, and how much of it is hidden, where something is."""
+    size = config.count // config.parts
+    side = config.side
+    _, mask_physical = make_masks(config, size)
+    seen_proxy, find_sender = make_seen_proxy(config.room), make_find_sender(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sum_light_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        directions: wp.array[wp.vec3],
+        flux: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        stride: wp.int32,
+        surface: wp.array2d[wp.int32],
+        # Out:
+        steps_out: Steps,
+    ):
+        part, i, thread = wp.tid()
+        j = cell_column(thread, surface.shape[1], side, WARP_LANES)
+        if not any_hit(steps_out.hits, i, j):
+            return
+        pixel = rays[cell_pixel(i, stride, rays.shape[0]), cell_pixel(j, stride, rays.shape[1])]
+        hit = seen_proxy(params[0], pixel, scene, room.probes)
+        begin = part * size
+        at = first_of_set(i, j, side, samples.shape[0]) + begin
+        physical = mask_physical(scene, room, directions, samples, at, hit.point, hit.shape)
+        met = physical.proxies | physical.balls
+        found = wp.uint64(steps_out.hits[part, i, j])
+        without = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        for k in range(at, at + size):
+            bit = wp.uint64(1) << wp.uint64(k - at)
+            direction = directions[k]
+            reach = float(FAR)
+            grown = float(1.0)
+            if wp.static(config.near):
+                toward = sample_toward(samples[k], hit.point)
+                direction = toward.direction
+                reach = toward.distance
+                grown = toward.measure / samples[k].measure
+            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
+            if cosine > 0.0:
+                light = cosine * grown * flux[k]
+                if (met & bit) != wp.uint64(0):
+                    origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                    by_proxy = (physical.proxies & bit) != wp.uint64(0)
+                    by_ball = (physical.balls & bit) != wp.uint64(0)
+                    sender = find_sender(
+                        params[0],
+                        frame,
+                        decode_table,
+                        scene,
+                        room,
+                        samples[k],
+                        origin,
+                        direction,
+                        reach,
+                        by_proxy,
+                        by_ball,
+                    )
+                    light = cosine * grown * samples[k].measure * sender.radiance
+                without += light
+                if (found & bit) != wp.uint64(0):
+                    hidden += light
+        steps_out.sums[2 * part, i, j] = without
+        steps_out.sums[2 * part + 1, i, j] = hidden
+
+    return sum_light_kernel
+
+
+@functools.cache
+def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
+    """Kernel of the third step: what objects send along the listed rays."""
+    asked = round(config.count * config.asking)
+    side = config.side
+    closest_object = make_trace(config.room.trace).closest_object
+    seen_proxy = make_seen_proxy(config.room)
+    traced = config.bounce == "traced"
+    bounced = make_bounced(config.room) if traced else None
+    estimated, look_before = (None, None) if traced else (make_estimated(config.room), make_look_before(config.room))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def ask_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        directions: wp.array[wp.vec3],
+        samples: wp.array[RoomSample],
+        stride: wp.int32,
+        columns: wp.int32,
+        threads: wp.int32,
+        # Out:
+        steps_out: Steps,
+    ):
+        for place in range(wp.tid(), steps_out.listed[0], threads):
+            item = steps_out.items[place]
+            i = item / CHUNK / columns
+            j = item / CHUNK % columns
+            index = first_of_set(i, j, side, samples.shape[0]) + item % CHUNK
+            row = cell_pixel(i, stride, rays.shape[0])
+            column = cell_pixel(j, stride, rays.shape[1])
+            hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+            direction = directions[index]
+            measure = samples[index].measure
+            if wp.static(config.near):
+                toward = sample_toward(samples[index], hit.point)
+                direction = toward.direction
+                measure = toward.measure
+            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
+            origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+            sent = wp.vec3(0.0)
+            returned = wp.vec3(0.0)
+            # What is nearer than all that is physical is nearest.
+            other = closest_object(scene, origin, direction, FAR)
+            if other.shape >= 0:
+                stands_for = cosine * measure * wp.static(config.count / asked)
+                alpha = caustic_alpha(scene.objects[other.shape], hit.point)
+                if wp.static(traced):
+                    seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
+                    sent = stands_for * bounced(
+                        params[0], frame, decode_table, scene, room, other, direction, alpha, seed
+                    )
+                else:
+                    before = look_before(room, hit.geometric_normal, direction)
+                    light = estimated(scene, room, other, direction, alpha, before.up, before.from_desk)
+                    stands_for *= wp.min(before.brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0)
+                    sent = stands_for * light.room
+                    returned = stands_for * light.desk
+            steps_out.sent[0, place] = sent
+            if wp.static(not traced):
+                steps_out.sent[1, place] = returned
+
+    return ask_kernel
+
+
+@functools.cache
+def make_join_steps_kernel(config: RoomShadowConfig) -> wp.Kernel:
+    """Kernel of the last step: estimates of the cells from which something is hidden."""
+    size = config.count // config.parts
+    asked = round(config.count * config.asking)
+    traced = config.bounce == "traced"
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def join_steps_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        steps: Steps,
+        # Out:
+        ratio_out: wp.array2d[wp.vec4],
+        bounced_out: wp.array2d[wp.vec3],
+        shaded_out: wp.array2d[wp.int32],
+    ):
+        """Sums in the order of the samples, wherever their threads put them: the same bits in every run."""
+        i, j = wp.tid()
+        if not any_hit(steps.hits, i, j):
+            return
+        without = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        sent = wp.vec3(0.0)
+        returned = wp.vec3(0.0)
+        for part in range(steps.hits.shape[0]):
+            without += steps.sums[2 * part, i, j]
+            hidden += steps.sums[2 * part + 1, i, j]
+            found = steps.hits[part, i, j]
+            place = steps.starts[part, i, j]
+            for k in range(part * size, wp.min((part + 1) * size, asked)):
+                if (found & (wp.uint32(1) << wp.uint32(k - part * size))) != wp.uint32(0):
+                    sent += steps.sent[0, place]
+                    if wp.static(not traced):
+                        returned += steps.sent[1, place]
+                    place += 1
+        unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
+        if shaded_out.shape[0] > 0 and not unchanged:
+            shaded_out[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
+        ratio_out[i, j] = ratio_of(without, hidden, ratio_out[i, j][3])
+        bounced_out[i, j] = bounced_of(without, hidden, sent, returned)
+
+    return join_steps_kernel
 
 
 @wp.func
@@ -857,6 +1300,7 @@ def shade_room(
     *,
     shaded_out: wp.array2d[wp.int32] | None = None,
     sums_out: wp.array3d[wp.vec3] | None = None,
+    steps: Steps | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Estimate the ratio for one pixel of every ``stride x stride``, each with one set of samples.
@@ -878,8 +1322,45 @@ def shade_room(
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         sums_out: Scratch of ``sums_shape``; needed if ``config.parts`` is not 1, and then ``rows`` must be None.
+        steps: Scratch of ``make_steps``: do it in steps; ``rows`` must be None, and ``sums_out`` is not needed.
         rows: Band of rows of the outputs; None means all.
     """
+    if steps is not None:
+        seen = [params, rays]
+        light = [frame, decode_table, scene, room, directions]
+        threads = min(steps.items.shape[0], ASKING_THREADS)
+        cells = steps.hits.shape
+        device = rays.device
+        steps.listed.zero_()
+        wp.launch(
+            make_find_hits_kernel(config),
+            cells,
+            [*seen, scene, room, directions, samples, stride],
+            [ratio_out, bounced_out, surface_out, steps],
+            device=device,
+        )
+        wp.launch(
+            make_sum_light_kernel(config),
+            cells,
+            [*seen, *light, flux, samples, stride, surface_out],
+            [steps],
+            device=device,
+        )
+        wp.launch(
+            make_ask_kernel(config),
+            threads,
+            [*seen, *light, samples, stride, cells[2], threads],
+            [steps],
+            device=device,
+        )
+        wp.launch(
+            make_join_steps_kernel(config),
+            cells[1:],
+            [params, steps],
+            [ratio_out, bounced_out, shaded_out],
+            device=device,
+        )
+        return
     lanes = 1 if rays.device.is_cpu else WARP_LANES
     cells = ratio_out.shape
     launch_rows(
@@ -894,12 +1375,33 @@ def shade_room(
         wp.launch(join_parts_kernel, cells, [surface_out, sums_out], [ratio_out, bounced_out], device=rays.device)
 
 
-def count_parts(rows: int, columns: int) -> int:
-    """Threads of a CUDA device per cell: as many as it takes to fill it."""
-    parts = MAX_PARTS
+def count_parts(rows: int, columns: int, most: int = MAX_PARTS) -> int:
+    """Threads of a CUDA device per cell: as many as it takes to fill it, up to ``most``, a power of 2."""
+    parts = most
     while parts > 1 and parts * rows * columns > ENOUGH_THREADS:
         parts //= 2
     return parts
+
+
+def make_steps(config: RoomShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Steps | None:
+    """Scratch for ``shade_room`` to find so many cells in steps, or None where it needs too much or more than a set.
+
+    Args:
+        config: As for ``shade_room``; ``config.parts`` at least 2, as one part's samples are the bits of a word.
+        rows: Rows of cells.
+        columns: Cells in a row.
+        device: Where.
+    """
+    items = rows * columns * round(config.count * config.asking)
+    if config.count > CHUNK or config.count // config.parts > WORD or items > MOST_ITEMS:
+        return None
+    cells = config.parts, rows, columns
+    steps = Steps()
+    steps.hits, steps.starts = (wp.empty(cells, dtype=kind, device=device) for kind in (wp.uint32, wp.int32))
+    steps.items, steps.listed = wp.empty(items, dtype=wp.int32, device=device), wp.zeros(1, wp.int32, device=device)
+    steps.sums = wp.empty((2 * cells[0], *cells[1:]), dtype=wp.vec3, device=device)
+    steps.sent = wp.empty((1 if config.bounce == "traced" else 2, items), dtype=wp.vec3, device=device)
+    return steps
 
 
 def sums_shape(parts: int, rows: int, columns: int) -> tuple[int, int, int]:

@@ -110,9 +110,13 @@ class View:
     def cells(self, stride):
         return tuple(-(-n // stride) for n in self.size)
 
-    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False):
+    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, parts=1):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
+        sums = None
+        if parts > 1:
+            poison = wp.vec3(math.nan, math.nan, math.nan)
+            sums = wp.full(desk_cells.share_sums_shape(parts, *share.shape), poison, dtype=wp.vec3)
         desk_cells.share_room(
             self.config,
             self.params,
@@ -126,6 +130,7 @@ class View:
             share,
             surface,
             bounced=bounced,
+            sums_out=sums,
             rows=rows,
         )
         return share.numpy(), surface.numpy()
@@ -342,6 +347,56 @@ def test_share_matches_twin(device):
     assert off.max() < 0.05
     check_error("relight", share[on_desk][off <= SUM_ERROR], expected[on_desk][off <= SUM_ERROR])
     assert expected[on_desk].min() < 0.7
+
+
+@pytest.mark.parametrize("parts", [2, 16])
+def test_threads_that_share_a_cell_find_the_same(device, parts):
+    """First where a light shines, then where bounced light arrives as well; 100 samples are no multiple of 16."""
+    samples = draw(with_sun(9, 40, 300.0))[2]
+    room_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
+    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), [ball((-0.1, 0.03, 0.05), 0.04)], share=True)
+    away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
+    lit, dark = view.lights, records(Light, away)
+    bounced = np.zeros((*view.cells(4), 3))
+    bounced[4:8, 3:9] = 0.1
+    results = []
+    for count in (1, parts):
+        out = wp.full(view.cells(4), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.full(view.cells(4), 7, dtype=wp.int32)
+        more = {"count": 100, "out": out, "parts": count}
+        view.lights = lit
+        first = [found.copy() for found in view.share(samples, **more)]
+        view.lights = dark
+        none = view.share(samples, **more)[1]
+        assert (none == -1).all()
+        again = view.share(samples, **more, bounced=True, cells=cells_of(view, 4, bounced=bounced))
+        results.append((*first, *again))
+    one, many = results
+    for which in (1, 3):
+        np.testing.assert_array_equal(many[which], one[which])
+        on_desk = one[which] >= 0
+        assert on_desk.any()
+        np.testing.assert_allclose(many[which - 1][on_desk], one[which - 1][on_desk], atol=SUM_ERROR)
+    assert one[0][one[1] >= 0].min() < 0.7
+    assert 0 < (one[3] >= 0).sum() < (one[1] >= 0).sum()
+
+
+@pytest.mark.parametrize("parts", [2, 16])
+def test_cells_that_are_found_already_stay_as_they_are(device, parts):
+    """The second pass adds to the first: it neither estimates its cells again nor reads sums of an earlier frame."""
+    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), share=True)
+    samples = draw(sky())[2]
+    kept = np.full(view.cells(4), -1, np.int32)
+    kept[2:4, 2:9] = 0
+    out = wp.full(view.cells(4), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.array(kept, dtype=wp.int32)
+    bounced = np.zeros((*view.cells(4), 3))
+    bounced[3:8, 3:9] = 0.1
+    cells = cells_of(view, 4, bounced=bounced)
+    share, surface = view.share(samples, out=out, bounced=True, cells=cells, parts=parts)
+    assert (share[kept == 0] == 7.0).all()
+    added = (surface >= 0) & (kept < 0)
+    assert added.sum() > 10
+    assert (share[added] <= 1.0).all()
+    assert (share[surface < 0] == 7.0).all()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -97,6 +97,7 @@ def run(
     out=None,
     near=False,
     parts=1,
+    in_steps=False,
 ):
     kinds = tuple(tuple(sorted({thing["kind"] for thing in things})) for things in (objects, proxies))
     forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
@@ -129,6 +130,8 @@ def run(
     bounced = wp.zeros(cells, wp.vec3)
     shaded = wp.full(room_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
     rays = wp.array(RAYS, dtype=wp.vec2)
+    steps = room_shadow.make_steps(config, *cells, rays.device) if in_steps else None
+    assert in_steps == (steps is not None)
     room_shadow.shade_room(
         config,
         params,
@@ -143,6 +146,7 @@ def run(
         bounced,
         surface,
         shaded_out=shaded,
+        steps=steps,
         sums_out=wp.full(room_shadow.sums_shape(parts, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
         rows=rows,
     )
@@ -534,13 +538,63 @@ def test_bands_of_rows_and_rectangles(device, stride):
     assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
 
 
+@pytest.mark.parametrize("asking", [1.0, 0.5])
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
-def test_threads_that_share_a_cell_find_the_same(device, bounce):
+def test_threads_that_share_a_cell_find_the_same(device, bounce, asking):
+    """By one kernel or in steps: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
-    item, balls = [sphere((0, 0, 0.05), 0.05)], [{"center": (0.1, 0, 0.03), "radius": 0.03}]
-    one, eight = (run(drawn, item, probes=balls, stride=2, bounce=bounce, albedo=0.5, parts=parts) for parts in (1, 8))
+    room_samples.place_lamps(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    scene = {
+        "objects": [sphere((0, 0, 0.05), 0.05), shape(BOX, (-0.1, -0.1, 0.03), (0.03, 0.02, 0.03))],
+        "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),
+        "probes": [{"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}],
+        "stride": 2,
+        "bounce": bounce,
+        "asking": asking,
+        "albedo": 0.5,
+        "near": True,
+    }
+    one = run(drawn, **scene)
     assert one.min() < 0.7
-    np.testing.assert_allclose(eight, one, atol=SUM_ERROR)
+    np.testing.assert_allclose(run(drawn, **scene, parts=8), one, atol=SUM_ERROR)
+    for parts in (2, 8):
+        steps = run(drawn, **scene, parts=parts, in_steps=True)
+        np.testing.assert_allclose(steps, one, atol=SUM_ERROR)
+        np.testing.assert_array_equal(run(drawn, **scene, parts=parts, in_steps=True), steps)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, parts=8, in_steps=True)
+    assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
+
+
+def test_steps_take_one_set_and_little_memory(device):
+    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+
+    def steps(count, parts, asking=1.0):
+        config = room_shadow.RoomShadowConfig(forms, count, 4, "traced", asking, parts=parts)
+        return room_shadow.make_steps(config, 10, 20, device)
+
+    found = steps(64, 4, 0.5)
+    assert (found.hits.shape, found.items.shape) == ((4, 10, 20), (10 * 20 * 32,))
+    assert steps(64, 1) is None, "more samples than a word has bits"
+    assert steps(128, 8) is None, "more than a set"
+    config = room_shadow.RoomShadowConfig(forms, 64, 4, "traced", parts=2)
+    assert room_shadow.make_steps(config, 1080, 1920, device) is None
+
+
+@wp.kernel(enable_backward=False)
+def _columns_kernel(side: wp.int32, lanes: wp.int32, out: wp.array[wp.int32]):
+    thread = wp.tid()
+    out[thread] = room_shadow.cell_column(thread, out.shape[0], side, lanes)
+
+
+@pytest.mark.parametrize("columns", [5, 128, 300, 640])
+def test_every_column_has_a_thread(device, columns):
+    for lanes in (1, 32):
+        out = wp.zeros(columns, wp.int32)
+        wp.launch(_columns_kernel, columns, [4, lanes], [out])
+        taken = out.numpy()
+        np.testing.assert_array_equal(np.sort(taken), np.arange(columns))
+        whole = taken[: columns // (4 * lanes) * 4 * lanes].reshape(-1, lanes)
+        assert (whole % 4 == whole[:, :1] % 4).all(), "a warp's cells are of one set"
 
 
 def test_half_resolution_agrees(device):

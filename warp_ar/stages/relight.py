@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels import desk_cells, relight
+from warp_ar.kernels.room_shadow import count_parts
 from warp_ar.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shares_room
@@ -135,10 +136,15 @@ class Relight(Stage):
         grain = _grain(self.request)
         if config.share:
             share, surface, size = arrays["relight_share"], arrays["relight_share_surface"], cells.share_stride
+            parts = 1 if device.is_cpu else count_parts(*share.shape, desk_cells.SHARE_PARTS)
+            sums = None
+            if parts > 1:
+                sums = wp.empty(desk_cells.share_sums_shape(parts, *share.shape), dtype=wp.vec3, device=device)
 
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
                 own = arrays["room_samples"], grain.samples, size, share, surface
-                desk_cells.share_room(place, *seen, scene, lights, desk, *own, bounced=bounced, rows=rows)
+                more = {"bounced": bounced, "sums_out": sums, "rows": rows}
+                desk_cells.share_room(place, *seen, scene, lights, desk, *own, **more)
 
             desk_cells.make_share_room_kernel(place)
             passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))

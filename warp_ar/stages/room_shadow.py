@@ -97,10 +97,6 @@ class RoomShadow(Stage):
             "room_shadow_seen": ArraySpec(room_shadow.shaded_shape(*cells), wp.int32, -1),
             "room_shadow_bounced": ArraySpec(cells, wp.vec3),
         }
-        parts = room_shadow.count_parts(*cells)
-        specs["room_shadow_sums"] = ArraySpec(
-            room_shadow.sums_shape(parts, *cells) if parts > 1 else (0, 0, 0), wp.vec3
-        )
         return {**specs, **room_arrays(room_config(self.request), self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -108,9 +104,15 @@ class RoomShadow(Stage):
         rung = RUNGS[self.rung]
         forms = room_config(self.request)
         near = knows_lamps(self.request)
-        parts = 1 if device.is_cpu else room_shadow.count_parts(*arrays["room_shadow_ratio"].shape)
+        cells = arrays["room_shadow_ratio"].shape
+        parts = 1 if device.is_cpu else room_shadow.count_parts(*cells)
         config = room_shadow.RoomShadowConfig(forms, rung.count, rung.side, rung.bounce, rung.asking, near, parts)
-        room_shadow.make_room_shadow_kernel(config)
+        steps = None if device.is_cpu else room_shadow.make_steps(config, *cells, device)
+        sums = None
+        if steps is None:
+            room_shadow.make_room_shadow_kernel(config)
+            if parts > 1:
+                sums = wp.empty(room_shadow.sums_shape(parts, *cells), dtype=wp.vec3, device=device)
         room_shadow.make_filter_ratio_kernel(rung.side)
         room_shadow.make_spread_ratio_kernel(forms)
         room = make_room(forms, self.request, arrays, self.name)
@@ -123,7 +125,7 @@ class RoomShadow(Stage):
         inputs = [arrays["params"], arrays["rays"], frame, arrays["decode"], arrays["ray_scene"]]
         shadow_rows, stride = arrays["shadow_rows"], cell_size(rung, self.request.size[1])
 
-        def cells() -> Rows:
+        def cell_rows() -> Rows:
             start, stop = shadow_rows()
             reach = rung.side  # the filter looks beyond the rows that it writes
             return max(start // stride - reach, 0), min(-(-stop // stride) + reach, ratio.shape[0])
@@ -142,7 +144,8 @@ class RoomShadow(Stage):
                 bounced,
                 surface,
                 shaded_out=shaded,
-                sums_out=arrays["room_shadow_sums"],
+                sums_out=sums,
+                steps=steps,
                 rows=rows,
             )
 
@@ -167,7 +170,7 @@ class RoomShadow(Stage):
             )
 
         return [
-            Pass(estimate, rows=ratio.shape[0], extent=cells),
-            Pass(average, rows=ratio.shape[0], extent=cells),
+            Pass(estimate, rows=ratio.shape[0], extent=cell_rows),
+            Pass(average, rows=ratio.shape[0], extent=cell_rows),
             Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
         ]
