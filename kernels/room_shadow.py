@@ -187,10 +187,11 @@ def make_mask_cone(count: int, near: bool) -> wp.Function:
         threshold = cone_threshold(to_center, radius)
         mask = wp.uint64(0)
         bit = wp.uint64(1)
-        for k in range(count):
-            direction = directions[first + k]
+        # Its end is no constant: a loop that is unrolled loads all of its samples at once, into as many registers.
+        for k in range(first, first + count):
+            direction = directions[k]
             if wp.static(near):
-                direction = sample_toward(samples[first + k], point).direction
+                direction = sample_toward(samples[k], point).direction
             if wp.dot(direction, to_center) >= threshold:
                 mask = mask | bit
             bit = bit << wp.uint64(1)
