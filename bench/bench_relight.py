@@ -10,6 +10,7 @@ import warp as wp
 from bench.common import measure, report
 from warp_ar.kernels import color, desk_cells, relight, room_samples, summed_area
 from warp_ar.kernels.room_samples import RoomSample
+from warp_ar.kernels.room_shadow import count_parts
 from warp_ar.kernels.structs import BOX, PLANE, POINT, SPHERE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
 
@@ -64,11 +65,15 @@ def _cells(
     count = wp.zeros(patches.shape[0], wp.int32, device=device)
     desk = relight.make_desk(config, frame, decode, table, probes, keys, room, cells=cells)
     seen = params, rays, scene
-    shares = desk, samples, 256, share_stride, cells.share, cells.share_surface
+    shares = desk, samples, 128, share_stride, cells.share, cells.share_surface
+    parts = count_parts(*cells.share.shape, desk_cells.SHARE_PARTS) if wp.get_device(device).is_cuda else 1
+    scratch = None
+    if parts > 1:
+        scratch = wp.zeros(desk_cells.share_sums_shape(parts, *cells.share.shape), wp.vec3, device=device)
     sums_out = cells.bounced, cells.bounced_surface
     known = frame, decode, table, scene, probes, lights, keys, room, out
     passes: dict[str, Callable[[], None]] = {
-        "share_room": lambda: desk_cells.share_room(place, *seen, lights, *shares),
+        "share_room": lambda: desk_cells.share_room(place, *seen, lights, *shares, sums_out=scratch),
         "send_light": lambda: desk_cells.send_light(place, *seen, lights, desk, patch_stride, patches),
         "list_patches": lambda: desk_cells.list_patches(patches, listed, count),
         "gather_light": lambda: desk_cells.gather_light(

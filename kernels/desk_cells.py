@@ -32,7 +32,7 @@ import warp as wp
 
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.relight import (
     DEFAULT_REFLECTANCE,
     Desk,
@@ -175,7 +175,7 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def share_room_kernel(
         # In:
         row_start: wp.int32,
@@ -313,7 +313,7 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
     seen_desk = make_seen_desk(config)
     lit_by = make_lit_by(dataclasses.replace(config.relight, bounced=False))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def send_light_kernel(
         # In:
         row_start: wp.int32,
@@ -378,7 +378,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
     seen_desk = make_seen_desk(config)
     mean_facing = make_mean_facing(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def gather_light_kernel(
         # In:
         row_start: wp.int32,

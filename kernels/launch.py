@@ -17,6 +17,13 @@ import warp as wp
 Rows = tuple[int, int]
 """A band of rows: first, and one past the last."""
 
+MOST_REGISTERS = 80
+"""Registers of a CUDA thread in kernels that trace rays.
+
+They wait for memory most of their time. Left alone they take 130 to 255, with which a multiprocessor of 65,536 holds
+one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
+"""
+
 
 def launch_rows(
     kernel: wp.Kernel,

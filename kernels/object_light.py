@@ -22,7 +22,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_shade_unoccluded
 from warp_ar.kernels.room_samples import RoomSample, sample_toward, sobol_second
@@ -128,7 +128,7 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
     side = config.side
     lobes = config.lobe_count
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def object_light_kernel(
         row_start: wp.int32,
         # In:

@@ -66,7 +66,7 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.lamps import add_nearness
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
@@ -427,7 +427,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     closest_proxy = make_trace(config.trace).closest_proxy
     lit_by = make_lit_by(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def relight_kernel(
         # In:
         row_start: wp.int32,

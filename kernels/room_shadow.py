@@ -56,7 +56,7 @@ import warp as wp
 
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_mirrored, make_shade_unoccluded
@@ -432,7 +432,7 @@ class Sender:
 
 @functools.cache
 def make_find_sender(config: RoomShadowConfig) -> wp.Function:
-    """``find_sender(params, frame, decode_table, scene, room, sample, origin, direction, distance, ...) -> Sender``.
+    """``find_sender(params, frame, decode_table, scene, room, samples, index, origin, direction, ...) -> Sender``.
 
     The sample itself, ``distance`` away, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
     ``by_ball``; those that the ray cannot meet need not be asked.
@@ -444,12 +444,13 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
 
     @wp.func(module="unique")
     def find_sender(
-        params: FrameParams,
+        params: wp.array[FrameParams],
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
         room: Room,
-        sample: RoomSample,
+        samples: wp.array[RoomSample],
+        index: wp.int32,
         origin: wp.vec3,
         direction: wp.vec3,
         distance: wp.float32,
@@ -457,7 +458,7 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
         by_ball: wp.bool,
     ) -> Sender:
         sender = Sender()
-        sender.radiance = sample.radiance
+        sender.radiance = samples[index].radiance
         sender.distance = distance
         if by_proxy:
             proxy = closest_proxy(scene, origin, direction, distance)
@@ -466,7 +467,7 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
                 seen = wp.vec2(-1.0, -1.0)
                 if wp.static(traced):
                     seen = find_in_frame(
-                        params,
+                        params[0],
                         frame.shape[0],
                         frame.shape[1],
                         scene,
@@ -479,12 +480,12 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
                 else:
                     # Where the ball saw it; a lamp right beside it is not its light.
                     sender.radiance = wp.min(
-                        sample_latlong(room.environment, proxy.point - sample.origin), wp.vec3(1.0, 1.0, 1.0)
+                        sample_latlong(room.environment, proxy.point - samples[index].origin), wp.vec3(1.0, 1.0, 1.0)
                     )
         if wp.static(config.room.probes):
             if by_ball:
-                for index in range(room.probes.shape[0]):
-                    probe = room.probes[index]
+                for ball in range(room.probes.shape[0]):
+                    probe = room.probes[ball]
                     t = intersect_sphere(probe.radius, origin - probe.center, direction, sender.distance)
                     if t < sender.distance:
                         sender.distance = t
@@ -721,12 +722,13 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         by_proxy = (physical.proxies & bit) != wp.uint64(0)
                         by_ball = (physical.balls & bit) != wp.uint64(0)
                         sender = find_sender(
-                            params[0],
+                            params,
                             frame,
                             decode_table,
                             scene,
                             room,
-                            samples[at + k],
+                            samples,
+                            at + k,
                             origin,
                             direction,
                             reach,
@@ -832,7 +834,7 @@ def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
     closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
     seen_proxy = make_seen_proxy(config.room)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def find_hits_kernel(
         # In:
         params: wp.array[FrameParams],
@@ -929,7 +931,7 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
     _, mask_physical = make_masks(config, size)
     seen_proxy, find_sender = make_seen_proxy(config.room), make_find_sender(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sum_light_kernel(
         # In:
         params: wp.array[FrameParams],
@@ -977,12 +979,13 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
                     by_proxy = (physical.proxies & bit) != wp.uint64(0)
                     by_ball = (physical.balls & bit) != wp.uint64(0)
                     sender = find_sender(
-                        params[0],
+                        params,
                         frame,
                         decode_table,
                         scene,
                         room,
-                        samples[k],
+                        samples,
+                        k,
                         origin,
                         direction,
                         reach,
@@ -1010,7 +1013,7 @@ def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
     bounced = make_bounced(config.room) if traced else None
     estimated, look_before = (None, None) if traced else (make_estimated(config.room), make_look_before(config.room))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def ask_kernel(
         # In:
         params: wp.array[FrameParams],
@@ -1213,7 +1216,7 @@ def make_spread_ratio_kernel(config: RoomConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
     seen_proxy = make_seen_proxy(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def spread_ratio_kernel(
         # In:
         row_start: wp.int32,
