@@ -288,8 +288,8 @@ def optix_rays(mitsuba: Any, mesh: Any, center: Any, directions: np.ndarray) -> 
     drjit = importlib.import_module("drjit")
     shape = mitsuba.Mesh("mesh", len(mesh.vertices), len(mesh.faces))
     parameters = mitsuba.traverse(shape)
-    parameters["vertex_positions"] = (mesh.vertices - np.asarray(center)).astype(np.float32).ravel()
-    parameters["faces"] = mesh.faces.astype(np.uint32).ravel()
+    parameters["vertex_positions"] = mitsuba.Float((mesh.vertices - np.asarray(center)).astype(np.float32).ravel())
+    parameters["faces"] = mitsuba.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
     scene = mitsuba.load_dict({"type": "scene", "mesh": shape})
     flat = np.ascontiguousarray(directions.reshape(-1, 3).T)
@@ -302,7 +302,8 @@ def optix_rays(mitsuba: Any, mesh: Any, center: Any, directions: np.ndarray) -> 
             depth = scene.ray_intersect_preliminary(ray, coherent=True).t
             drjit.eval(depth)
             drjit.sync_thread()
-            kernels = [entry for entry in drjit.kernel_history() if entry["type"] == drjit.KernelType.JIT]
+            kernels = drjit.kernel_history([drjit.KernelType.JIT])
+            assert kernels, "a run without a kernel has traced nothing"
             if run >= 5:
                 times.append(sum(entry["execution_time"] for entry in kernels))
     return np.isfinite(np.array(depth)), times
