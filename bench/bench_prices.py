@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from bench.common import report
-from warp_ar.auto_quality import BASE, NOW_AND_THEN, WORK
+from warp_ar.costs import BASE, NOW_AND_THEN, WORK
 from warp_ar.ladder import Knob, light_only, relevant_knobs, setting, turn
 from warp_ar.quality import PRESETS
 from warp_ar.scene import bundled_scenes

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from warp_ar.auto_quality import BASE
+from warp_ar.costs import BASE
 from warp_ar.ladder import KNOBS, WORDS, Choice, Price, choose, frontier, load_errors, setting
 from warp_ar.quality import BUDGETS, PRESETS, SHARE
 

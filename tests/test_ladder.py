@@ -94,6 +94,35 @@ def test_choice_is_the_best_of_all(seed):
             assert choice.milliseconds == pytest.approx(min(fitting), abs=EXACT)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_choice_is_the_best_of_all_where_knobs_multiply(seed):
+    """A knob that others share makes each of them dearer by a factor of its own, the more the dearer it is itself."""
+    prices = random_prices(seed)
+    shared = {price.rung: price.milliseconds for price in prices if price.knob == "knob0"}
+    factors = {"knob1": 0.5, "knob2": 0.1}
+    scales = {
+        "knob0": {rung: {knob: 1.0 + factor * ms for knob, factor in factors.items()} for rung, ms in shared.items()}
+    }
+    groups = [list(own) for _, own in itertools.groupby(prices, lambda price: price.knob)]
+    every = [
+        (
+            sum(p.milliseconds * scales["knob0"][pick[0].rung].get(p.knob, 1.0) for p in pick),
+            sum(p.error for p in pick),
+        )
+        for pick in itertools.product(*groups)
+    ]
+    front = frontier(prices, scales)
+    assert front != frontier(prices)
+    for budget in (12.0, 25.0, 60.0, 200.0, 1e9):
+        choice = choose(front, budget)
+        fitting = [error for cost, error in every if cost <= budget]
+        if fitting:
+            assert choice.milliseconds <= budget
+            assert choice.error == pytest.approx(min(fitting), abs=EXACT)
+        else:
+            assert choice.milliseconds == pytest.approx(min(cost for cost, _ in every), abs=EXACT)
+
+
 def test_choice_adds_up_and_covers_every_knob():
     prices = random_prices(3)
     by_name = {(price.knob, price.rung): price for price in prices}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import types
 from collections.abc import Mapping
@@ -133,6 +134,31 @@ def test_switching_sets_of_stages_gives_the_same_answer(monkeypatch: pytest.Monk
         arrays.touch("frame")
         scheduler.run()
         np.testing.assert_array_equal(arrays["b"].numpy(), value + 2)
+    scheduler.close()
+
+
+def test_alone_it_stays_on_the_callers_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And counts by the clock that it is given: one that grows by a second whenever it is read."""
+    arrays = inputs("cpu")
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device("cpu"), bands=3)
+    threads = []
+    launch_band = scheduler._launch_band
+    monkeypatch.setattr(
+        scheduler,
+        "_launch_band",
+        lambda step, rows: (threads.append(threading.get_ident()), launch_band(step, rows)),
+    )
+    clock = scheduler.clock
+    ticks = itertools.count()
+    with scheduler.alone(lambda: float(next(ticks))):
+        timings = scheduler.run()
+    assert [timing.milliseconds for timing in timings.values()] == [1e3, 1e3]
+    assert threads == [threading.get_ident()] * 2, "each pass whole"
+    np.testing.assert_array_equal(arrays["b"].numpy(), 2)
+    assert scheduler.clock is clock
+    arrays.touch("frame")
+    scheduler.run()
+    assert len(threads) > 4, "in bands again"
     scheduler.close()
 
 

@@ -25,8 +25,9 @@ import pytest
 from tests.test_auto_quality import even_costs
 from tests.test_pipeline import make_scene
 from warp_ar import live
-from warp_ar.auto_quality import AIM, Costs
+from warp_ar.auto_quality import AIM
 from warp_ar.calibrate import card_size, draw_card
+from warp_ar.costs import Costs
 from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.ladder import KNOBS
 from warp_ar.pipeline import Pipeline, pixel_rays

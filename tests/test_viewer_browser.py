@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from tests.test_auto_quality import even_costs
-from warp_ar.auto_quality import cost_key, write_costs
+from warp_ar.costs import cost_key, write_costs
 from warp_ar.ladder import relevant_knobs
 from warp_ar.pipeline import Pipeline
 from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene

@@ -1,59 +1,59 @@
 """``--quality auto``: the rungs that err least within a time budget, and a change of them when the load changes.
 
 **Prices.** Errors come from the price list that is part of the package. Costs depend on the device and on the scene,
-so they are measured here, on the first frame that shows the marker, and kept in the user's cache folder until the
-device, a version or the scene changes.
+so they are measured here (``warp_ar.costs``), on the first frame that shows the marker.
 
-**Choice.** With base cost b, relative prices c and a load factor f (measured over predicted time), the settings are the
-best of the frontier with f (b + sum c) <= ``AIM`` budget, to go up ``RAISE`` budget.
+**Load.** A frame should take what its settings cost times a load, which is what frames took over what they should have
+taken. Costs and load are told apart by when they change: what differs just after other settings are shown is theirs,
+what differs later is the load's.
 
-**Steadiness.** Nothing is decided before ``WINDOW`` frames ran as they are; their median counts. Over the budget, the
-choice is made anew at once. Under it, only what errs less by ``GAIN`` is worth a change, and only after a patience that
-doubles whenever a step up had to be taken back within ``REGRET`` seconds, and halves when one lasted. A knob moves at
-most one rung in ``KNOB_SECONDS``; of a mixed move that would not fit, what saves goes first.
+**Choice.** The settings are the best of the frontier whose cost times the load is at most ``AIM`` budget, to go up
+``RAISE`` budget. Settings that were timed cost what they took; others what the prices say, times the ratio in which the
+timed settings that are most like them departed from it.
 
-**Switching.** Each set of rungs has a pipeline of its own. It is built on a thread of its own, and loads its kernels
-there, while frames go on; then it takes over the light, the clock and the track of the marker between two frames.
+**Steadiness.** Nothing is decided before ``WINDOW`` frames ran as they are, and their median counts, or that of up to
+``LONG_WINDOW`` frames where the budget is not exceeded by much. Over it, the choice is made anew at once. Under it,
+only what errs less by ``GAIN`` is worth a change, and only after it would have fit for ``PATIENCE``. After the first
+choice a knob moves at most one rung in ``KNOB_SECONDS``, and all move until they are where they were to go, or the
+budget is exceeded; of a mixed move that would not fit, what saves goes first.
+
+**Switching.** Each set of rungs has a pipeline of its own. It is built on a thread of its own while frames go on, and
+lights a few frames there that nobody sees: that loads its kernels, and tells what it costs. If that fits, it takes over
+the light, the clock and the track of the marker between two frames; if not, the choice is made anew.
 """
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-import hashlib
-import importlib.metadata
-import json
-import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any, Generic, TypeVar
 
+import numpy as np
 import warp as wp
 
-from warp_ar.errors import UsageError
-from warp_ar.graph import Plan
-from warp_ar.ladder import (
-    Choice,
-    Knob,
-    Price,
-    choose,
-    frontier,
-    light_only,
-    load_errors,
-    relevant_knobs,
-    setting,
-    turn,
-    undominated,
+from warp_ar.costs import (
+    BASE,
+    Costs,
+    cache_folder,
+    cost_key,
+    make_prices,
+    measure_costs,
+    read_costs,
+    time_alone,
+    write_costs,
 )
-from warp_ar.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
-from warp_ar.quality import PRESETS, Quality
+from warp_ar.errors import UsageError
+from warp_ar.ladder import Choice, frontier, load_errors, relevant_knobs, setting, turn, undominated
+from warp_ar.pipeline import Pipeline, Result
+from warp_ar.quality import Quality
 from warp_ar.scene import Scene
-from warp_ar.stages.recover import EVERY_FRAME
 from warp_ar.tracking import Pose
 
 AUTO = "auto"
@@ -66,118 +66,180 @@ AIM = 0.9
 RAISE = 0.8
 """Share that what errs less must fit into before it is tried: apart from ``AIM``, so that noise moves nothing."""
 WINDOW = 9
-"""Frames whose median is what a frame costs."""
+"""Frames whose median tells what a frame takes, at the earliest."""
+LONG_WINDOW = 27
+"""Frames whose median tells it well: within 3 % where times scatter by a tenth."""
+ALARM = 1.15
+"""Share of the budget above which the short window is enough, for noise alone hardly gets there; and the ratio to what
+was expected of new settings from which on the difference is taken to be theirs."""
 SETTLE = 2
 """Frames after a change that are not counted."""
 GAIN = 0.03
-"""Share of the predicted error that a change must save."""
+"""Share of the predicted error, or over the budget of the time, that a change must save."""
 PATIENCE = 2.0
-"""Seconds within the budget before more is tried, at first."""
-MOST_PATIENCE = 32.0
-REGRET = 5.0
-"""Seconds within which taking a step up back means that it was too early."""
+"""Seconds for which every frame must leave room for what errs less before it is tried."""
 KNOB_SECONDS = 0.5
 """Shortest time between two rungs of one knob."""
-
-BASE = PRESETS["medium"]
-"""What costs are measured from, and what runs until something is chosen."""
-_MEASURED_FRAMES = 6
-_WARM_UP = 1
-NOW_AND_THEN = "recover"
-"""Stage that works some times a second on a thread of its own: what it takes is shown by all that the process works."""
-_SPREAD_FRAMES = 12
-"""Frames over which that is taken: two of its turns."""
-_ENOUGH_MS = 200.0
-"""Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
-WORK = time.thread_time
-"""Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
+MEMORY = 60.0
+"""Seconds for which what settings took when they were shown is held against them: a moment's load may have been in it.
+What they took alone is known for good."""
 _KEPT_PIPELINES = 6
-_CACHE_FILE = "costs.json"
 
-
-@dataclasses.dataclass(frozen=True)
-class Costs:
-    """What a device takes for a scene."""
-
-    base: float
-    """Milliseconds per frame of the preset that rungs were measured from, tracking included."""
-    rungs: Mapping[str, Mapping[str, float]]
-    """By knob and rung: milliseconds per frame more than the base takes."""
-
-
-def make_prices(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[Price]:
-    """Costs measured on a device beside errors by knob and rung."""
-    return [
-        Price(knob, rung, milliseconds, errors[knob][rung])
-        for knob, own in costs.rungs.items()
-        for rung, milliseconds in own.items()
-    ]
+T = TypeVar("T")
 
 
 # ----------------------------------------------------------------------------------------------------------- the choice
 
 
+@dataclasses.dataclass
+class _Timed:
+    """What settings took, without the load."""
+
+    alone: float | None = None
+    """Milliseconds, timed beside other frames."""
+    shown: float | None = None
+    """Milliseconds, when they were shown last."""
+    until: float = 0.0
+    """When that is forgotten, seconds."""
+
+    @property
+    def milliseconds(self) -> float | None:
+        """What is known best."""
+        return self.alone if self.shown is None else self.shown
+
+
 class Controller:
     """Decides, frame by frame, what to run. Knows nothing of pipelines: times go in, settings come out."""
 
-    def __init__(self, costs: Costs, errors: Mapping[str, Mapping[str, float]], budget_ms: float) -> None:
-        """Choose for an idle machine.
+    def __init__(
+        self,
+        costs: Costs,
+        errors: Mapping[str, Mapping[str, float]],
+        budget_ms: float,
+        running: Mapping[str, str] | None = None,
+    ) -> None:
+        """Choose for an idle machine, or wait for frames that tell the load.
 
         Args:
             costs: Measured on this device.
             errors: By knob and rung.
             budget_ms: Milliseconds per frame.
+            running: Settings of the frames to come; the first choice is made from what they take. None chooses now.
         """
         self.budget_ms = budget_ms
-        self._base = costs.base
+        self._costs = costs
         prices = make_prices(costs, errors)
-        self._prices = {(price.knob, price.rung): price for price in prices}
+        self._errors = {(price.knob, price.rung): price.error for price in prices}
         self._ladders = {
             knob: [price.rung for price in undominated([price for price in prices if price.knob == knob])]
             for knob in costs.rungs
         }
-        self._front = frontier(prices)
-        self._factor = 1.0
-        self._times: collections.deque[float] = collections.deque(maxlen=WINDOW)
+        self._front = frontier(prices, costs.scales)
+        self._timed: dict[frozenset[tuple[str, str]], _Timed] = {}
+        self._predicted: list[float] | None = None
+        self._factor: float | None = None
+        self._times: collections.deque[float] = collections.deque(maxlen=LONG_WINDOW)
         self._skip = SETTLE
+        self._new = False
         self._moved: dict[str, float] = {}
-        self._patience = PATIENCE
-        self._calm_since: float | None = None
-        self._raised: float | None = None
-        self.settings: dict[str, str] = dict(self._best(AIM).settings)
+        self._better_since: float | None = None
+        self._chosen = running is None
+        self.fits = True
+        """False: frames take longer than the budget, and no settings are known to take less."""
+        self.measured_ms: float | None = None
+        """Median of the last frames, once there were enough of them."""
+        self.settings: dict[str, str] = dict(self._best(AIM).settings if running is None else running)
+        self._before = self._target = self.settings
 
     def set_budget(self, budget_ms: float) -> None:
         """Choose anew for another budget; what is known of the load stays."""
         self.budget_ms = budget_ms
-        self.settings = dict(self._best(AIM).settings)
-        self._calm_since = self._raised = None
-        self.restart()
+        self._target = dict(self._best(AIM).settings)
+        self._change(self._target)
 
     @property
     def choices(self) -> list[Choice]:
-        """All that a budget may buy, cheapest first; milliseconds are relative to the base."""
+        """All that a budget may buy, cheapest first; milliseconds are relative to the base, as the prices have them."""
         return self._front
+
+    @property
+    def chosen(self) -> bool:
+        """Whether the first choice has been made."""
+        return self._chosen
 
     @property
     def factor(self) -> float:
         """Measured time over predicted time: the load."""
-        return self._factor
+        return 1.0 if self._factor is None else self._factor
 
-    def _best(self, share: float) -> Choice:
-        return choose(self._front, share * self.budget_ms / self._factor - self._base)
-
-    def _sum(self, settings: Mapping[str, str], what: str) -> float:
-        return float(sum(getattr(self._prices[pair], what) for pair in settings.items()))
+    def expected(self, settings: Mapping[str, str]) -> float:
+        """Milliseconds per frame that settings should take under the present load."""
+        return self.factor * self._cost(settings)
 
     @property
     def expected_ms(self) -> float:
-        """Milliseconds per frame that the present settings should take under the present load."""
-        return self._factor * (self._base + self._sum(self.settings, "milliseconds"))
+        """Of the present settings."""
+        return self.expected(self.settings)
 
     @property
     def expected_error(self) -> float:
         """FLIP above that of the best rungs that the price list expects of the present settings."""
-        return self._sum(self.settings, "error")
+        return sum(self._errors[pair] for pair in self.settings.items())
+
+    def _cost(self, settings: Mapping[str, str]) -> float:
+        """Milliseconds without the load."""
+        timed = self._timed.get(frozenset(settings.items()))
+        if timed is not None and timed.milliseconds is not None:
+            return timed.milliseconds
+        return (self._costs.base + self._costs.excess(settings)) * self._departure(settings)
+
+    def _departure(self, settings: Mapping[str, str]) -> float:
+        """What the timed settings that are most like these took, over what the prices say."""
+        # By the milliseconds of what differs; the base itself differs by what it costs less or more, and departs not.
+        nearest = sum(abs(self._costs.rungs[knob][rung]) for knob, rung in settings.items())
+        found = 1.0
+        for key, timed in self._timed.items():
+            if timed.milliseconds is None:
+                continue
+            rungs = self._costs.rungs
+            distance = sum(abs(rungs[knob][rung] - rungs[knob][settings[knob]]) for knob, rung in key)
+            if distance < nearest:
+                nearest, found = distance, timed.milliseconds / (self._costs.base + self._costs.excess(dict(key)))
+        return found
+
+    def _best(self, share: float) -> Choice:
+        """Least error within a share of the budget; the cheapest if none fits."""
+        if self._predicted is None:
+            self._predicted = [self._cost(dict(choice.settings)) for choice in self._front]
+        limit = share * self.budget_ms / self.factor
+        fitting = [choice for choice, cost in zip(self._front, self._predicted, strict=True) if cost <= limit]
+        # The frontier's errors fall.
+        return fitting[-1] if fitting else self._front[self._predicted.index(min(self._predicted))]
+
+    def learn(self, settings: Mapping[str, str], milliseconds: float) -> None:
+        """Note what settings take alone, without the load."""
+        timed = self._timed.setdefault(frozenset(settings.items()), _Timed())
+        timed.alone, timed.shown, self._predicted = milliseconds, None, None
+
+    def confirm(self) -> bool:
+        """Whether the present settings may be shown, now that they have been timed; if not, those before are back."""
+        limit = max(AIM * self.budget_ms, (1.0 - GAIN) * self.expected(self._before))
+        if self.expected_ms <= limit:
+            self._chosen = True
+            return True
+        self.settings = self._target = self._before
+        self._new = False
+        self.restart()
+        return False
+
+    def shown(self, now: float) -> None:
+        """Frames are lit by the present settings from now on."""
+        for knob, rung in self.settings.items():
+            if rung != self._before[knob]:
+                self._moved[knob] = now
+        self._before = self.settings
+        self._chosen = True
+        self.restart()
 
     def observe(self, milliseconds: float, now: float) -> bool:
         """Note what a frame took.
@@ -195,240 +257,94 @@ class Controller:
         self._times.append(milliseconds)
         if len(self._times) < WINDOW:
             return False
-        measured = statistics.median(self._times)
-        predicted = self._base + self._sum(self.settings, "milliseconds")
-        self._factor = measured / max(predicted, 1e-3)
-        over = measured > self.budget_ms
-        if over:
-            self._calm_since = None
-        elif self._calm_since is None:
-            self._calm_since = now
-        if self._raised is not None and now - self._raised > REGRET:
-            self._raised, self._patience = None, max(0.5 * self._patience, PATIENCE)
-        target = self._best(AIM if over else RAISE)
-        worth = target.error < (1.0 - GAIN) * self.expected_error
-        calm = self._calm_since is not None and now - self._calm_since >= self._patience
-        if not over and not (worth and calm):
-            return False
-        step = self._step(dict(target.settings), now)
+        latest = statistics.median(list(self._times)[-WINDOW:])
+        alarm = latest > ALARM * self.budget_ms
+        self.measured_ms = latest if alarm else statistics.median(self._times)
+        self._tell_apart(self.measured_ms, now)
+        over = self.measured_ms > self.budget_ms
+        self.fits = not over
+        if over or not self._chosen:
+            self._target = dict(self._best(AIM).settings)
+            self.fits = not over or self._saves(self._target)
+        elif self._target == self.settings:
+            better = self._best(RAISE)
+            if better.error >= (1.0 - GAIN) * self.expected_error:
+                self._better_since = None
+            elif self._better_since is None:
+                self._better_since = now
+            elif now - self._better_since >= PATIENCE:
+                self._target = dict(better.settings)
+        step = self._step(now) if self._chosen else self._target
+        self._chosen = self._chosen or step == self.settings
         if step == self.settings:
+            if now - max(self._moved.values(), default=-KNOB_SECONDS) >= KNOB_SECONDS:
+                self._target = self.settings  # no way there fits
             return False
-        if over and self._raised is not None:
-            self._raised, self._patience = None, min(2.0 * self._patience, MOST_PATIENCE)
-        elif not over:
-            self._raised = now
         for knob, rung in step.items():
             if rung != self.settings[knob]:
                 self._moved[knob] = now
-        self.settings = step
-        self.restart()
+        self._change(dict(step))
         return True
+
+    def _tell_apart(self, measured: float, now: float) -> None:
+        """What frames took is what the settings cost times the load: find which of the two is not as it was thought."""
+        for timed in self._timed.values():
+            if timed.shown is not None and now > timed.until:
+                timed.shown = self._predicted = None
+        surprise = max(measured, 1e-3) / max(self.expected_ms, 1e-3)
+        if self._new and self._factor is not None and not 1.0 / ALARM < surprise < ALARM:
+            timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
+            timed.shown, timed.until = measured / self._factor, now + MEMORY
+            self._predicted = None
+        else:
+            self._factor = self.factor * surprise
+        self._new = False
+
+    def _change(self, settings: dict[str, str]) -> None:
+        self._before, self.settings = self.settings, settings
+        self._better_since, self._new = None, True
+        self.restart()
 
     def restart(self) -> None:
         """Forget the frames so far: what they took says nothing of those to come."""
         self._times.clear()
         self._skip = SETTLE
 
-    def _step(self, target: Mapping[str, str], now: float) -> dict[str, str]:
+    def _saves(self, settings: Mapping[str, str]) -> bool:
+        """Whether settings should take less than the present ones by what is worth a change."""
+        return self._cost(settings) < (1.0 - GAIN) * self._cost(self.settings)
+
+    def _step(self, now: float) -> dict[str, str]:
         """At most one rung of every knob toward the target."""
-        step, savings = dict(self.settings), dict(self.settings)
-        for knob, rung in target.items():
+        moves: dict[str, str] = {}
+        savings: dict[str, str] = {}
+        for knob, rung in self._target.items():
             ladder = self._ladders[knob]
             place, aim = ladder.index(self.settings[knob]), ladder.index(rung)
             if place == aim or now - self._moved.get(knob, -KNOB_SECONDS) < KNOB_SECONDS:
                 continue
-            step[knob] = ladder[place + (1 if aim > place else -1)]
+            moves[knob] = ladder[place + (1 if aim > place else -1)]
             if aim < place:
-                savings[knob] = step[knob]
-        fits = self._factor * (self._base + self._sum(step, "milliseconds")) <= AIM * self.budget_ms
-        return step if fits else savings
-
-
-# ----------------------------------------------------------------------------------------------------------- the costs
-
-
-def measure_costs(
-    scene: Scene,
-    image: Any,
-    pose: Pose | None,
-    device: str,
-    size: tuple[int, int],
-    knobs: Sequence[Knob],
-    clock: Callable[[], float] = time.perf_counter,
-) -> Costs:
-    """Time every rung but brute force on one frame that is shown again and again.
-
-    Args:
-        scene: What is shown.
-        image: uint8 RGB (height, width, 3).
-        pose: Of the camera in that frame, if the scene needs it.
-        device: ``cpu`` or ``cuda:N``.
-        size: Width and height.
-        knobs: What may be turned.
-        clock: Seconds, on CPU.
-    """
-    steps = measure_steps(scene, image, pose, device, size, knobs, clock)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return cast(Costs, end.value)
-
-
-def measure_steps(
-    scene: Scene,
-    image: Any,
-    pose: Pose | None,
-    device: str,
-    size: tuple[int, int],
-    knobs: Sequence[Knob],
-    clock: Callable[[], float] = time.perf_counter,
-) -> Generator[float, None, Costs]:
-    """``measure_costs`` in small steps, for whoever has other things to do; yields the share that is done."""
-    count, done = sum(len(knob.rungs) for knob in knobs) + 1, 1
-    base = _time_stages(scene, image, pose, device, size, BASE, clock)
-    yield done / count
-    rungs: dict[str, dict[str, float]] = {}
-    for knob in knobs:
-        start = setting(BASE, knob)
-        times: dict[str, dict[str, float]] = {}
-        spread = knob.name == NOW_AND_THEN
-        for rung in knob.rungs:
-            if rung != "brute_force":
-                quality = turn(BASE, {knob.name: rung})
-                known = rung == start and not spread
-                times[rung] = base if known else _time_stages(scene, image, pose, device, size, quality, clock, spread)
-            done += 1
-            yield done / count
-        # Stages that run whatever the rung is cost the same: what was measured of them is noise.
-        common = set.intersection(*(set(own) for own in times.values())) - set(knob.stages)
-        own = {rung: sum(ms for name, ms in stages.items() if name not in common) for rung, stages in times.items()}
-        rungs[knob.name] = {rung: ms - own[start] for rung, ms in own.items()}
-    return Costs(sum(base.values()), rungs)
-
-
-def _time_stages(
-    scene: Scene,
-    image: Any,
-    pose: Pose | None,
-    device: str,
-    size: tuple[int, int],
-    quality: Quality,
-    clock: Callable[[], float],
-    spread: bool = False,
-) -> dict[str, float]:
-    times: dict[str, list[float]] = {}
-    spent = 0.0
-    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, _MEASURED_FRAMES)
-    shown_at = light_only(quality) if spread else quality
-    with open_profiled(scene, device, shown_at, size, clock) as pipeline:
-        begun = 0.0
-        for index in range(warm_up + count):
-            # Brighter and darker by an eighth, else stages would be skipped.
-            shown = image if index % 2 == 0 else image - image // 8
-            if index == warm_up:
-                begun = time.process_time()
-            result = pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
-            if index < warm_up:
-                continue
-            for name, timing in result.stages.items():
-                times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
-            spent += sum(timing.milliseconds for timing in result.stages.values())
-            if spent > _ENOUGH_MS and not spread:
-                break
-        worked = time.process_time() - begun
-        on_cpu = pipeline.device.is_cpu
-    times.pop(TRACK, None)
-    if spread and on_cpu:
-        return {NOW_AND_THEN: worked_ms(worked / count, clock)}
-    return {name: statistics.median(own or [0.0]) for name, own in times.items()}
-
-
-def open_profiled(
-    scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
-) -> Pipeline:
-    """A pipeline whose stages are timed by a clock; by ``WORK`` one thread does them, one after another."""
-    bands = 1 if clock is WORK else None
-    pipeline = Pipeline(scene, device=device, quality=quality, size=size, bands=bands, profile=True)
-    pipeline.scheduler.clock = clock
-    return pipeline
-
-
-def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
-    """Milliseconds that the process's work takes: by ``WORK`` all of it, by the time its share on every core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return seconds * 1e3 / (1 if clock is WORK else cores)
-
-
-def cache_folder() -> Path:
-    """Where this user's programs keep what they can make again."""
-    if os.environ.get("XDG_CACHE_HOME"):
-        return Path(os.environ["XDG_CACHE_HOME"]) / "warp_ar"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "warp_ar" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "warp_ar"
-    return Path.home() / ".cache" / "warp_ar"
-
-
-def cost_key(plan: Plan, device: Any, knobs: Sequence[Knob]) -> str:
-    """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the rungs."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    scene = plan.request.scene
-    parts = [
-        device.name,
-        cores if device.is_cpu else None,
-        wp.__version__,
-        package_version(),
-        plan.request.size,
-        [stage.name for stage, _ in plan.stages],
-        [(item.shape, str(item.file), type(item.material).__name__) for item in scene.objects],
-        [(proxy.shape, str(proxy.file)) for proxy in scene.proxies],
-        [light.kind for light in scene.lights],
-        [(knob.name, knob.rungs) for knob in knobs],
-    ]
-    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:24]
-
-
-def package_version() -> str:
-    """Of this package; a checkout that is not installed has none."""
-    try:
-        return importlib.metadata.version("warp-ar")
-    except importlib.metadata.PackageNotFoundError:
-        return "checkout"
-
-
-def read_costs(folder: Path, key: str, knobs: Sequence[Knob]) -> Costs | None:
-    """Kept costs, or None where there are none that can be used."""
-    try:
-        kept = json.loads((folder / _CACHE_FILE).read_text(encoding="utf-8"))[key]
-        rungs = {knob.name: {str(rung): float(ms) for rung, ms in kept["rungs"][knob.name].items()} for knob in knobs}
-        known = all(set(rungs[knob.name]) <= set(knob.rungs) and rungs[knob.name] for knob in knobs)
-        return Costs(float(kept["base"]), rungs) if known else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None  # not there, or not ours: it is measured anew
-
-
-def write_costs(folder: Path, key: str, costs: Costs) -> None:
-    """Keep costs beside those of other devices and scenes; where nothing can be written, they are measured again."""
-    path = folder / _CACHE_FILE
-    try:
-        everything = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        everything = {}
-    if not isinstance(everything, dict):
-        everything = {}
-    everything[key] = {"base": costs.base, "rungs": costs.rungs}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(f"{path.name}.{os.getpid()}")
-        fresh.write_text(json.dumps(everything, indent=1), encoding="utf-8")
-        fresh.replace(path)
-    except OSError as error:
-        print(f"warp_ar: cannot keep measured costs in {folder}: {error.strerror}", file=sys.stderr)
+                savings[knob] = moves[knob]
+        # Where neither fits, what saves most goes first: not all that should save is known to.
+        steps = [{**self.settings, **some} for some in (moves, savings)]
+        steps += [{**self.settings, knob: rung} for knob, rung in savings.items()]
+        fitting = [step for step in steps[:2] if self.expected(step) <= AIM * self.budget_ms]
+        best = fitting[0] if fitting else min(steps[1:], key=self._cost)
+        return best if fitting or self._saves(best) else self.settings
 
 
 # -------------------------------------------------------------------------------------------------------- the pipelines
+
+
+class _OfTheLatest(Generic[T]):
+    """What the pipeline that lights the next frame says of itself."""
+
+    def __init__(self, get: Callable[[Pipeline], T]) -> None:
+        self._get = get
+
+    def __get__(self, auto: AutoPipeline, owner: type[AutoPipeline]) -> T:
+        return self._get(auto.pipeline)
 
 
 class AutoPipeline:
@@ -479,15 +395,19 @@ class AutoPipeline:
         self._given, self._folder, self._clock = scene, folder or cache_folder(), clock
         self._errors = load_errors()
         self._builder = ThreadPoolExecutor(1, "warp_ar-build")
-        self._building: Future[Pipeline] | None = None
+        self._building: Future[tuple[Pipeline, float | None]] | None = None
         self._kept: dict[Quality, Pipeline] = {}
-        self._now = self._open(BASE)
-        self._kept[BASE] = self._now
-        self.knobs = relevant_knobs(self._now.scene, self._now.size)
+        self.knobs = relevant_knobs(scene, size or (scene.camera.width, scene.camera.height))
+        self._base = {knob.name: setting(BASE, knob) for knob in self.knobs}
+        self.pipeline = self._open(turn(BASE, self._base))
+        """The one that lights the next frame."""
+        self._kept[self.quality] = self.pipeline
         self._costs = costs
         self._controller: Controller | None = None
         self._changes: list[dict[str, Any]] = []
+        self._rejected: list[dict[str, Any]] = []
         self._frames = 0
+        self._told = False
 
     def _open(self, quality: Quality) -> Pipeline:
         # On CUDA only a pipeline that profiles knows what the device takes.
@@ -505,44 +425,16 @@ class AutoPipeline:
         """Stop the threads; arrays go when the last result that refers to them does."""
         self._builder.shutdown(wait=True, cancel_futures=True)
         if self._building is not None and not self._building.cancelled() and self._building.exception() is None:
-            self._building.result().close()
+            self._building.result()[0].close()
         for pipeline in self._kept.values():
             pipeline.close()
 
-    @property
-    def pipeline(self) -> Pipeline:
-        """The one that lights the next frame."""
-        return self._now
-
-    @property
-    def plan(self) -> Plan:
-        """Of the present quality."""
-        return self._now.plan
-
-    @property
-    def quality(self) -> Quality:
-        """The present one."""
-        return self._now.quality
-
-    @property
-    def scene(self) -> Scene:
-        """What is shown, its camera scaled to the frames."""
-        return self._now.scene
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the frames."""
-        return self._now.size
-
-    @property
-    def device(self) -> Any:
-        """Where kernels run."""
-        return self._now.device
-
-    @property
-    def arrays(self) -> Any:
-        """Named arrays of the pipeline that lit the last frame."""
-        return self._now.arrays
+    plan = _OfTheLatest(lambda pipeline: pipeline.plan)
+    quality = _OfTheLatest(lambda pipeline: pipeline.quality)
+    scene = _OfTheLatest(lambda pipeline: pipeline.scene)
+    size = _OfTheLatest(lambda pipeline: pipeline.size)
+    device = _OfTheLatest(lambda pipeline: pipeline.device)
+    arrays = _OfTheLatest(lambda pipeline: pipeline.arrays)
 
     def __call__(
         self,
@@ -554,80 +446,105 @@ class AutoPipeline:
     ) -> Result:
         """Light one frame; arguments, result and errors are those of ``Pipeline``."""
         self._swap()
-        result = self._now(image, time_seconds=time_seconds, pose=pose, exposure_time=exposure_time)
+        result = self.pipeline(image, time_seconds=time_seconds, pose=pose, exposure_time=exposure_time)
         found = pose if pose is not None else result.pose
         self._frames += 1
-        if not result.shown:
-            return result
-        if self._now.plan.needs("pose") and found is None:
+        if not result.shown or (self.plan.needs("pose") and found is None):
             return result
         if self._controller is None:
-            self._start(image, found)
-        elif self._building is None:
-            spent = sum(timing.milliseconds for timing in result.stages.values())
-            if self._controller.observe(spent, self._clock()):
-                self._want()
+            self._controller = self._start(image, found)
+        elif self._building is None and self._wanted() == self.quality:
+            first = not self._changes
+            changed = self._controller.observe(_spent_ms(result), self._clock())
+            if changed or (first and self._controller.chosen):
+                self._want(image, found)
+            self._tell()
         return result
 
     submit = __call__
     """Frames are not sent ahead: their times must be known before the next one."""
 
-    def _start(self, image: Any, pose: Pose | None) -> None:
-        """Get the costs and make the first choice."""
+    def _start(self, image: Any, pose: Pose | None) -> Controller:
+        """Get the costs; the first choice waits for frames that tell the load."""
         if self._costs is None and self.knobs:
-            device = self._now.device
-            key = cost_key(self._now.plan, device, self.knobs)
+            key = cost_key(self.plan, self.device, self.knobs)
             self._costs = read_costs(self._folder, key, self.knobs)
             if self._costs is None:
                 print("warp_ar: measuring what each rung costs here; this is done once", file=sys.stderr)
-                picture = image.numpy() if isinstance(image, wp.array) else image
-                scene, size = self._given, self._now.size
-                self._costs = measure_costs(scene, picture, pose, str(device), size, self.knobs)
+                self._costs = measure_costs(self._given, _on_host(image), pose, str(self.device), self.size, self.knobs)
                 write_costs(self._folder, key, self._costs)
-        self._controller = Controller(self._costs or Costs(0.0, {}), self._errors, self.budget_ms)
-        self._want()
+        costs = self._costs or Costs(0.0, {})
+        return Controller(costs, self._errors, self.budget_ms, self._base)
 
     def _wanted(self) -> Quality:
-        assert self._controller is not None
-        return turn(BASE, self._controller.settings)
+        return turn(BASE, self._base if self._controller is None else self._controller.settings)
 
-    def _want(self) -> None:
+    def _want(self, image: Any, pose: Pose | None) -> None:
+        """Go over to the controller's settings, as soon as there is a pipeline for them."""
         quality = self._wanted()
-        assert self._controller is not None
-        self._changes.append(
-            {
-                "frame": self._frames,
-                "settings": dict(self._controller.settings),
-                "expected_ms": round(self._controller.expected_ms, 3),
-                "expected_error": round(self._controller.expected_error, 5),
-            }
-        )
-        if quality not in self._kept:
-            self._building = self._builder.submit(self._build, quality)
+        if quality in self._kept:
+            self._changes.append(self._record())
+        else:
+            self._building = self._builder.submit(self._build, quality, np.array(_on_host(image)), pose)
 
-    def _build(self, quality: Quality) -> Pipeline:
+    def _record(self) -> dict[str, Any]:
+        """The controller's settings as those of the next frame."""
+        assert self._controller is not None
+        return {
+            "frame": self._frames,
+            "settings": dict(self._controller.settings),
+            "expected_ms": round(self._controller.expected_ms, 3),
+            "expected_error": round(self._controller.expected_error, 5),
+        }
+
+    def _build(self, quality: Quality, image: Any, pose: Pose | None) -> tuple[Pipeline, float | None]:
+        """A pipeline that is ready to light frames, and what it takes alone, if that can be told."""
         pipeline = self._open(quality)
-        pipeline.warm_up()
-        return pipeline
+        costs = self._costs
+        if costs is None or costs.work <= 0.0:
+            pipeline.warm_up()
+            return pipeline, None
+        settings = {knob.name: setting(quality, knob) for knob in self.knobs}
+        return pipeline, time_alone(pipeline, image, pose, costs, settings)
 
     def _swap(self) -> None:
         """Go over to the wanted pipeline if it is ready."""
-        if self._controller is None:
+        controller = self._controller
+        if controller is None:
             return
         if self._building is not None and self._building.done():
             building, self._building = self._building, None
-            built = building.result()
+            built, alone = building.result()
+            if alone is not None:
+                controller.learn(controller.settings, alone)
+            record = self._record()
+            if not controller.confirm():
+                self._rejected.append(record)
+                built.close()
+                return
             self._kept[built.quality] = built
-            self._controller.restart()
+            self._changes.append(record)
         wanted = self._kept.get(self._wanted())
-        if wanted is None or wanted is self._now:
+        if wanted is None or wanted is self.pipeline:
             return
-        wanted.continue_from(self._now)
-        self._now = wanted
+        wanted.continue_from(self.pipeline)
+        self.pipeline = wanted
+        controller.shown(self._clock())
         # Latest last; the oldest goes.
         self._kept[wanted.quality] = self._kept.pop(wanted.quality)
         while len(self._kept) > _KEPT_PIPELINES:
             self._kept.pop(next(iter(self._kept))).close()
+
+    def _tell(self) -> None:
+        """Say once that the budget is too small."""
+        controller = self._controller
+        if controller is not None and not controller.fits and not self._told:
+            self._told = True
+            print(
+                f"warp_ar: nothing keeps to {self.budget_ms:g} ms here: the cheapest rungs take "
+                f"{controller.measured_ms:.1f} ms and are used",
+                file=sys.stderr,
+            )
 
     def status(self) -> dict[str, Any]:
         """What was chosen, what it should cost and err, and every change, as plain data."""
@@ -636,8 +553,20 @@ class AutoPipeline:
             return {"budget_ms": self.budget_ms, "changes": []}
         return {
             "budget_ms": self.budget_ms,
+            "fits": controller.fits,
             "settings": dict(controller.settings),
             "expected_ms": round(controller.expected_ms, 3),
+            "measured_ms": None if controller.measured_ms is None else round(controller.measured_ms, 3),
             "expected_error": round(controller.expected_error, 5),
+            "load": round(controller.factor, 4),
             "changes": self._changes,
+            "rejected": self._rejected,
         }
+
+
+def _spent_ms(result: Result) -> float:
+    return sum(timing.milliseconds for timing in result.stages.values())
+
+
+def _on_host(image: Any) -> Any:
+    return image.numpy() if isinstance(image, wp.array) else image

@@ -1,20 +1,23 @@
 """What a quality can turn, what each turn costs and how far off it is, and what to choose for a budget.
 
 A **knob** is a stage with several rungs, or a number or way of ``Quality`` that several stages share. A **price** is
-what one rung of one knob costs in milliseconds and errs in FLIP. Both are taken to add up over knobs: costs because
-stages run one after another, errors because each is the excess over the knob's best rung, mean over the same pixels.
+what one rung of one knob costs in milliseconds and errs in FLIP. Both add up over stages: costs because stages run one
+after another, errors because each is the excess over the knob's best rung, mean over the same pixels. A knob that
+several stages share multiplies: with four times the texels, what 128 samples per texel cost more is four times as much.
 
-Choosing is then a small knapsack problem with one item per knob, solved exactly: knobs are joined one by one, and of
-the joined choices those are dropped that cost no less and err no less than another.
+Choosing is then, for every setting of the shared knobs, a small knapsack problem with one item per other knob, solved
+exactly: knobs are joined one by one, and of the joined choices those are dropped that cost no less and err no less than
+another.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib.resources
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from warp_ar.errors import UsageError
@@ -239,32 +242,47 @@ def undominated(prices: Sequence[Price]) -> list[Price]:
     return kept
 
 
-def frontier(prices: Sequence[Price]) -> list[Choice]:
+Scales = Mapping[str, Mapping[str, Mapping[str, float]]]
+"""By knob that stages share, its rung and another knob: what multiplies the milliseconds of the other one's rungs."""
+
+
+def frontier(prices: Sequence[Price], scales: Scales | None = None) -> list[Choice]:
     """Every choice than which no other costs less and errs less; cheapest first.
 
     Args:
         prices: All rungs of all knobs; every knob must get one.
+        scales: How knobs that stages share scale prices; None means that prices add up.
     """
+    scales = scales or {}
     knobs: dict[str, list[Price]] = {}
     for price in prices:
         knobs.setdefault(price.knob, []).append(price)
-    front = [Choice((), 0.0, 0.0)]
-    for own in knobs.values():
-        joined = [
-            Choice(
-                (*choice.settings, (price.knob, price.rung)),
-                choice.milliseconds + price.milliseconds,
-                choice.error + price.error,
+    ladders = {knob: undominated(own) for knob, own in knobs.items()}
+    found: list[Choice] = []
+    for shared in itertools.product(*(own for knob, own in ladders.items() if knob in scales)):
+        front = [Choice((), 0.0, 0.0)]
+        for knob, own in ladders.items():
+            at = [price for price in shared if price.knob == knob]
+            scale = math.prod(scales[price.knob].get(price.rung, {}).get(knob, 1.0) for price in shared)
+            front = _thinned(
+                Choice(
+                    (*choice.settings, (price.knob, price.rung)),
+                    choice.milliseconds + scale * price.milliseconds,
+                    choice.error + price.error,
+                )
+                for choice in front
+                for price in at or own
             )
-            for choice in front
-            for price in undominated(own)
-        ]
-        joined.sort(key=lambda choice: (choice.milliseconds, choice.error))
-        front = []
-        for choice in joined:
-            if not front or choice.error < front[-1].error:
-                front.append(choice)
-    return front
+        found += front
+    return _thinned(found)
+
+
+def _thinned(choices: Iterable[Choice]) -> list[Choice]:
+    kept: list[Choice] = []
+    for choice in sorted(choices, key=lambda choice: (choice.milliseconds, choice.error)):
+        if not kept or choice.error < kept[-1].error:
+            kept.append(choice)
+    return kept
 
 
 def choose(front: Sequence[Choice], budget_ms: float) -> Choice:

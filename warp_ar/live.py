@@ -250,6 +250,9 @@ def _print_choice(pipeline: AutoPipeline) -> None:
     if "settings" not in status:
         print(f"{AUTO}: no marker was seen, so nothing was chosen")
         return
+    if not status["changes"]:
+        print(f"{AUTO}: too few frames to choose by")
+        return
     chosen = ", ".join(f"{knob} {rung}" for knob, rung in status["settings"].items())
     print(
         f"{AUTO}: {chosen}; {status['expected_ms']:.1f} of {status['budget_ms']:g} ms, expected error "

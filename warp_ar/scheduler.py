@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import bisect
 import collections
+import contextlib
 import dataclasses
 import itertools
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -143,6 +144,16 @@ class Scheduler:
             with exclusive(self.device):
                 wp.synchronize_stream(stream)
 
+    @contextlib.contextmanager
+    def alone(self, clock: Callable[[], float]) -> Iterator[None]:
+        """On CPU run stages one after another on the caller's thread, timed by its clock."""
+        before = self._pool, self.clock
+        self._pool, self.clock = None, clock
+        try:
+            yield
+        finally:
+            self._pool, self.clock = before
+
     def run(self) -> Mapping[str, StageTiming]:
         """Run the stages whose inputs changed since they last ran; returns the time of each."""
         if self.device.is_cpu:
@@ -172,7 +183,7 @@ class Scheduler:
             start = self.clock()
             for step in _due_passes(stage, passes):
                 # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
-                step.launch(step.extent() if step.extent is not None and self.device.is_cpu else None)
+                self._launch_band(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
             self._publish(stage)
             timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)

@@ -46,8 +46,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from warp_ar import tradeoff_page
-from warp_ar.auto_quality import BASE as COST_BASE
-from warp_ar.auto_quality import NOW_AND_THEN, WORK, make_prices, measure_costs, open_profiled, worked_ms
+from warp_ar.costs import BASE as COST_BASE
+from warp_ar.costs import NOW_AND_THEN, WORK, make_prices, measure_costs, open_profiled, worked_ms
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.graph import make_plan
 from warp_ar.kernels.color import decode_table
@@ -684,9 +684,9 @@ def measure_case(
         # As --quality auto does: costs measured here, errors from the list.
         frame, size = case.frames[-1], (case.scene.camera.width, case.scene.camera.height)
         costs = measure_costs(case.scene, frame.image, case.poses[-1], device, size, knobs, clock)
-        front = frontier(make_prices(costs, listed_errors(rows)))
+        front = frontier(make_prices(costs, listed_errors(rows)), costs.scales)
         qualities |= {
-            "ours in the paper's time": _find_same_time(case, front, costs.base, device, clock),
+            "ours in the paper's time": _find_same_time(case, front, costs.base - costs.track, device, clock),
             "ours at the paper's error": _find_same_error(case, front, device, reference),
         }
     times, images = run_in_turn(case, qualities, device, clock)

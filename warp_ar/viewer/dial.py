@@ -15,18 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.auto_quality import (
-    AUTO,
-    BASE,
-    DEFAULT_BUDGET_MS,
-    Controller,
-    Costs,
-    cache_folder,
-    cost_key,
-    measure_steps,
-    read_costs,
-    write_costs,
-)
+from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, Controller
+from warp_ar.costs import BASE, Costs, cache_folder, cost_key, measure_steps, read_costs, write_costs
 from warp_ar.errors import WarpArError
 from warp_ar.graph import make_plan
 from warp_ar.ladder import Knob, load_errors, relevant_knobs, setting, turn
@@ -198,6 +188,6 @@ class Dial:
         if any(rung not in costs.rungs[knob] for knob, rung in rungs.items()):
             return None
         return {
-            "ms": round(sum(costs.rungs[knob][rung] for knob, rung in rungs.items()), 3),
+            "ms": round(costs.excess(rungs), 3),
             "error": round(sum(self._errors[knob][rung] for knob, rung in rungs.items()), 5),
         }

@@ -1,0 +1,319 @@
+"""What every rung costs on this device: measured on one frame, and kept in the user's cache folder.
+
+Costs depend on the device and on the scene. They are measured one knob at a time from a base, and hold together by what
+knobs share: a rung's milliseconds more than the base's are multiplied where another knob gives its stage more to do,
+by as much as that knob multiplies the stage's time at the base.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import warp as wp
+
+from warp_ar.graph import Plan
+from warp_ar.ladder import Knob, Price, Scales, light_only, setting, turn
+from warp_ar.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
+from warp_ar.quality import PRESETS, Quality
+from warp_ar.scene import Scene
+from warp_ar.stages.recover import EVERY_FRAME
+from warp_ar.tracking import Pose, Tracker
+
+BASE = PRESETS["medium"]
+"""What costs are measured from, and what runs until something is chosen."""
+_MEASURED_FRAMES = 6
+_WARM_UP = 1
+NOW_AND_THEN = "recover"
+"""Stage that works some times a second on a thread of its own: what it takes is shown by all that the process works."""
+_SPREAD_FRAMES = 12
+"""Frames over which that is taken: two of its turns."""
+_ENOUGH_MS = 200.0
+"""Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
+WORK = time.thread_time
+"""Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
+_CACHE_FILE = "costs.json"
+
+
+@dataclasses.dataclass(frozen=True)
+class Costs:
+    """What a device takes for a scene."""
+
+    base: float
+    """Milliseconds per frame of the preset that rungs were measured from, tracking included."""
+    rungs: Mapping[str, Mapping[str, float]]
+    """By knob and rung: milliseconds per frame more than the base takes."""
+    scales: Scales = dataclasses.field(default_factory=dict)
+    """How knobs that stages share multiply what rungs of those stages cost more than the base's."""
+    track: float = 0.0
+    """Milliseconds of ``base`` that tracking takes."""
+    work: float = 0.0
+    """Milliseconds of the base's stages on one thread, by ``WORK``; on CUDA, on the device. 0 if that is not known."""
+
+    def excess(self, settings: Mapping[str, str]) -> float:
+        """Milliseconds per frame that settings should take more than the base."""
+        shared = [self.scales[knob].get(rung, {}) for knob, rung in settings.items() if knob in self.scales]
+        return sum(
+            self.rungs[knob][rung] * math.prod(scale.get(knob, 1.0) for scale in shared)
+            for knob, rung in settings.items()
+        )
+
+
+def make_prices(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[Price]:
+    """Costs measured on a device beside errors by knob and rung."""
+    return [
+        Price(knob, rung, milliseconds, errors[knob][rung])
+        for knob, own in costs.rungs.items()
+        for rung, milliseconds in own.items()
+    ]
+
+
+def measure_costs(
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    knobs: Sequence[Knob],
+    clock: Callable[[], float] | None = None,
+) -> Costs:
+    """Time every rung but brute force on one frame that is shown again and again.
+
+    Args:
+        scene: What is shown.
+        image: uint8 RGB (height, width, 3).
+        pose: Of the camera in that frame, if the scene needs it.
+        device: ``cpu`` or ``cuda:N``.
+        size: Width and height.
+        knobs: What may be turned.
+        clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
+            ratio in which the base's stands to the time that passes.
+    """
+    steps = measure_steps(scene, image, pose, device, size, knobs, clock)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return cast(Costs, end.value)
+
+
+def measure_steps(
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    knobs: Sequence[Knob],
+    clock: Callable[[], float] | None = None,
+) -> Generator[float, None, Costs]:
+    """``measure_costs`` in small steps, for whoever has other things to do; yields the share that is done."""
+    count, done = sum(len(knob.rungs) for knob in knobs) + 2, 2
+    timed = WORK if clock is None else clock
+    passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
+    track = passed.pop(TRACK, 0.0)
+    yield 1 / count
+    base = _time_stages(scene, image, pose, device, size, BASE, timed)
+    base.pop(TRACK, None)
+    yield done / count
+    work = sum(base.values())
+    pace = sum(passed.values()) / work if clock is None and work > 0.0 else 1.0
+    rungs: dict[str, dict[str, float]] = {}
+    scales: dict[str, dict[str, dict[str, float]]] = {}
+    for knob in knobs:
+        start = setting(BASE, knob)
+        times: dict[str, dict[str, float]] = {}
+        spread = knob.name == NOW_AND_THEN
+        for rung in knob.rungs:
+            if rung != "brute_force":
+                quality = turn(BASE, {knob.name: rung})
+                known = rung == start and not spread
+                times[rung] = base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
+                times[rung].pop(TRACK, None)
+            done += 1
+            yield done / count
+        # Stages that run whatever the rung is cost the same: what was measured of them is noise.
+        common = set.intersection(*(set(own) for own in times.values())) - set(knob.stages)
+        own = {rung: sum(ms for name, ms in stages.items() if name not in common) for rung, stages in times.items()}
+        rungs[knob.name] = {rung: pace * (ms - own[start]) for rung, ms in own.items()}
+        # What recovery does on its own thread is the same for a map of any size.
+        others = [
+            other.name for other in knobs if other.name in knob.stages and other.name not in (knob.name, NOW_AND_THEN)
+        ]
+        if others:
+            scales[knob.name] = {
+                rung: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
+                for rung, stages in times.items()
+            }
+    return Costs(track + pace * work, rungs, scales, track, work)
+
+
+def _time_stages(
+    scene: Scene,
+    image: Any,
+    pose: Pose | None,
+    device: str,
+    size: tuple[int, int],
+    quality: Quality,
+    clock: Callable[[], float],
+    spread: bool = False,
+) -> dict[str, float]:
+    """Milliseconds by stage, tracking among them where the clock is that of the time that passes."""
+    times: dict[str, list[float]] = {}
+    spent = 0.0
+    warm_up, count = (EVERY_FRAME, _SPREAD_FRAMES) if spread else (_WARM_UP, _MEASURED_FRAMES)
+    shown_at = light_only(quality) if spread else quality
+    with open_profiled(scene, device, shown_at, size, clock) as pipeline:
+        begun = 0.0
+        if pose is not None and clock is time.perf_counter:
+            tracker = Tracker(pipeline.scene.marker, pipeline.camera)
+            for index in range(warm_up + count):
+                start = clock()
+                tracker.track(image, index * DEFAULT_FRAME_INTERVAL)
+                times.setdefault(TRACK, []).extend([(clock() - start) * 1e3] if index >= warm_up else [])
+        for index in range(warm_up + count):
+            if index == warm_up:
+                begun = time.process_time()
+            result = show_again(pipeline, image, pose, index)
+            if index < warm_up:
+                continue
+            for name, timing in result.stages.items():
+                times.setdefault(name, []).append(timing.milliseconds)
+            spent += sum(timing.milliseconds for timing in result.stages.values())
+            if spent > _ENOUGH_MS and not spread:
+                break
+        worked = time.process_time() - begun
+        on_cpu = pipeline.device.is_cpu
+    if spread and on_cpu:
+        return {NOW_AND_THEN: worked_ms(worked / count, clock)}
+    return {name: statistics.median(own) for name, own in times.items()}
+
+
+def show_again(pipeline: Pipeline, image: Any, pose: Pose | None, index: int) -> Result:
+    """Light one picture as the ``index``-th frame, a little darker every other time, with every stage at work."""
+    pipeline.scheduler.forget()
+    shown = image - image // 8 if index % 2 else image
+    return pipeline(shown, time_seconds=index * DEFAULT_FRAME_INTERVAL, pose=pose)
+
+
+def time_alone(pipeline: Pipeline, image: Any, pose: Pose | None, costs: Costs, settings: Mapping[str, str]) -> float:
+    """Milliseconds per frame that a pipeline will take, in the measure of ``costs``, found beside other work.
+
+    Args:
+        pipeline: Has lit no frame; its kernels are loaded by this too.
+        image: uint8 RGB (height, width, 3).
+        pose: Of the camera in that frame, if the scene needs it.
+        costs: What the base takes.
+        settings: That the pipeline runs; what recovery works on its own thread is taken from ``costs``.
+    """
+    if not pipeline.device.is_cpu:
+        pipeline.warm_up()
+    works: list[float] = []
+    with pipeline.scheduler.alone(WORK):
+        # As many frames as recovery wants at once: those that are shown then need not wait for it.
+        for index in range(EVERY_FRAME):
+            result = show_again(pipeline, image, pose, index)
+            stages = {name: timing.milliseconds for name, timing in result.stages.items()}
+            works.append(sum(ms for name, ms in stages.items() if name not in (TRACK, NOW_AND_THEN)))
+            if index > 0 and sum(works) > _ENOUGH_MS:
+                break
+    pace = (costs.base - costs.track) / costs.work
+    recovers = {knob: rung for knob, rung in settings.items() if knob == NOW_AND_THEN}
+    return costs.track + pace * min(works[1:]) + costs.excess(recovers)
+
+
+def open_profiled(
+    scene: Scene, device: str, quality: Quality, size: tuple[int, int] | None, clock: Callable[[], float]
+) -> Pipeline:
+    """A pipeline whose stages are timed by a clock; by ``WORK`` one thread does them, one after another."""
+    bands = 1 if clock is WORK else None
+    pipeline = Pipeline(scene, device=device, quality=quality, size=size, bands=bands, profile=True)
+    pipeline.scheduler.clock = clock
+    return pipeline
+
+
+def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
+    """Milliseconds that the process's work takes: by ``WORK`` all of it, by the time its share on every core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return seconds * 1e3 / (1 if clock is WORK else cores)
+
+
+def cache_folder() -> Path:
+    """Where this user's programs keep what they can make again."""
+    if os.environ.get("XDG_CACHE_HOME"):
+        return Path(os.environ["XDG_CACHE_HOME"]) / "warp_ar"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "warp_ar" / "cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "warp_ar"
+    return Path.home() / ".cache" / "warp_ar"
+
+
+def cost_key(plan: Plan, device: Any, knobs: Sequence[Knob]) -> str:
+    """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the rungs."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    scene = plan.request.scene
+    parts = [
+        device.name,
+        cores if device.is_cpu else None,
+        wp.__version__,
+        package_version(),
+        plan.request.size,
+        [stage.name for stage, _ in plan.stages],
+        [(item.shape, str(item.file), type(item.material).__name__) for item in scene.objects],
+        [(proxy.shape, str(proxy.file)) for proxy in scene.proxies],
+        [light.kind for light in scene.lights],
+        [(knob.name, knob.rungs) for knob in knobs],
+    ]
+    return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:24]
+
+
+def package_version() -> str:
+    """Of this package; a checkout that is not installed has none."""
+    try:
+        return importlib.metadata.version("warp-ar")
+    except importlib.metadata.PackageNotFoundError:
+        return "checkout"
+
+
+def read_costs(folder: Path, key: str, knobs: Sequence[Knob]) -> Costs | None:
+    """Kept costs, or None where there are none that can be used."""
+    try:
+        kept = json.loads((folder / _CACHE_FILE).read_text(encoding="utf-8"))[key]
+        rungs = {knob.name: {str(rung): float(ms) for rung, ms in kept["rungs"][knob.name].items()} for knob in knobs}
+        known = all(set(rungs[knob.name]) <= set(knob.rungs) and rungs[knob.name] for knob in knobs)
+        scales = {
+            str(knob): {str(rung): {str(name): float(x) for name, x in own.items()} for rung, own in table.items()}
+            for knob, table in kept["scales"].items()
+        }
+        return Costs(float(kept["base"]), rungs, scales, float(kept["track"]), float(kept["work"])) if known else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None  # not there, or not ours: it is measured anew
+
+
+def write_costs(folder: Path, key: str, costs: Costs) -> None:
+    """Keep costs beside those of other devices and scenes; where nothing can be written, they are measured again."""
+    path = folder / _CACHE_FILE
+    try:
+        everything = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        everything = {}
+    if not isinstance(everything, dict):
+        everything = {}
+    everything[key] = dataclasses.asdict(costs)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        fresh = path.with_name(f"{path.name}.{os.getpid()}")
+        fresh.write_text(json.dumps(everything, indent=1), encoding="utf-8")
+        fresh.replace(path)
+    except OSError as error:
+        print(f"warp_ar: cannot keep measured costs in {folder}: {error.strerror}", file=sys.stderr)
