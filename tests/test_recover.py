@@ -286,12 +286,6 @@ def test_nonnegative_solution_is_the_reference_one():
             assert warm == pytest.approx(got, abs=SOLVED)
 
 
-def test_small_product_is_a_product():
-    rng = np.random.default_rng(3)
-    a, b = rng.normal(size=(700, 90)), rng.normal(size=(700, 80))
-    assert recovery.small_product(a, b) == pytest.approx(a.T @ b, abs=1e-10)
-
-
 def test_regions_join_across_seam_and_poles():
     mask = np.zeros((16, 32), bool)
     mask[5, 0] = mask[6, 31] = True  # across the seam, diagonally
@@ -452,9 +446,13 @@ def test_errors_are_shared_by_what_is_near():
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]])
     together = np.array([0.2, 0.3, 0.0]) + 1e-4 * np.arange(100)[:, None] * [1.0, 0.0, 0.0]
     plane = np.full(103, int(recovery.Kind.PLANE))
-    shared = recovery.shared_errors(np.concatenate([apart, together]), np.zeros(103, int), plane)
+    overlap = recovery.texture_overlap(np.concatenate([apart, together]), np.zeros(103, int), plane)
+    shared = recovery.shared_errors(overlap, plane, np.ones(103, bool))
     assert shared[:3] == pytest.approx(2.0)
     assert (shared[3:] > 80.0).all()
+    half = recovery.shared_errors(overlap, plane, np.arange(103) % 2 == 0)
+    assert len(half) == 52
+    assert half[2:] == pytest.approx(0.5 * shared[4::2], rel=0.03)
 
 
 def test_nothing_clipped_nothing_added(device, scene):
@@ -567,11 +565,11 @@ def shown_estimates(scene, device, count, turns=1, waits=False):
 
 @pytest.mark.parametrize("turns", [1, 2])
 @pytest.mark.parametrize("seconds", [0.0, 0.05])
-def test_estimates_take_effect_a_fixed_number_of_frames_later(scene, device, monkeypatch, seconds, turns):
+def test_estimates_take_effect_a_fixed_time_later(scene, device, monkeypatch, seconds, turns):
     """The first frames wait for theirs; however long one takes, and whoever has the frames meanwhile."""
     spied_estimates(monkeypatch, seconds)
     # Begun in frames 0, 1, 2, 8 and 14.
-    expected = [1, 2, *[3] * (8 + LATENCY - 2), *[4] * 6, 5, 5]
+    expected = [1, 2, *[3] * (8 + round(30 * LATENCY) - 2), *[4] * 6, 5, 5]
     assert shown_estimates(scene, device, len(expected), turns) == expected
 
 
@@ -579,6 +577,90 @@ def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monk
     spied_estimates(monkeypatch, 0.05)
     expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
     assert shown_estimates(scene, device, len(expected), waits=True) == expected
+
+
+def what_is_seen(room=0.4, table=0.3):
+    """Cells and observations of a room that does not clip."""
+    cells = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
+    cells["solid_angle"], cells["radiance"] = reference.cell_directions(ROWS, COLUMNS)[1].reshape(ROWS, COLUMNS), room
+    observations = np.zeros(40, np.dtype(kernels.Observation.numpy_dtype()))
+    observations["visible"], observations["radiance"] = 1.0, table
+    return cells, observations
+
+
+def settled_solver(scene):
+    """A solver that has made as many estimates as it takes."""
+    solver = recovery.Recovery(recovery.find_surfaces(scene), 0.85, (-0.12, 0.03, 0.035))
+    solver._frames = recovery.SETTLED
+    return solver
+
+
+def test_what_still_holds_is_solved_for_now_and_then(scene):
+    solver = settled_solver(scene)
+    rested = [solver.rests(*what_is_seen()) for _ in range(12)]
+    assert rested == [False, *[True] * recovery.REST, False, *[True] * recovery.REST, False, True]
+
+
+def test_a_new_solver_does_not_rest(scene):
+    solver = settled_solver(scene)
+    solver._frames = recovery.SETTLED - 1
+    assert not any(solver.rests(*what_is_seen()) for _ in range(5))
+
+
+@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"room": 0.35, "table": 0.25}])
+def test_other_light_is_solved_for_at_once(scene, changed):
+    solver = settled_solver(scene)
+    assert not solver.rests(*what_is_seen())
+    assert solver.rests(*what_is_seen())
+    assert not solver.rests(*what_is_seen(**changed))
+
+
+def test_light_that_changes_slowly_is_followed(scene):
+    """What is compared with is what was solved for, not the last frame."""
+    solver = settled_solver(scene)
+    rested = [solver.rests(*what_is_seen(table=0.3 * 1.009**k)) for k in range(12)]
+    assert rested.count(False) >= 4
+
+
+def test_a_lamp_over_a_part_of_the_desk_is_other_light(scene):
+    solver = settled_solver(scene)
+    cells, observations = what_is_seen()
+    assert not solver.rests(cells, observations)
+    observations = observations.copy()
+    observations["radiance"][:10] *= 1.3
+    assert not solver.rests(cells, observations)
+
+
+def test_a_frame_without_surfaces_is_no_proof(scene):
+    solver = settled_solver(scene)
+    cells, observations = what_is_seen()
+    observations["visible"] = 0.0
+    assert not any(solver.rests(cells, observations) for _ in range(3))
+
+
+def test_the_stage_lets_an_estimate_stand(scene, device, monkeypatch):
+    """The same picture for seconds: fewer estimates, the same light, and no work for those who read it."""
+    solved, update = [], recovery.Recovery.update
+
+    def counted(self, *sides):
+        solved.append(index)
+        return update(self, *sides)
+
+    monkeypatch.setattr(recovery.Recovery, "update", counted)
+    image = np.full((240, 320, 3), 90, np.uint8)
+    image[:100] = 255
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
+    quality = PRESETS["low"].with_rungs(recover="white_card")
+    lit = []
+    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), waits=True) as pipeline:
+        for index in range(100):
+            result = pipeline(image, time_seconds=index / 30, pose=pose)
+            lit.append(result.environment)
+    asked = [0, 1, 2, *range(8, 100, 6)]
+    rests = [frame for frame in asked[recovery.SETTLED :] if frame not in solved]
+    assert solved == [frame for frame in asked if frame not in rests]
+    assert len(rests) >= 4
+    assert all((lit[frame] == lit[frame - 1]).all() for frame in rests)
 
 
 def test_a_failing_estimate_is_reported_with_its_frame(scene, monkeypatch):

@@ -40,12 +40,14 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels.recover import LOST, SurfacePoint
@@ -78,6 +80,10 @@ PEAKS: Final = 4
 """Most peaks at a time."""
 SEARCH_EVERY: Final = 2
 """Estimates between searches for one more peak; the first searches for all."""
+LATER_EVERY: Final = 6
+"""The same once as many estimates as ``SETTLED`` were made."""
+SETTLED: Final = 10
+"""Estimates, from several views, after which lamps are taken for found, and light that stays as it is for known."""
 FIRST: Final = 5
 """Estimates in which searches try as many directions as they ever do."""
 MOST_CANDIDATES: Final = 160
@@ -94,6 +100,10 @@ MIRROR_TRUST: Final = 0.5
 """Relative standard deviation of light that comes by way of a ball: dents, scratches and dust scatter it."""
 ITERATIONS: Final = 6
 WARM_ITERATIONS: Final = 3
+STILL: Final = 0.02
+"""Relative change, of surfaces or of the room, below which the light is the same."""
+REST: Final = 4
+"""Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
 DARK: Final = 0.005
 """pi times radiance below which a point says nothing: quantisation."""
 
@@ -113,8 +123,6 @@ class Kind(enum.IntEnum):
 
 GRID: Final = 0.06
 """Metres between points on planes."""
-_ONE_THREAD: Final = 1 << 17
-"""Multiplications below which OpenBLAS, MKL and Accelerate use one thread."""
 _NOISE: Final = np.array([0.02, 0.04, 0.12, 0.04])
 """Relative standard deviation of one equation, by kind."""
 _SHARED: Final = np.array([4.0, 8.0, 2.0, 3.0])
@@ -141,6 +149,8 @@ class Surfaces:
     """``Kind`` of each surface, (surfaces,)."""
     groups: NDArray[np.int64]
     """Number of the thing that a surface belongs to, (surfaces,): faces of one box share it."""
+    overlap: NDArray[np.float32]
+    """How far points share their surface's texture, 0 to 1, (n, n)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,6 +181,12 @@ Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of lamps (q, 4: position, radius), (n, q)."""
 
 
+@functools.cache
+def _blas_threads() -> ThreadpoolController:
+    """Of NumPy's BLAS: products here take microseconds, and waking threads for them more where cores are busy."""
+    return ThreadpoolController().select(user_api="blas")
+
+
 # ---- surface points --------------------------------------------------------------------------------------------------
 
 
@@ -193,7 +209,9 @@ class _Collector:
         points = np.zeros(len(self.rows), np.dtype(SurfacePoint.numpy_dtype()))
         for column, name in enumerate(("position", "normal", "tangent", "half")):
             points[name] = [row[column] for row in self.rows]
-        return Surfaces(points, np.array(self.surface), np.array(self.kinds), np.array(self.groups))
+        surface, kinds = np.array(self.surface), np.array(self.kinds)
+        overlap = texture_overlap(points["position"], surface, kinds[surface])
+        return Surfaces(points, surface, kinds, np.array(self.groups), overlap)
 
 
 def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
@@ -264,23 +282,35 @@ def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def shared_errors(positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]) -> Array:
-    """Number of equations that share the error of each.
+def texture_overlap(
+    positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """How far points share their surface's texture, 0 to 1, (n, n); 0 where its kind has none.
 
     Args:
         positions: Of the points, metres, (n, 3).
         surface: That each lies on, (n,).
         kind: ``Kind`` of that surface, (n,).
     """
-    shared = _SHARED[kind]
+    overlap = np.zeros((len(surface), len(surface)), np.float32)
     for number in np.unique(surface):
         own = np.flatnonzero(surface == number)
         reach = _TEXTURE[kind[own[0]]]
         if reach > 0.0:
             at = positions[own].astype(float)
-            apart = np.linalg.norm(at[:, None] - at, axis=2)
-            shared[own] = np.maximum(shared[own], np.exp(-apart / reach).sum(axis=1))
-    return shared
+            overlap[np.ix_(own, own)] = np.exp(-np.linalg.norm(at[:, None] - at, axis=2) / reach)
+    return overlap
+
+
+def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: NDArray[np.bool_]) -> Array:
+    """Number of equations that share the error of each of the points that are seen.
+
+    Args:
+        overlap: From ``texture_overlap``, (n, n).
+        kind: ``Kind`` of each point's surface, (n,).
+        seen: Points that have an equation, (n,).
+    """
+    return np.asarray(np.maximum(_SHARED[kind], overlap @ seen.astype(np.float32))[seen])
 
 
 # ---- regions ---------------------------------------------------------------------------------------------------------
@@ -345,34 +375,6 @@ def split_regions(
             parts[index[nearest == piece]] = count
             count += 1
     return parts, count
-
-
-def small_product(a: Array, b: Array) -> Array:
-    """Product a' b, summed over blocks of rows so small that a BLAS library keeps to one thread.
-
-    The products here take microseconds; waking threads for them costs more than they do, and a hundredfold where cores
-    are busy.
-    """
-    step = max(1, _ONE_THREAD // max(a.shape[1] * b.shape[1], 1))
-    total = np.zeros((a.shape[1], b.shape[1]))
-    for start in range(0, len(a), step):
-        total += a[start : start + step].T @ b[start : start + step]
-    return total
-
-
-def sums_over_cells(transfer: NDArray[np.float32], values: Array) -> Array:
-    """Product of (n, m) and (m, k), in blocks that a BLAS library keeps on one thread, as ``small_product``."""
-    step = max(1, _ONE_THREAD // max(values.size, 1))
-    small = values.astype(np.float32)
-    blocks = [transfer[start : start + step] @ small for start in range(0, len(transfer), step)]
-    return np.concatenate([np.zeros((0, values.shape[1])), *blocks])
-
-
-def solve_columns(matrix: Array, columns: Array) -> Array:
-    """Solution of a linear system for every column, in blocks as in ``small_product``."""
-    step = max(1, _ONE_THREAD // 4 // max(len(columns), 1))
-    blocks = [np.linalg.solve(matrix, columns[:, start : start + step]) for start in range(0, columns.shape[1], step)]
-    return np.concatenate([np.zeros((len(columns), 0)), *blocks], axis=1)
 
 
 # ---- the least-squares problem ---------------------------------------------------------------------------------------
@@ -450,6 +452,7 @@ class _Problem:
         clipped = self.lacking.max(axis=1) - cells["hidden"].ravel()
         self.may_hold_peak = (self.lacking.max(axis=1) > 0.1) & ~modelled
         self._trace, self._center = trace, center
+        self._traced: dict[_Peak, Array] = {}
 
         # What clips on modelled surfaces is not joined to what clips beyond.
         beyond = connected_regions(((clipped > LOST) & ~modelled).reshape(self.shape)).ravel()
@@ -474,7 +477,7 @@ class _Problem:
         self.surface = surfaces.surface[seen]
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
-        self.shared = shared_errors(surfaces.points["position"][seen], self.surface, self.kind)
+        self.shared = shared_errors(surfaces.overlap, surfaces.kinds[surfaces.surface], seen)
         through_balls = mirrored[seen]
         self.transfer = transfer[seen]
         # What clips in a cell lies off its middle, for which transfer was traced.
@@ -491,10 +494,10 @@ class _Problem:
         self.bound = shown["clipped"] > 0.5
         # With what clips taken to be some ten times as bright: only the order of magnitude matters.
         bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
-        sums = sums_over_cells(self.transfer, np.column_stack([self.radiance, bright]))
+        sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
         self.captured = sums[:, :3]
-        mirrored_sums = sums_over_cells(through_balls, bright[:, None])
-        self.mirrored_share = mirrored_sums[:, 0] / np.maximum(sums[:, 3], 1e-9)
+        mirrored_sums = through_balls @ bright.astype(np.float32)
+        self.mirrored_share = mirrored_sums / np.maximum(sums[:, 3], 1e-9)
         order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
         starts = np.unique(self.part[order], return_index=True)[1]
         columns = [np.zeros((len(self.index), 0))] * 3
@@ -628,7 +631,7 @@ class _Problem:
             for row, (a, b) in enumerate(self.ties, start=len(own)):
                 deviation[row] = TIE * 0.5 * (u[a] + u[b])
             scaled = prior / deviation[:, None]
-            hessian = small_product(scaled, scaled)
+            hessian = scaled.T @ scaled
             gradient = scaled.T @ (prior_target / deviation)
             # Log-normal prior of 1 / reflectance, about the last estimate.
             hessian[diagonal, diagonal] += 1.0 / (u * spread_u) ** 2
@@ -637,7 +640,7 @@ class _Problem:
             weights = 1.0 / (1.0 + 0.25 * relative**2) / ((u[surface] * sigma) ** 2 * shared)
             weights[one_sided & (relative > 0.0)] = 0.0
             weighted = weights[:, None] * matrix
-            hessian += small_product(matrix, weighted)
+            hessian += matrix.T @ weighted
             gradient += weighted.T @ target
             # Deviations are relative: what they are relative to must not shrink for their sake.
             squared = weights * (matrix @ z - target) ** 2
@@ -668,7 +671,7 @@ class _Problem:
         pull = weighted.T @ (fit.target - fit.matrix @ fit.z)
         overlap = fit.matrix[:, free].T @ weighted
         own = (added * weighted).sum(axis=0)
-        own -= (overlap * solve_columns(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
+        own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
         return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0), np.float64)
 
     def power_columns(self, peaks: Sequence[_Peak]) -> Array:
@@ -676,11 +679,15 @@ class _Problem:
         cells = np.array([peak.cell for peak in peaks])
         distances = np.array([peak.distance for peak in peaks])
         columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
-        near = np.isfinite(distances)
-        if self._trace is not None and near.any():
-            at = self._center + distances[near, None] * self.direction[cells[near]]
-            lamps = np.column_stack([at, LAMP_SHARE * distances[near]]).astype(np.float32)
-            columns[:, near] = self._trace(lamps)[self.index] * distances[near] ** 2
+        near = [k for k, peak in enumerate(peaks) if np.isfinite(peak.distance)]
+        if self._trace is not None and near:
+            new = [k for k in near if peaks[k] not in self._traced]
+            if new:
+                at = self._center + distances[new, None] * self.direction[cells[new]]
+                lamps = np.column_stack([at, LAMP_SHARE * distances[new]]).astype(np.float32)
+                traced = self._trace(lamps)[self.index] * distances[new] ** 2
+                self._traced.update((peaks[k], column) for k, column in zip(new, traced.T, strict=True))
+            columns[:, near] = np.stack([self._traced[peaks[k]] for k in near], -1)
         return columns
 
     def patch(self, cell: int) -> Array:
@@ -804,6 +811,32 @@ class Recovery:
         self._white, self._center = white, np.array(center, float)
         self._peaks: list[_Peak] = []
         self._frames = 0
+        self._rested = 0
+        self._seen: tuple[Array, Array, NDArray[np.bool_]] | None = None
+
+    def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
+        """Whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
+
+        Takes note of what it is given, unless it holds.
+
+        Args:
+            cells: As for ``update``.
+            observations: As for ``update``.
+        """
+        room = cells["solid_angle"][..., None] * cells["radiance"].astype(float)
+        shown = observations["radiance"].mean(axis=1).astype(float)
+        told = (observations["visible"] > 0.8) & (observations["clipped"].max(axis=1) < 0.01) & (np.pi * shown > DARK)
+        before, self._rested = self._seen, self._rested + 1
+        if before is not None and self._frames >= SETTLED and self._rested <= REST:
+            both = told & before[2]
+            # The mean of what changed, not the mean change: which of two cells sees a window's edge varies by itself.
+            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max()
+            if both.any() and moved < STILL * room.sum(axis=(0, 1)).max():
+                ratio = np.log(shown[both] / before[1][both])
+                if np.quantile(np.abs(ratio), 0.8) < 2.0 * STILL and abs(np.median(ratio)) < STILL:
+                    return True
+        self._seen, self._rested = (room, shown, told), 0
+        return False
 
     def update(
         self,
@@ -822,7 +855,20 @@ class Recovery:
             observations: Records of ``Observation``, (n,).
             trace: Traces lamps at finite distances; None: all light is distant.
         """
+        with _blas_threads().limit(limits=1):
+            return self._solve(cells, transfer, mirrored, observations, trace)
+
+    def _solve(
+        self,
+        cells: NDArray[Any],
+        transfer: NDArray[Any],
+        mirrored: NDArray[Any],
+        observations: NDArray[Any],
+        trace: Trace | None,
+    ) -> Estimate:
+        """``update``, by the thread that asks for it alone."""
         problem = _Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, self._center)
+        self._frames += 1
         means, bounds = problem.card_means()
         if self.rung == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
             excess = problem.member @ (problem.expected[problem.component][:, None] * means)
@@ -833,16 +879,17 @@ class Recovery:
         for peak in self._peaks:
             if problem.may_hold_peak[peak.cell]:
                 problem.push(peak)
-        if self._frames and problem.peaks:
+        before = self._frames - 1
+        every = SEARCH_EVERY if before < SETTLED else LATER_EVERY
+        if before and problem.peaks and (before < SETTLED or before % 2 == 0):
             problem.move_peak(best, means[best])
         start, room = problem.start(means[best]), PEAKS - len(problem.peaks)
-        if self._frames == 0:
+        if before == 0:
             problem.find_peaks(best, start, room)
-        elif self._frames % SEARCH_EVERY == 1:
-            turn = self._frames // SEARCH_EVERY
-            candidates = MOST_CANDIDATES if self._frames < FIRST else LATER_CANDIDATES
+        elif before % every == 1:
+            turn = before // SEARCH_EVERY
+            candidates = MOST_CANDIDATES if before < FIRST else LATER_CANDIDATES
             problem.find_peaks(best, start, min(room, 1), candidates=candidates, turn=turn)
-        self._frames += 1
 
         bright = problem.first_mean
         # Where the card does not tell, reflectances in a channel in which it does are worth more than guesses.

@@ -24,9 +24,10 @@ EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
 EVERY_SECONDS = 0.2
 """Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched lamp."""
-LATENCY = 3
-"""Frames after which an estimate takes effect, unless the request is to wait for it: it is solved for beside them. The
-number is fixed, so that the same frames give the same pictures; where it is not solved for in time, the frame waits."""
+LATENCY = 0.1
+"""Seconds, by the frames' clock, after which an estimate takes effect, unless the request is to wait for it: it is
+solved for beside them. They are fixed, so that the same frames give the same pictures; where it is not solved for in
+time, the frame waits."""
 MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
 
 
@@ -37,10 +38,8 @@ class _Progress:
     solver: recovery.Recovery
     estimate: recovery.Estimate | None = None
     """The one that took effect last."""
-    pending: Future[_Solution] | None = None
-    """The one that is being solved for."""
-    age: int = 0
-    """Frames since that began."""
+    pending: Future[_Solution | None] | None = None
+    """The one that is being solved for; it becomes None where the last still holds."""
     frames: int = 0
     waited: int = 0
     """Frames since the last estimate was begun."""
@@ -112,7 +111,7 @@ class Recover(Stage):
         arrays["recover_points"].assign(self._surfaces.points)
         solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
         self._progress = _Progress(solver)
-        self._asks = self._arrives = False
+        self._asks = self._arrives = self._news = False
         self._worker: ThreadPoolExecutor | None = None
         cells = arrays["recover_cells_now"]
         points = len(self._surfaces.points)
@@ -197,10 +196,9 @@ class Recover(Stage):
         now, seconds = self._progress, self._arrays["seconds"]()
         now.frames += 1
         now.waited += 1
-        now.age += 1
-        waited = abs(seconds - now.last) > EVERY_SECONDS - 1e-3
-        self._arrives = now.pending is not None and now.age >= LATENCY
-        self._asks = now.frames <= EVERY_FRAME or (waited and now.waited >= EVERY_FRAME)
+        since = abs(seconds - now.last) + 1e-3
+        self._arrives = now.pending is not None and since > LATENCY
+        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and now.waited >= EVERY_FRAME)
         if self._asks:
             now.waited, now.last = 0, seconds
 
@@ -214,7 +212,7 @@ class Recover(Stage):
                 wp.load_module(kernels.make_kernels(proxies)[2].module, device=self._device)
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
-        now.pending, now.age = self._worker.submit(self._solve, now.solver), 0
+        now.pending = self._worker.submit(self._solve, now.solver)
         if self._at_once():
             self._take(None)
 
@@ -222,10 +220,12 @@ class Recover(Stage):
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
         return self.request.waits or self._progress.frames <= EVERY_FRAME
 
-    def _solve(self, solver: recovery.Recovery) -> _Solution:
+    def _solve(self, solver: recovery.Recovery) -> _Solution | None:
         """In the worker. Nothing writes the equations before this is done: it takes effect before the next begins."""
         sides = self._equations.fetched()
         cells = sides["recover_cells_now"]
+        if solver.rests(cells, sides["recover_observations"]):
+            return None
         estimate = solver.update(
             cells, sides["recover_transfer"], sides["recover_mirrored"], sides["recover_observations"], self._trace
         )
@@ -258,6 +258,9 @@ class Recover(Stage):
         now = self._progress
         assert now.pending is not None
         solution, now.pending = now.pending.result(), None
+        self._news = solution is not None
+        if solution is None:
+            return
         now.estimate = solution.estimate
         values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
         if "lamps" in self.wiring.writes:
@@ -283,7 +286,7 @@ class Recover(Stage):
     def changed(self, name: str) -> bool:
         """As ``Fill.changed``; lamps change where an estimate takes effect."""
         if name == "lamps":
-            return self._arrives or (self._asks and self._at_once())
+            return self._news and (self._arrives or (self._asks and self._at_once()))
         if not self._device.is_cpu:
             return True
         if not self._arrays["recover_difference"].numpy().max() > 1.0:
