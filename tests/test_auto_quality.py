@@ -177,6 +177,15 @@ def test_what_nobody_knew_is_found_out_before_it_is_shown(budget):
     assert machine.changes(15.0) == 0
 
 
+def test_the_first_choice_is_not_taken_for_being_cheaper_than_the_base():
+    """A rung that promises to cost 1 ms and costs 8 leaves less than the base takes, and more than the budget."""
+    promised = {**COSTS.rungs, "diffuse": {**COSTS.rungs["diffuse"], "clusters": 1.0}}
+    machine = Machine(13.0, known=Costs(COSTS.base, promised, COSTS.scales))
+    machine.run(10.0)
+    assert machine.rejected > 0, "it must have been tempted"
+    assert machine.dearest() <= 13.0
+
+
 def test_without_trials_the_frames_tell():
     machine = Machine(110.0, known=UNSCALED, timed=False)
     machine.run(20.0)

@@ -223,8 +223,10 @@ class Controller:
 
     def confirm(self) -> bool:
         """Whether the present settings may be shown, now that they have been timed; if not, those before are back."""
-        limit = max(AIM * self.budget_ms, (1.0 - GAIN) * self.expected(self._before))
-        if self.expected_ms <= limit:
+        # The first choice may be any: it must be the best still. Later ones lead to it by way of what saves something.
+        fits = self.expected_ms <= AIM * self.budget_ms
+        saves = self.expected_ms < (1.0 - GAIN) * self.expected(self._before)
+        if fits or (saves if self._chosen else dict(self._best(AIM).settings) == self.settings):
             self._chosen = True
             return True
         self.settings = self._target = self._before

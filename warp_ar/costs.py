@@ -129,6 +129,7 @@ def measure_steps(
     pace = sum(passed.values()) / work if clock is None and work > 0.0 else 1.0
     rungs: dict[str, dict[str, float]] = {}
     scales: dict[str, dict[str, dict[str, float]]] = {}
+    shares: dict[str, float] = {}
     for knob in knobs:
         start = setting(BASE, knob)
         times: dict[str, dict[str, float]] = {}
@@ -145,6 +146,10 @@ def measure_steps(
         common = set.intersection(*(set(own) for own in times.values())) - set(knob.stages)
         own = {rung: sum(ms for name, ms in stages.items() if name not in common) for rung, stages in times.items()}
         rungs[knob.name] = {rung: pace * (ms - own[start]) for rung, ms in own.items()}
+        # A rung may bring another stage along; what is shared scales the knob's own stage.
+        most = max(own, key=lambda rung: abs(own[rung] - own[start]))
+        part = times[most].get(knob.name, 0.0) - times[start].get(knob.name, 0.0)
+        shares[knob.name] = min(max(part / (own[most] - own[start]), 0.0), 1.0) if own[most] != own[start] else 1.0
         # What recovery does on its own thread is the same for a map of any size.
         others = [
             other.name for other in knobs if other.name in knob.stages and other.name not in (knob.name, NOW_AND_THEN)
@@ -154,6 +159,9 @@ def measure_steps(
                 rung: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
                 for rung, stages in times.items()
             }
+    for table in scales.values():
+        for scale in table.values():
+            scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
     return Costs(track + pace * work, rungs, scales, track, work)
 
 
