@@ -20,7 +20,7 @@ Rows = tuple[int, int]
 MOST_REGISTERS = 80
 """Registers of a CUDA thread in kernels that trace rays.
 
-They wait for memory most of their time. Left alone they take 130 to 255, with which a multiprocessor of 65,536 holds
+They wait for memory most of their time. Left alone they take 120 to 255, with which a multiprocessor of 65,536 holds
 one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
 """
 
