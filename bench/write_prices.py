@@ -1,8 +1,9 @@
 """``python -m bench.write_prices``: the measured price list into ``docs/prices.md`` and the README.
 
 It reads ``bench/results/*_prices.jsonl``, which ``python -m bench prices`` prints, and the errors of
-``warp_ar/price_list.json``, and replaces what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It
-prints for every preset what the rule of ``quality.BUDGETS`` would choose.
+``warp_ar/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and replaces what
+stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what the rule of
+``quality.BUDGETS`` would choose.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def rung_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: di
 
 
 def preset_table(
-    cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any], scenes: list[str]
+    cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], presets: dict[str, Any], scenes: list[str]
 ) -> str:
     rows = []
     for scene in scenes:
@@ -94,7 +95,7 @@ def preset_table(
                 next((line for line in lines if line.get("preset") == name and line["scene"] == scene), None)
                 for lines in (cpu, cuda)
             ]
-            flip = listed.get("wholes", {}).get(scene, {}).get(name)
+            flip = presets["errors"].get(scene, {}).get(name)
             cells = ["" if flip is None else f"{flip:.3f}", *(milliseconds(line) for line in found)]
             rows.append([f"`{scene}`" if name == "paper" else "", f"`{name}`", *cells])
     head = ["scene", "preset", "error (FLIP)", f"ms, {device_of(cpu)}", f"ms, {device_of(cuda)}"]
@@ -151,14 +152,15 @@ def replace(path: Path, name: str, text: str) -> None:
 def main() -> None:
     cpu, cuda = read("cpu_prices.jsonl"), read("h*_prices.jsonl")
     listed = json.loads((ROOT / "warp_ar" / "price_list.json").read_text(encoding="utf-8"))
+    presets = json.loads((ROOT / "bench" / "results" / "presets.json").read_text(encoding="utf-8"))
     if not cpu:
         sys.exit("write_prices: no bench/results/cpu_prices.jsonl; make it with python -m bench prices --device cpu")
     page = ROOT / "docs" / "prices.md"
     scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
-    replace(page, "presets", preset_table(cpu, cuda, listed, scenes))
+    replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
     replace(page, "rungs", rung_table(cpu, cuda, listed))
     replace(page, "rule", rule_table(cpu))
-    replace(ROOT / "README.md", "extract", preset_table(cpu, cuda, listed, ["desk"]))
+    replace(ROOT / "README.md", "extract", preset_table(cpu, cuda, presets, ["desk"]))
 
 
 if __name__ == "__main__":

@@ -306,9 +306,22 @@ def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
     assert "expose" in capsys.readouterr().out
 
 
+def test_presets_alone(tmp_path, monkeypatch, device):
+    monkeypatch.setattr(tradeoff, "RUNS", ("paper", "low"))
+    arguments = ["darken", "--presets", "--frames", "2", "--shrink", "4", "--device", device]
+    assert tradeoff.main([*arguments, "--out", str(tmp_path)]) == EXIT_DONE
+    assert {path.name for path in tmp_path.iterdir()} == {"presets.json", "tradeoff.jsonl"}
+    listed = json.loads((tmp_path / "presets.json").read_text())
+    assert listed["made"]["against"] == "truth"
+    assert set(listed["errors"]) == {"darken"}
+    assert set(listed["errors"]["darken"]) == {"paper", "low"}
+    assert all(0.0 < error < 1.0 for error in listed["errors"]["darken"].values())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["desk", "--presets", "--stage", "diffuse"], "--presets --stage diffuse: expected one of both"),
         (["desk", "--frames", "0"], "--frames 0: expected 1 or more"),
         (["desk", "--shrink", "0"], "--shrink 0: expected 1 or more"),
         (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),

@@ -867,21 +867,32 @@ def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any
         kept = {row.rung for row in rows if not row.dominated}
         dominated[knob.name] = [rung for rung in by_rung if rung not in kept]
     return {
-        "made": {
-            "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
-            "device": device_name(device),
-            "warp": wp.__version__,
-            "against": "truth" if all(report.case.truth for report in reports) else "the last rung where no truth is",
-            "base": BASE.name,
-        },
+        "made": _made(reports, device) | {"base": BASE.name},
         "errors": errors,
         "stage_errors": stage_errors,
-        "wholes": {
+        "dominated": {knob: rungs for knob, rungs in dominated.items() if rungs},
+    }
+
+
+def make_preset_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
+    """FLIP per changed pixel of every preset's whole picture, by case."""
+    return {
+        "made": _made(reports, device),
+        "errors": {
             report.case.name: {whole.label: round(whole.flip, 4) for whole in report.wholes if whole.label in RUNS}
             for report in reports
             if report.wholes
         },
-        "dominated": {knob: rungs for knob, rungs in dominated.items() if rungs},
+    }
+
+
+def _made(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
+    """Of what a list was made."""
+    return {
+        "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
+        "device": device_name(device),
+        "warp": wp.__version__,
+        "against": "truth" if all(report.case.truth for report in reports) else "the last rung where no truth is",
     }
 
 
@@ -928,7 +939,8 @@ def print_report(report: CaseReport, console: Console) -> None:
                 style="dim" if row.dominated else "",
             )
         table.add_section()
-    console.print(table)
+    if report.rows:
+        console.print(table)
     table = Table(title=f"{report.case.name}: as a whole")
     table.add_column("quality")
     for column in ("ms", "over paper's", "FLIP"):
@@ -971,6 +983,7 @@ def make_parser() -> argparse.ArgumentParser:
         help="scene files or bundled scenes' names, or all for every bundled one (default: desk, or --truth)",
     )
     add("--stage", metavar="NAME", help=f"turn only this: {', '.join(knob.name for knob in KNOBS)}")
+    add("--presets", action="store_true", help="turn nothing: run whole presets only, and write presets.json")
     add("--truth", type=Path, metavar="DIR", help="a case with pictures of the truth, or a folder of cases")
     add(
         "--versions",
@@ -984,7 +997,12 @@ def make_parser() -> argparse.ArgumentParser:
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add("--quick", action="store_true", help="leave brute force out: seconds instead of minutes on CPU")
     add("--processor-time", action="store_true", help="on CPU count the work of one thread, not the time by the clock")
-    add("--out", type=Path, metavar="DIR", help="write tradeoff.jsonl, price_list.json and tradeoff.html here")
+    add(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write tradeoff.jsonl, price_list.json and tradeoff.html here (or presets.json)",
+    )
     add("--extra", type=Path, metavar="FILE", help="JSON lines of python -m bench precision, for the page")
     return parser
 
@@ -1003,6 +1021,8 @@ def tradeoff(options: argparse.Namespace) -> int:
     """Measure, print and write."""
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected 1 or more")
+    if options.presets and options.stage is not None:
+        raise UsageError(f"--presets --stage {options.stage}: expected one of both")
     if options.shrink < 1:
         raise UsageError(f"--shrink {options.shrink}: expected 1 or more")
     from warp_ar.device import resolve_device
@@ -1016,10 +1036,12 @@ def tradeoff(options: argparse.Namespace) -> int:
     reports = []
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), console=console) as progress:
         for case in open_cases(options):
-            knobs = chosen_knobs(case, options.stage)
+            knobs = () if options.presets else chosen_knobs(case, options.stage)
             if case.name.endswith(SIZED):
                 knobs = tuple(knob for knob in knobs if knob.name == "light_shadow")
-            if not knobs:
+                if options.presets:
+                    continue
+            if not knobs and not options.presets:
                 console.print(f"{case.name}: nothing to turn", highlight=False)
                 continue
             task = progress.add_task(case.name, total=len(knobs) + 2)
@@ -1040,6 +1062,11 @@ def tradeoff(options: argparse.Namespace) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
         lines = (json.dumps(record) for report in reports for record in records(report, device))
         (options.out / "tradeoff.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if options.presets:
+            presets = make_preset_list(reports, device)
+            (options.out / "presets.json").write_text(json.dumps(presets, indent=1) + "\n", encoding="utf-8")
+            console.print(f"written to {options.out}", highlight=False)
+            return EXIT_DONE
         (options.out / "price_list.json").write_text(json.dumps(price_list, indent=1) + "\n", encoding="utf-8")
         figures = (
             list(make_figures(str(device), options.frames, options.truth, options.shrink, clock))
