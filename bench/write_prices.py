@@ -1,8 +1,8 @@
 """``python -m bench.write_prices``: the measured price list into ``docs/prices.md`` and the README.
 
 It reads ``bench/results/*_prices.jsonl``, which ``python -m bench prices`` prints, and the errors of
-``warp_ar/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and replaces what
-stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what the rule of
+``warp_ar/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and replaces
+what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what the rule of
 ``quality.BUDGETS`` would choose.
 """
 
