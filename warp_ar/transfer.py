@@ -30,38 +30,47 @@ SLOTS = 3
 KEPT = 8
 """Pictures in pinned memory at once; who keeps more gets those in ordinary memory, for which the host waits."""
 
-
 COPY_THREADS = 4
-"""Threads that copy a large frame into pinned memory."""
+"""Threads at most that copy a frame into pinned memory."""
 
-COPY_BYTES = 12_000_000
-"""From which on that pays for handing parts over; a smaller frame's copy is no longer than its kernels."""
+COPY_BYTES = 3_000_000
+"""That each of them copies at least: a quarter of a millisecond, ten times what it takes to hand a part over."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
 
 
 class Marks:
-    """When a frame took which step on the device."""
+    """When a frame took which step on its way to the kernels; streams wait for the same events that tell the times."""
 
     def __init__(self, device: Any) -> None:
         self.frame = -1
-        self.sent, self.arrived, self.started, self.rendered, self.returned = (
-            wp.Event(device, enable_timing=True) for _ in range(5)
-        )
+        self.sent, self.arrived, self.started = (wp.Event(device, enable_timing=True) for _ in range(3))
 
 
 class Slot:
     """Buffers of one frame under way."""
 
     marks: Marks
+    """Of the frame that was uploaded last."""
 
     def __init__(self, shape: tuple[int, int], device: Any) -> None:
         self.pinned = wp.zeros(shape, dtype=wp.vec3ub, device="cpu", pinned=True)
         self.host = self.pinned.numpy()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         self.image = wp.zeros(shape, dtype=wp.vec3ub, device=device)
-        self.uploaded, self.consumed, self.rendered, self.downloaded = (wp.Event(device) for _ in range(4))
+        self.consumed = wp.Event(device)
+        self.downloaded: Any = None
+        """Event after the last picture from here, or from a later slot."""
+
+
+class Buffer:
+    """Memory of the host that a picture comes into, and when it was rendered and was there."""
+
+    def __init__(self, shape: tuple[int, int], device: Any, *, pinned: bool) -> None:
+        self.array = wp.empty(shape, dtype=wp.vec3ub, device="cpu", pinned=pinned)
+        self.host = self.array.numpy()
+        self.rendered, self.done = (wp.Event(device, enable_timing=True) for _ in range(2))
 
 
 class _Holder:
@@ -86,18 +95,13 @@ class Transfers:
         self._up, self._down = wp.Stream(device), wp.Stream(device)
         self._slots = [Slot(shape, device) for _ in range(SLOTS)]
         self._uploads = self._downloads = 0
-        large = 3 * shape[0] * shape[1] >= COPY_BYTES
-        self._pool = ThreadPoolExecutor(COPY_THREADS - 1, "warp_ar-copy") if large else None
+        self._parts = split_rows(*shape)
+        helpers = len(self._parts) - 1
+        self._pool = ThreadPoolExecutor(helpers, "warp_ar-copy") if helpers else None
         self._marks = [Marks(device) for _ in range(MARKED)]
         self._marking = self._marks[0]
-        self._free: collections.deque[tuple[Any, Image, Any]] = collections.deque()
-        for _ in range(SLOTS):
-            self._free.append(self._new_buffer())
+        self._free = collections.deque(Buffer(shape, device, pinned=True) for _ in range(SLOTS))
         self._buffers = SLOTS
-
-    def _new_buffer(self) -> tuple[Any, Image, Any]:
-        pinned = wp.zeros(self._shape, dtype=wp.vec3ub, device="cpu", pinned=True)
-        return pinned, pinned.numpy(), wp.Event(self._device)
 
     def close(self) -> None:
         """Stop the copying threads."""
@@ -108,10 +112,9 @@ class Transfers:
         if self._pool is None:
             np.copyto(target, source)
             return
-        edges = [len(source) * part // COPY_THREADS for part in range(COPY_THREADS + 1)]
-        parts = [slice(*pair) for pair in itertools.pairwise(edges)]
-        others = [self._pool.submit(np.copyto, target[part], source[part]) for part in parts[1:]]
-        np.copyto(target[parts[0]], source[parts[0]])
+        own, *handed_over = self._parts
+        others = [self._pool.submit(np.copyto, target[part], source[part]) for part in handed_over]
+        np.copyto(target[own], source[own])
         for other in others:
             other.result()
 
@@ -123,21 +126,20 @@ class Transfers:
         """
         slot = self._slots[self._uploads % SLOTS]
         if self._uploads >= SLOTS:
-            wait_for(slot.uploaded)
+            wait_for(slot.marks.arrived)
             self._up.wait_event(slot.consumed)
-        slot.marks = self._marks[self._uploads % MARKED]
-        slot.marks.frame = self._uploads
+        marks = slot.marks = self._marks[self._uploads % MARKED]
+        marks.frame = self._uploads
         self._uploads += 1
         self._copy(slot.host, image)
-        self._up.record_event(slot.marks.sent)
+        self._up.record_event(marks.sent)
         wp.copy(slot.frame, slot.pinned, stream=self._up)
-        self._up.record_event(slot.marks.arrived)
-        self._up.record_event(slot.uploaded)
+        self._up.record_event(marks.arrived)
         return slot
 
     def receive(self, slot: Slot, frame_out: Any) -> None:
         """Have kernels that are launched from now on see an uploaded picture in ``frame_out``."""
-        self._compute.wait_event(slot.uploaded)
+        self._compute.wait_event(slot.marks.arrived)
         self._compute.record_event(slot.marks.started)
         self._marking = slot.marks
         wp.copy(frame_out, slot.frame, stream=self._compute)
@@ -145,42 +147,46 @@ class Transfers:
 
     def download(self, image: Any) -> Picture:
         """Send the device's picture to the host as soon as the kernels launched so far have written it."""
-        slot, marks = self._slots[self._downloads % SLOTS], self._marking
+        slot = self._slots[self._downloads % SLOTS]
         self._downloads += 1
-        self._compute.wait_event(slot.downloaded)
-        wp.copy(slot.image, image, stream=self._compute)
-        self._compute.record_event(slot.rendered)
-        self._compute.record_event(marks.rendered)
-        self._down.wait_event(slot.rendered)
         if not self._free and self._buffers < KEPT:
             with exclusive(self._device):
-                self._free.append(self._new_buffer())
+                self._free.append(Buffer(self._shape, self._device, pinned=True))
             self._buffers += 1
         try:
             buffer = self._free.popleft()
         except IndexError:
-            ordinary = wp.empty(self._shape, dtype=wp.vec3ub, device="cpu")
-            buffer = (ordinary, ordinary.numpy(), wp.Event(self._device))
-            kept: Image = buffer[1]
+            buffer = Buffer(self._shape, self._device, pinned=False)
+            kept: Image = buffer.host
         else:
-            holder = _Holder(buffer[1])
+            holder = _Holder(buffer.host)
             # The next picture is sent there on the same stream, so after this one even if nobody waited for it.
             weakref.finalize(holder, self._free.append, buffer)
             kept = np.asarray(holder)
-        target, _, done = buffer
-        wp.copy(target, slot.image, stream=self._down)
-        self._down.record_event(slot.downloaded)
-        self._down.record_event(marks.returned)
-        self._down.record_event(done)
-        return Picture(kept, done, marks)
+        if slot.downloaded is not None:
+            self._compute.wait_event(slot.downloaded)
+        wp.copy(slot.image, image, stream=self._compute)
+        self._compute.record_event(buffer.rendered)
+        self._down.wait_event(buffer.rendered)
+        wp.copy(buffer.array, slot.image, stream=self._down)
+        self._down.record_event(buffer.done)
+        slot.downloaded = buffer.done
+        return Picture(kept, buffer, self._marking)
+
+
+def split_rows(height: int, width: int) -> list[slice]:
+    """Rows of a frame in as many parts as threads copy it: ``COPY_BYTES`` each or more."""
+    parts = min(COPY_THREADS, max(3 * height * width // COPY_BYTES, 1))
+    return [slice(*pair) for pair in itertools.pairwise(height * part // parts for part in range(parts + 1))]
 
 
 class Picture:
     """A picture on its way to the host."""
 
-    def __init__(self, image: Image, done: Any, marks: Marks) -> None:
-        """``image`` is there once the event ``done`` has come to pass."""
-        self._image, self._done, self._marks, self._frame = image, done, marks, marks.frame
+    def __init__(self, image: Image, buffer: Buffer, marks: Marks) -> None:
+        """``image`` is there once the buffer is done; ``marks`` are of the frame that it was made of."""
+        self._image, self._rendered, self._done = image, buffer.rendered, buffer.done
+        self._marks, self._frame = marks, marks.frame
 
     def result(self) -> Image:
         """Wait for the picture; the array is the caller's for as long as anything refers to it."""
@@ -195,8 +201,8 @@ class Picture:
             return {}
         pairs = {
             "upload": (marks.sent, marks.arrived),
-            "kernels": (marks.started, marks.rendered),
-            "download": (marks.rendered, marks.returned),
+            "kernels": (marks.started, self._rendered),
+            "download": (self._rendered, self._done),
         }
         times = {name: wp.get_event_elapsed_time(*pair, synchronize=False) for name, pair in pairs.items()}
         return {name: float(milliseconds) for name, milliseconds in times.items()}
