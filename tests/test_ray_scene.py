@@ -18,6 +18,7 @@ from warp_ar.kernels import structs
 from warp_ar.ray_scene import (
     EMPTY,
     HostScene,
+    Outline,
     linear_texture,
     make_ray_mesh,
     reflects_diffusely,
@@ -416,7 +417,7 @@ def test_screen_rect_of_a_known_square():
     pose = Pose(np.eye(3), np.zeros(3))
     square = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]])
     # Columns 30.5 -+ 6: centres 25 to 36. Rows 24 -+ 6.2: centres 18 to 30.
-    assert screen_rect([square], pose, CAMERA) == (17, 32, 24, 38)
-    assert screen_rect([square - np.array([0, 0, 2])], pose, CAMERA) == EMPTY
-    assert screen_rect([square + np.array([5, 0, 0])], pose, CAMERA) == EMPTY
-    assert screen_rect([], pose, CAMERA) == EMPTY
+    assert screen_rect(Outline([square]), pose, CAMERA) == (17, 32, 24, 38)
+    assert screen_rect(Outline([square - np.array([0, 0, 2])]), pose, CAMERA) == EMPTY
+    assert screen_rect(Outline([square + np.array([5, 0, 0])]), pose, CAMERA) == EMPTY
+    assert screen_rect(Outline([]), pose, CAMERA) == EMPTY

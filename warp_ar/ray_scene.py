@@ -251,11 +251,12 @@ class HostScene:
         materials = self._material_records()
         self._place_objects()
         self._lights = np.zeros(len(scene.lights), _dtype(structs.Light))
-        self._lit: list[FloatArray] | None = None
-        self._bounced: list[FloatArray] | None = None
+        self._lit: Outline | None = None
+        self._bounced: Outline | None = None
         self._placed = b""  # the objects that the polygons below are of
-        self._outlines: list[FloatArray] = []
-        self._shaded: list[FloatArray] | None = None
+        self._outline = Outline(())
+        self._shaded: Outline | None = None
+        self._balls = _ball_outline(scene)
         self._lights_edited = False
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -281,6 +282,7 @@ class HostScene:
         self._place_objects()
         self.ray_scene.materials.assign(self._material_records())
         self._lit = None
+        self._balls = _ball_outline(scene)
         self._lights_edited = True
 
     def _place_objects(self) -> None:
@@ -387,14 +389,14 @@ class HostScene:
             camera: The camera of the frames.
         """
         self._follow_objects()
-        return screen_rect(self._outlines, pose, camera)
+        return screen_rect(self._outline, pose, camera)
 
     def _follow_objects(self) -> None:
         """Forget what was found out about moved objects; clipping polygons takes longer than a kernel."""
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
-            self._outlines = [face for record in self._objects for face in _faces(record)]
+            self._outline = Outline([face for record in self._objects for face in _faces(record)])
             self._shaded = None
 
     def light_rect(self, pose: Pose, camera: scenes.Camera, *, bounced: bool = False) -> Rect:
@@ -406,29 +408,27 @@ class HostScene:
             bounced: Light that lit proxies send on counts as well.
         """
         if self._lit is None:
-            self._lit = [
-                lit for light in self._lights for record in self._proxies for lit in _lit_faces(light, _faces(record))
-            ]
+            faces = [_faces(record) for record in self._proxies]
+            self._lit = Outline([part for light in self._lights for own in faces for part in _lit_faces(light, own)])
             self._bounced = None
         if not bounced:
             return screen_rect(self._lit, pose, camera)
         if self._bounced is None:
-            self._bounced = _bounced_faces(self._lights, self._proxies)
-        return screen_rect([*self._lit, *self._bounced], pose, camera)
+            self._bounced = Outline([*self._lit.polygons, *_bounced_faces(self._lights, self._proxies)])
+        return screen_rect(self._bounced, pose, camera)
 
     def ball_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where mirror balls are on screen; arguments as ``object_rect``."""
-        boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in self.scene.probes]
-        return screen_rect([box[list(face)] for box in boxes for face in _FACES], pose, camera)
+        return screen_rect(self._balls, pose, camera)
 
     def shadow_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
         """Where virtual objects can change the room's light on proxies on screen; arguments as ``object_rect``."""
         self._follow_objects()
         if self._shaded is None:
             proxies = [_faces(record) for record in self._proxies]
-            self._shaded = [
-                part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)
-            ]
+            self._shaded = Outline(
+                [part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)]
+            )
         return screen_rect(self._shaded, pose, camera)
 
 
@@ -475,6 +475,12 @@ def _faces(record: Any) -> list[FloatArray]:
     if record["kind"] == structs.PLANE:
         return [corners[[0, 2, 6, 4]]]
     return [corners[list(face)] for face in _FACES]
+
+
+def _ball_outline(scene: scenes.Scene) -> Outline:
+    """Boxes around the mirror balls."""
+    boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in scene.probes]
+    return Outline([box[list(face)] for box in boxes for face in _FACES])
 
 
 def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
@@ -616,32 +622,49 @@ def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
     )
 
 
-def screen_rect(polygons: Sequence[FloatArray], pose: Pose, camera: scenes.Camera) -> Rect:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outline:
+    """Convex polygons in the world, looked at in every frame from somewhere else."""
+
+    polygons: Sequence[FloatArray]
+    """(n, 3) each."""
+
+    @functools.cached_property
+    def corners(self) -> FloatArray:
+        """Those of all polygons, (n, 3)."""
+        return np.concatenate(self.polygons)
+
+
+def screen_rect(outline: Outline, pose: Pose, camera: scenes.Camera) -> Rect:
     """Smallest rectangle of pixels whose rays can meet the convex hull of some polygons, one pixel of margin included.
 
     Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
     are picked by their undistorted rays, not by distorting the polygons.
 
     Args:
-        polygons: Convex polygons (n, 3) in the world.
+        outline: The polygons.
         pose: ``camera_from_world``.
         camera: The camera of the frames.
     """
-    if not polygons:
+    if not outline.polygons:
         return EMPTY
-    points = pose.apply(np.concatenate(polygons))
+    points = pose.apply(outline.corners)
     near = 1e-6 * max(float(np.abs(points).max()), 1e-12)
     if (points[:, 2] < near).any():
         forward = np.array([0.0, 0.0, 1.0])
-        clipped = [_clip(pose.apply(polygon), forward, near) for polygon in polygons]
+        clipped = [_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons]
         points = np.concatenate(clipped)
         if len(points) == 0:
             return EMPTY
     projected = points[:, :2] / points[:, 2:]
     low, high = projected.min(axis=0), projected.max(axis=0)
     x_low, x_high, y_low, y_high = _ray_bounds(camera)
-    columns = np.flatnonzero((x_high >= low[0]) & (x_low <= high[0]))
-    rows = np.flatnonzero((y_high >= low[1]) & (y_low <= high[1]))
-    if len(columns) == 0 or len(rows) == 0:
-        return EMPTY
-    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+    columns = _span((x_high >= low[0]) & (x_low <= high[0]))
+    rows = _span((y_high >= low[1]) & (y_low <= high[1]))
+    return EMPTY if columns is None or rows is None else (*rows, *columns)
+
+
+def _span(chosen: npt.NDArray[np.bool_]) -> tuple[int, int] | None:
+    """Where the first chosen element is, and where one beyond the last; None if there is none."""
+    first = int(chosen.argmax())
+    return (first, len(chosen) - int(chosen[::-1].argmax())) if chosen[first] else None
