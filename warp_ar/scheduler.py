@@ -47,6 +47,9 @@ class StageTiming:
     """True: nothing that it reads had changed."""
 
 
+SKIPPED = StageTiming(0.0, True)
+
+
 class Scheduler:
     """Runs the stages of one plan on one device."""
 
@@ -178,7 +181,7 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = StageTiming(0.0, True)
+                timings[stage.name] = SKIPPED
                 continue
             start = self.clock()
             for step in _due_passes(stage, passes):
@@ -217,7 +220,7 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = StageTiming(0.0, True)
+                timings[stage.name] = SKIPPED
                 continue
             chosen = _due_passes(stage, passes)
             due.append((stage, chosen))
@@ -237,16 +240,16 @@ class Scheduler:
                         step.launch(None)
             else:
                 self._replay(segment)
-        share = (self.clock() - start) * 1e3 / len(due)
-        times = {stage.name: share for stage, _ in due}
-        if self._marks is not None:
-            times = dict.fromkeys(times, 0.0)
-            for segment in self._patterns[key]:
-                for stage, steps in segment.part:
-                    if not segment.on_host:
-                        times[stage.name] += wp.get_event_elapsed_time(*self._marks[_ids(steps)])
-        timings.update({name: StageTiming(milliseconds, False) for name, milliseconds in times.items()})
-        return timings
+        names = [stage.name for stage, _ in due]
+        if self._marks is None:
+            share = StageTiming((self.clock() - start) * 1e3 / len(due), False)
+            return timings | dict.fromkeys(names, share)
+        times = dict.fromkeys(names, 0.0)
+        for segment in self._patterns[key]:
+            for stage, steps in segment.part:
+                if not segment.on_host:
+                    times[stage.name] += wp.get_event_elapsed_time(*self._marks[_ids(steps)])
+        return timings | {name: StageTiming(milliseconds, False) for name, milliseconds in times.items()}
 
     def _replay(self, segment: Segment) -> None:
         graph = self._graphs.get(segment.key)
@@ -361,7 +364,7 @@ class SideBySide:
         """All inputs are there: ready, or done at once where none of them changed."""
         versions = self._scheduler._due(running.stage)
         if versions is None:
-            self._timings[running.stage.name] = StageTiming(0.0, True)
+            self._timings[running.stage.name] = SKIPPED
             self._end(running)
             return
         running.versions = versions
