@@ -406,7 +406,8 @@ def shade(
     """Shade what ``trace_pixels`` found.
 
     Samples of edges take many times as long as the pixels around them. On CUDA that holds up whole warps; given
-    ``edge_lists``, edges are listed first and their samples shaded side by side, with the same result.
+    ``edge_lists``, edges are listed first and their samples shaded side by side, with the same result but for the last
+    places, where CUDA's compiler contracts a product and a sum in one of the kernels alone.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.

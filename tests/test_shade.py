@@ -42,6 +42,9 @@ FURNACE_TOLERANCE = 1e-5
 # Float32 positions against float64: 1e-6 of the cosine and the distance; a shadow's edge may fall to either side.
 TWIN_TOLERANCE = 2e-5
 TWIN_OUTLIERS = 4e-3
+# Units in the last place between two kernels that share the code of a sample. On CUDA each is compiled by itself, and
+# where only one hoists a product out of its loop, only the other contracts it with its sum: one rounding of a sample.
+CONTRACTION_ULPS = {"cpu": 0, "cuda": 4}
 
 
 def make_room(models, device, radiance=1.0):
@@ -191,12 +194,14 @@ def test_near_vertical_edge_has_every_shade(device):
 @pytest.mark.parametrize("edge_samples", [4, 16])
 @pytest.mark.parametrize("listed", [5, 3000])
 def test_listed_edges_are_the_same(device, edge_samples, listed):
-    """Edges sampled on their own, or in place where the list is full, give the bits of edges sampled in place."""
+    """Edges sampled on their own, or in place where the list is full, are as edges sampled in place."""
     scene = scene_of(ball(device), WHITE["plastic"], device=device)
     config = dataclasses.replace(EVERYTHING, edge_samples=edge_samples)
     expected = render(scene, config, device)
     assert ((expected[..., 3] > 0.0) & (expected[..., 3] < 1.0)).sum() > 20
-    np.testing.assert_array_equal(render(scene, config, device, listed=listed), expected)
+    image = render(scene, config, device, listed=listed)
+    np.testing.assert_array_equal(image[..., 3], expected[..., 3])
+    np.testing.assert_array_max_ulp(image, expected, CONTRACTION_ULPS["cpu" if device == "cpu" else "cuda"])
 
 
 # --- The float64 twin -------------------------------------------------------------------------------------------------
