@@ -440,12 +440,10 @@ def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, 
     )
     scene = make_scene(lights=(spot,))
     pictures, looked = [], []
-    rect = HostScene.light_rect
+    outline = HostScene.light_outline
     for whole in (False, True):
         if whole:
-            monkeypatch.setattr(
-                HostScene, "light_rect", lambda self, *pose, bounced=False: rect(self, *pose, bounced=True)
-            )
+            monkeypatch.setattr(HostScene, "light_outline", lambda self, bounced=False: outline(self, bounced=True))
         with Pipeline(scene, device=device, quality=quality) as pipeline:
             pictures.append([pipeline(frame).image.copy() for frame in frames[:2]])
             params = pipeline._block.host("params")

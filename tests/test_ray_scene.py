@@ -23,7 +23,7 @@ from warp_ar.ray_scene import (
     make_ray_mesh,
     reflects_diffusely,
     reflects_glossily,
-    screen_rect,
+    screen_rects,
     trace_config,
 )
 from warp_ar.tracking import Pose
@@ -43,6 +43,11 @@ PROXIES = (
 
 # Records are float32; twins in this file work on float64 numbers.
 RECORD_TOLERANCE = 1e-6
+
+
+def screen_rect(outline, pose, camera):
+    """The rectangle of one outline."""
+    return screen_rects([outline], pose, camera)[0]
 
 
 def look(eye, target) -> Pose:
@@ -250,7 +255,7 @@ def test_object_rect_holds_every_ray_that_meets_an_object(device, camera):
         distance = (0.05, 0.4, 1.0, 3.0)[index % 4]
         eye = rng.normal(size=3) * distance
         pose = look(eye, rng.normal(size=3) * 0.3)
-        rect = host.object_rect(pose, camera)
+        rect = screen_rect(host.object_outline(), pose, camera)
         mask = seen(shapes, pose, camera)
         inside = np.zeros_like(mask)
         inside[rect[0] : rect[1], rect[2] : rect[3]] = True
@@ -280,7 +285,7 @@ def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
             eye = np.array(one.center) + distance * rng.normal(size=3)
             target = rng.normal(size=3) * 0.2 if index % 5 else 3.0 * eye - 2.0 * np.array(one.center)
             pose = look(eye, target)
-            rect, mask = host.ball_rect(pose, camera), seen(balls, pose, camera)
+            rect, mask = screen_rect(host.ball_outline(), pose, camera), seen(balls, pose, camera)
             inside = np.zeros_like(mask)
             inside[rect[0] : rect[1], rect[2] : rect[3]] = True
             assert not (mask & ~inside).any(), (eye, rect)
@@ -293,16 +298,16 @@ def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
             # The ball in its box seen from a corner, and a pixel on every side of a few.
             assert np.median(wasted) < 5.0
     host = HostScene(scenes.Scene(camera), wp.get_device(device))
-    assert host.ball_rect(look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), camera) == EMPTY
+    assert screen_rect(host.ball_outline(), look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), camera) == EMPTY
 
 
 def test_nothing_in_front_gives_no_rectangle(device):
     """Objects behind the camera, and no object at all."""
     host = HostScene(scenes.Scene(CAMERA, objects=OBJECTS), wp.get_device(device))
-    assert host.object_rect(look((0.0, -2.0, 0.1), (0.0, -3.0, 0.1)), CAMERA) == EMPTY
+    assert screen_rect(host.object_outline(), look((0.0, -2.0, 0.1), (0.0, -3.0, 0.1)), CAMERA) == EMPTY
     empty = HostScene(scenes.Scene(CAMERA), wp.get_device(device))
-    assert empty.object_rect(look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), CAMERA) == EMPTY
-    assert empty.light_rect(look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), CAMERA) == EMPTY
+    assert screen_rect(empty.object_outline(), look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), CAMERA) == EMPTY
+    assert screen_rect(empty.light_outline(), look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), CAMERA) == EMPTY
 
 
 LAMPS = {
@@ -327,7 +332,7 @@ def test_light_rect_holds_every_lit_pixel(device, name):
     shares = []
     for _ in range(25):
         pose = look([*rng.uniform(-0.9, 0.9, 2), rng.uniform(0.2, 1.0)], [*rng.uniform(-0.2, 0.2, 2), 0.0])
-        rect = host.light_rect(pose, CAMERA)
+        rect = screen_rect(host.light_outline(), pose, CAMERA)
         inverse = pose.inverse()
         directions = pixel_rays(CAMERA, (0, 0)) @ inverse.rotation.T
         t, which, _ = reference.closest(shapes, np.broadcast_to(inverse.translation, directions.shape), directions)
@@ -377,8 +382,8 @@ def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, prox
     reached = 0
     for _ in range(8):
         pose = look([*rng.uniform(-0.9, 0.9, 2), rng.uniform(0.2, 1.0)], [*rng.uniform(-0.2, 0.2, 2), 0.0])
-        rect = host.light_rect(pose, CAMERA, bounced=True)
-        direct = host.light_rect(pose, CAMERA)
+        rect = screen_rect(host.light_outline(bounced=True), pose, CAMERA)
+        direct = screen_rect(host.light_outline(), pose, CAMERA)
         inverse = pose.inverse()
         directions = pixel_rays(CAMERA, (0, 0)) @ inverse.rotation.T
         t, which, normals = reference.closest(
@@ -403,12 +408,13 @@ def test_a_light_that_nothing_sends_on_has_the_same_rectangle(device):
     lamp = scenes.Light("spot", 1.0, at=(0.3, 0.2, 0.5), target=(0.3, 0.2, 0.2), inner_angle=1.0, outer_angle=4.0)
     for proxies in ((PROXIES[0],), (PROXIES[1],)):
         host = HostScene(scenes.Scene(CAMERA, lights=(lamp,), proxies=proxies), wp.get_device(device))
-        assert host.light_rect(pose, CAMERA, bounced=True) == host.light_rect(pose, CAMERA) != EMPTY
+        direct = screen_rect(host.light_outline(), pose, CAMERA)
+        assert screen_rect(host.light_outline(bounced=True), pose, CAMERA) == direct != EMPTY
     # On the desk before the box: the faces of the box that look there, and no more of the desk.
     lamp = dataclasses.replace(lamp, at=(0.0, -0.2, 0.5), target=(0.0, -0.2, 0.0))
     host = HostScene(scenes.Scene(CAMERA, lights=(lamp,), proxies=PROXIES), wp.get_device(device))
-    rect = host.light_rect(pose, CAMERA, bounced=True)
-    assert rect != host.light_rect(pose, CAMERA)
+    rect = screen_rect(host.light_outline(bounced=True), pose, CAMERA)
+    assert rect != screen_rect(host.light_outline(), pose, CAMERA)
     assert (rect[1] - rect[0]) * (rect[3] - rect[2]) < 0.5 * CAMERA.width * CAMERA.height
 
 
@@ -417,7 +423,13 @@ def test_screen_rect_of_a_known_square():
     pose = Pose(np.eye(3), np.zeros(3))
     square = np.array([[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]])
     # Columns 30.5 -+ 6: centres 25 to 36. Rows 24 -+ 6.2: centres 18 to 30.
-    assert screen_rect(Outline([square]), pose, CAMERA) == (17, 32, 24, 38)
-    assert screen_rect(Outline([square - np.array([0, 0, 2])]), pose, CAMERA) == EMPTY
-    assert screen_rect(Outline([square + np.array([5, 0, 0])]), pose, CAMERA) == EMPTY
-    assert screen_rect(Outline([]), pose, CAMERA) == EMPTY
+    shown, behind, beside = (
+        Outline([square]),
+        Outline([square - np.array([0, 0, 2])]),
+        Outline([square + np.array([5, 0, 0])]),
+    )
+    assert screen_rects([shown], pose, CAMERA) == [(17, 32, 24, 38)]
+    assert screen_rects([behind, Outline([])], pose, CAMERA) == [EMPTY, EMPTY]
+    assert screen_rects([Outline([]), beside, shown], pose, CAMERA) == [EMPTY, EMPTY, (17, 32, 24, 38)]
+    assert screen_rects([behind, shown, beside], pose, CAMERA) == [EMPTY, (17, 32, 24, 38), EMPTY]
+    assert screen_rects([], pose, CAMERA) == []

@@ -24,10 +24,10 @@ from warp_ar.graph import make_plan
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.ray_scene import HostScene, skeleton
+from warp_ar.ray_scene import HostScene, Outline, Rect, screen_rects, skeleton
 from warp_ar.scene import Camera, Scene
 from warp_ar.scheduler import Scheduler, StageTiming
-from warp_ar.stages.base import Arrays, Request
+from warp_ar.stages.base import Arrays, Request, Rows
 from warp_ar.tracking import Pose, Tracker, TrackState
 from warp_ar.transfer import Image, Picture, Slot, Transfers
 
@@ -39,6 +39,9 @@ TRACK = "track"
 
 AHEAD = 2
 """Submitted frames that may wait for being rendered."""
+
+RECTS = ("object", "light", "shadow", "ball")
+"""Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
 
 DEFAULT_FRAME_INTERVAL = 1.0 / 30.0
 """Seconds between frames whose caller gives no time."""
@@ -263,14 +266,9 @@ class Pipeline:
         add("decode", wp.array(self._decode, dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=device))
         add("rays", wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device))
-        self._object_rows = (0, height)
-        self._light_rows = (0, height)
-        add("object_rows", lambda: self._object_rows)
-        add("light_rows", lambda: self._light_rows)
-        self._shadow_rows = (0, height)
-        add("shadow_rows", lambda: self._shadow_rows)
-        self._ball_rows = (0, height)
-        add("ball_rows", lambda: self._ball_rows)
+        self._rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, height, 0, width))
+        for name in RECTS:
+            add(f"{name}_rows", functools.partial(self._rows, name))
         params = self._block.host("params")
         add("seconds", lambda: float(params["time"][0]))
         params["focal"] = (self.camera.fx, self.camera.fy)
@@ -544,19 +542,12 @@ class Pipeline:
         if moved or self._arrays.version("pose") == 0:
             touched.append("pose")
         if pose is not None:
-            params["object_rect"] = self._host_scene.object_rect(pose, self.camera)
-            bounced = "relight_bounced" in self._arrays
-            params["direct_rect"] = params["light_rect"] = self._host_scene.light_rect(pose, self.camera)
-            if bounced:
-                params["light_rect"] = self._host_scene.light_rect(pose, self.camera, bounced=True)
-            self._object_rows = (int(params["object_rect"][0][0]), int(params["object_rect"][0][1]))
-            self._light_rows = (int(params["light_rect"][0][0]), int(params["light_rect"][0][1]))
-            if "mirrored" in self._arrays:
-                params["ball_rect"] = self._host_scene.ball_rect(pose, self.camera)
-                self._ball_rows = (int(params["ball_rect"][0][0]), int(params["ball_rect"][0][1]))
-            if "physical_ratio" in self._arrays:
-                params["shadow_rect"] = self._host_scene.shadow_rect(pose, self.camera)
-                self._shadow_rows = (int(params["shadow_rect"][0][0]), int(params["shadow_rect"][0][1]))
+            outlines = self._outlines()
+            rects = dict(zip(outlines, screen_rects(list(outlines.values()), pose, self.camera), strict=True))
+            rects.setdefault("light", rects["direct"])
+            self._rects.update(rects)
+            for name, rect in rects.items():
+                params[f"{name}_rect"] = rect
         params["time"] = frame.seconds
         params["time_step"] = frame.step
         params["frame_index"] = frame.index
@@ -564,6 +555,22 @@ class Pipeline:
         self._block.upload()
         for name in touched:
             self._arrays.touch(name)
+
+    def _outlines(self) -> dict[str, Outline]:
+        """What of the screen a frame asks about; ``light`` only where it is more than what is lit directly."""
+        scene, arrays = self._host_scene, self._arrays
+        outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
+        if "relight_bounced" in arrays:
+            outlines["light"] = scene.light_outline(bounced=True)
+        if "mirrored" in arrays:
+            outlines["ball"] = scene.ball_outline()
+        if "physical_ratio" in arrays:
+            outlines["shadow"] = scene.shadow_outline()
+        return outlines
+
+    def _rows(self, name: str) -> Rows:
+        """Rows of one of ``RECTS`` in this frame."""
+        return self._rects[name][:2]
 
     def _take_frame(self, frame: _Frame) -> None:
         """The frame becomes the one that stages read."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -381,15 +382,10 @@ class HostScene:
         self._lights_edited = False
         return _update(records_out, self._lights)
 
-    def object_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
-        """Where virtual objects can be on screen, one pixel of margin included.
-
-        Args:
-            pose: ``camera_from_world``.
-            camera: The camera of the frames.
-        """
+    def object_outline(self) -> Outline:
+        """Where virtual objects are."""
         self._follow_objects()
-        return screen_rect(self._outline, pose, camera)
+        return self._outline
 
     def _follow_objects(self) -> None:
         """Forget what was found out about moved objects; clipping polygons takes longer than a kernel."""
@@ -399,37 +395,31 @@ class HostScene:
             self._outline = Outline([face for record in self._objects for face in _faces(record)])
             self._shaded = None
 
-    def light_rect(self, pose: Pose, camera: scenes.Camera, *, bounced: bool = False) -> Rect:
-        """Where virtual light or its shadows can fall on proxies on screen.
-
-        Args:
-            pose: ``camera_from_world``.
-            camera: The camera of the frames.
-            bounced: Light that lit proxies send on counts as well.
-        """
+    def light_outline(self, *, bounced: bool = False) -> Outline:
+        """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
             faces = [_faces(record) for record in self._proxies]
             self._lit = Outline([part for light in self._lights for own in faces for part in _lit_faces(light, own)])
             self._bounced = None
         if not bounced:
-            return screen_rect(self._lit, pose, camera)
+            return self._lit
         if self._bounced is None:
             self._bounced = Outline([*self._lit.polygons, *_bounced_faces(self._lights, self._proxies)])
-        return screen_rect(self._bounced, pose, camera)
+        return self._bounced
 
-    def ball_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
-        """Where mirror balls are on screen; arguments as ``object_rect``."""
-        return screen_rect(self._balls, pose, camera)
+    def ball_outline(self) -> Outline:
+        """Where mirror balls are."""
+        return self._balls
 
-    def shadow_rect(self, pose: Pose, camera: scenes.Camera) -> Rect:
-        """Where virtual objects can change the room's light on proxies on screen; arguments as ``object_rect``."""
+    def shadow_outline(self) -> Outline:
+        """Where virtual objects can change the room's light on proxies."""
         self._follow_objects()
         if self._shaded is None:
             proxies = [_faces(record) for record in self._proxies]
             self._shaded = Outline(
                 [part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)]
             )
-        return screen_rect(self._shaded, pose, camera)
+        return self._shaded
 
 
 def proxies_face(scene: scenes.Scene) -> bool:
@@ -604,7 +594,10 @@ def _clip_to_cube(polygon: FloatArray, center: FloatArray, reach: float) -> Floa
 
 @functools.lru_cache(maxsize=8)
 def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
-    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included."""
+    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included.
+
+    In ascending order: where a lens bends rows or columns back, a bound is that of all columns to one side.
+    """
     if not any(camera.distortion):
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = (np.arange(camera.height) - camera.cy) / camera.fy
@@ -615,10 +608,10 @@ def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
         rays = pixel_rays(camera).astype(np.float64)
         bounds = (rays[..., 0].min(0), rays[..., 0].max(0), rays[..., 1].min(1), rays[..., 1].max(1))
     return (
-        bounds[0] - 1.0 / camera.fx,
-        bounds[1] + 1.0 / camera.fx,
-        bounds[2] - 1.0 / camera.fy,
-        bounds[3] + 1.0 / camera.fy,
+        np.minimum.accumulate(bounds[0][::-1])[::-1] - 1.0 / camera.fx,
+        np.maximum.accumulate(bounds[1]) + 1.0 / camera.fx,
+        np.minimum.accumulate(bounds[2][::-1])[::-1] - 1.0 / camera.fy,
+        np.maximum.accumulate(bounds[3]) + 1.0 / camera.fy,
     )
 
 
@@ -635,36 +628,55 @@ class Outline:
         return np.concatenate(self.polygons)
 
 
-def screen_rect(outline: Outline, pose: Pose, camera: scenes.Camera) -> Rect:
-    """Smallest rectangle of pixels whose rays can meet the convex hull of some polygons, one pixel of margin included.
+def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera) -> list[Rect]:
+    """Smallest rectangles of pixels whose rays can meet the convex hulls of outlines, one pixel of margin included.
 
     Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
-    are picked by their undistorted rays, not by distorting the polygons.
+    are picked by their undistorted rays, not by distorting the polygons. All at once, because a frame has several, and
+    NumPy takes no longer for all than for one.
 
     Args:
-        outline: The polygons.
+        outlines: What to look at, each by itself.
         pose: ``camera_from_world``.
         camera: The camera of the frames.
     """
-    if not outline.polygons:
-        return EMPTY
-    points = pose.apply(outline.corners)
-    near = 1e-6 * max(float(np.abs(points).max()), 1e-12)
-    if (points[:, 2] < near).any():
-        forward = np.array([0.0, 0.0, 1.0])
-        clipped = [_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons]
-        points = np.concatenate(clipped)
-        if len(points) == 0:
-            return EMPTY
+    rects = [EMPTY] * len(outlines)
+    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
+    if not parts:
+        return rects
+    points = pose.apply(np.concatenate(list(parts.values())))
+    if points[:, 2].min() < _nearest(points):
+        clipped = {index: _in_front(outlines[index], pose) for index in parts}
+        parts = {index: part for index, part in clipped.items() if len(part)}
+        if not parts:
+            return rects
+        points = np.concatenate(list(parts.values()))
     projected = points[:, :2] / points[:, 2:]
-    low, high = projected.min(axis=0), projected.max(axis=0)
+    starts = list(itertools.accumulate(map(len, parts.values()), initial=0))[:-1]
+    low, high = np.minimum.reduceat(projected, starts), np.maximum.reduceat(projected, starts)
     x_low, x_high, y_low, y_high = _ray_bounds(camera)
-    columns = _span((x_high >= low[0]) & (x_low <= high[0]))
-    rows = _span((y_high >= low[1]) & (y_low <= high[1]))
-    return EMPTY if columns is None or rows is None else (*rows, *columns)
+    edges = (
+        y_high.searchsorted(low[:, 1]),
+        y_low.searchsorted(high[:, 1], "right"),
+        x_high.searchsorted(low[:, 0]),
+        x_low.searchsorted(high[:, 0], "right"),
+    )
+    for index, top, bottom, left, right in zip(parts, *(edge.tolist() for edge in edges), strict=True):
+        if top < bottom and left < right:
+            rects[index] = top, bottom, left, right
+    return rects
 
 
-def _span(chosen: npt.NDArray[np.bool_]) -> tuple[int, int] | None:
-    """Where the first chosen element is, and where one beyond the last; None if there is none."""
-    first = int(chosen.argmax())
-    return (first, len(chosen) - int(chosen[::-1].argmax())) if chosen[first] else None
+def _nearest(points: FloatArray) -> float:
+    """Depth from which on points of the camera's space are looked at."""
+    return 1e-6 * max(float(np.abs(points).max()), 1e-12)
+
+
+def _in_front(outline: Outline, pose: Pose) -> FloatArray:
+    """Corners of what is left of an outline, in the camera's space, when what is behind the camera is cut off."""
+    points = pose.apply(outline.corners)
+    near = _nearest(points)
+    if points[:, 2].min() >= near:
+        return points
+    forward = np.array([0.0, 0.0, 1.0])
+    return np.concatenate([_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons])
