@@ -34,7 +34,8 @@ COPY_THREADS = 4
 """Threads at most that copy a frame into pinned memory."""
 
 COPY_BYTES = 3_000_000
-"""That each of them copies at least: a quarter of a millisecond, ten times what it takes to hand a part over."""
+"""That each of them copies at least: to hand a part over, and to hear that it is done, takes turns with other threads
+at the interpreter. At 1080p two threads bring more frames a second than one or three."""
 
 MARKED = 16
 """Frames whose times on the device are remembered."""
