@@ -39,6 +39,8 @@ EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
 # Smallest cosine between shading normal and viewer.
 MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
+SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
+"""What becomes of edges in a kernel of ``make_shade_kernel``."""
 EDGE_THREADS = 1 << 16
 """Threads that share the samples of all edges."""
 
@@ -239,8 +241,15 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
 
 
 @functools.cache
-def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
-    """Kernel of ``shade``, specialised to ``config``; one that is ``deferred`` lists edges instead of sampling them."""
+def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
+    """Kernel of ``shade``, specialised to ``config``, and to what becomes of ``edges``.
+
+    Args:
+        config: What the scene calls for.
+        edges: ``SAMPLED`` in place; ``LISTED``, and nothing else done about them; or ``LEFT``: only where the list did
+            not hold all are they sampled in place, all of them. Which ones it held depends on the order of threads, and
+            kernels that are compiled separately differ in the last place.
+    """
     shade_sample = make_shade_sample(config)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -263,7 +272,11 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
     ):
         i, j = wp.tid()
         i += row_start
+        if wp.static(edges == LEFT):
+            if edge_count_out[0] <= edges_out.shape[0]:
+                return
         result = wp.vec4(0.0)
+        samples = wp.int32(0)
         rect = params[0].object_rect
         if inside_rect(i, j, rect):
             found = hit_object[i, j]
@@ -278,12 +291,12 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
                     column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
                     if differs(row, column, found, reach, rect, hit_object, hits, hit):
                         samples = wp.static(config.edge_samples)
-            if wp.static(deferred):
+            if wp.static(edges == LISTED):
                 if samples > 1:
                     place = wp.atomic_add(edge_count_out, 0, 1)
                     if place < edges_out.shape[0]:
                         edges_out[place] = wp.vec2i(i, j)
-                        return
+                    return
             for sample in range(samples):
                 result += shade_sample(
                     params,
@@ -297,14 +310,23 @@ def make_shade_kernel(config: ShadeConfig, deferred: bool = False) -> wp.Kernel:
                     i,
                     j,
                     sample,
-                    samples == 1,
+                    wp.static(edges == LISTED) or samples == 1,
                     hit,
                 )
             if samples > 1:
                 result = result / wp.float32(samples)
+        if wp.static(edges == LEFT):
+            if samples <= 1:
+                return
         virtual_out[i, j] = result
 
     return shade_kernel
+
+
+@wp.func
+def listed_edges(edge_count: wp.array[wp.int32], edges: wp.array[wp.vec2i]) -> wp.int32:
+    """Edges in the list; none where it did not hold all."""
+    return wp.where(edge_count[0] <= edges.shape[0], edge_count[0], 0)
 
 
 @functools.cache
@@ -330,7 +352,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         samples_out: wp.array[wp.vec4],
     ):
         item = wp.tid()
-        stop = wp.min(edge_count[0], edges.shape[0]) * wp.static(config.edge_samples)
+        stop = listed_edges(edge_count, edges) * wp.static(config.edge_samples)
         while item < stop:
             edge = edges[item / wp.static(config.edge_samples)]
             samples_out[item] = shade_sample(
@@ -366,7 +388,7 @@ def average_edges_kernel(
 ):
     """Mean of every listed edge's samples, in their order."""
     item = wp.tid()
-    stop = wp.min(edge_count[0], edges.shape[0])
+    stop = listed_edges(edge_count, edges)
     while item < stop:
         result = wp.vec4(0.0)
         for sample in range(count):
@@ -377,7 +399,7 @@ def average_edges_kernel(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EdgeLists:
-    """Scratch arrays for edges that are sampled on their own; edges beyond what they hold are sampled in place."""
+    """Scratch arrays for edges that are sampled on their own; where they do not hold all, all are sampled in place."""
 
     count: wp.array[wp.int32]
     """(1,): edges found."""
@@ -433,8 +455,9 @@ def shade(
         return
     count, edges, samples = edge_lists.count, edge_lists.edges, edge_lists.samples
     count.zero_()
-    kernel, outputs = make_shade_kernel(config, deferred=True), [virtual_out, count, edges]
-    launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
+    outputs = [virtual_out, count, edges]
+    for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
+        launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
     listed = [count, edges]
     sampling = [EDGE_THREADS, *inputs, *near, *listed]
     wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)

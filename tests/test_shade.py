@@ -194,7 +194,7 @@ def test_near_vertical_edge_has_every_shade(device):
 @pytest.mark.parametrize("edge_samples", [4, 16])
 @pytest.mark.parametrize("listed", [5, 3000])
 def test_listed_edges_are_the_same(device, edge_samples, listed):
-    """Edges sampled on their own, or in place where the list is full, are as edges sampled in place."""
+    """Edges sampled on their own, or in place where the list does not hold them all, are as edges sampled at once."""
     scene = scene_of(ball(device), WHITE["plastic"], device=device)
     config = dataclasses.replace(EVERYTHING, edge_samples=edge_samples)
     expected = render(scene, config, device)
