@@ -607,11 +607,20 @@ def test_a_new_solver_does_not_rest(scene):
     assert not any(solver.rests(*what_is_seen()) for _ in range(5))
 
 
-@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"room": 0.35, "table": 0.25}])
-def test_other_light_is_solved_for_at_once(scene, changed):
+@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.4}, {"table": 0.3 * 0.7}, {"room": 0.25, "table": 0.2}])
+def test_a_switched_lamp_is_solved_for_at_once(scene, changed):
     solver = settled_solver(scene)
     assert not solver.rests(*what_is_seen())
-    assert solver.rests(*what_is_seen())
+    assert not solver.rests(*what_is_seen(**changed))
+
+
+@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"room": 0.35, "table": 0.25}])
+def test_other_light_waits_once_at_most(scene, changed):
+    solver = settled_solver(scene)
+    assert not solver.rests(*what_is_seen())
+    assert [solver.rests(*what_is_seen(**changed)) for _ in range(2)] == [True, False]
+    solver = settled_solver(scene)
+    assert [solver.rests(*what_is_seen()) for _ in range(2)] == [False, True]
     assert not solver.rests(*what_is_seen(**changed))
 
 
@@ -628,6 +637,7 @@ def test_a_lamp_over_a_part_of_the_desk_is_other_light(scene):
     assert not solver.rests(cells, observations)
     observations = observations.copy()
     observations["radiance"][:10] *= 1.3
+    assert solver.rests(cells, observations)
     assert not solver.rests(cells, observations)
 
 

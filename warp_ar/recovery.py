@@ -104,6 +104,10 @@ STILL: Final = 0.02
 """Relative change, of surfaces or of the room, below which the light is the same."""
 REST: Final = 4
 """Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
+SUDDEN: Final = 0.25
+"""Relative change that is solved for at once; what changes less may wait for one more estimate."""
+CONVERGED: Final = 1.0e-3
+"""Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
 DARK: Final = 0.005
 """pi times radiance below which a point says nothing: quantisation."""
 
@@ -653,7 +657,9 @@ class _Problem:
                 ) / np.maximum(z[mean_at : u_at - 1], LEAST)
                 wide = self.expected * z[u_at - 1] > LEAST
                 gradient[u_at - 1] += (off[mean_at : u_at - 1] * wide).sum() / max(z[u_at - 1], LEAST)
-            z = solve_nonnegative(hessian, gradient, z)
+            last, z = z, solve_nonnegative(hessian, gradient, z)
+            if np.abs(z - last).max() < CONVERGED * np.abs(z).max():
+                break
         u = np.maximum(z[u_at:], 1e-3)
         z[u_at:] = u
         relative = (matrix @ z - target) / (u[surface] * sigma)
@@ -827,14 +833,14 @@ class Recovery:
         shown = observations["radiance"].mean(axis=1).astype(float)
         told = (observations["visible"] > 0.8) & (observations["clipped"].max(axis=1) < 0.01) & (np.pi * shown > DARK)
         before, self._rested = self._seen, self._rested + 1
-        if before is not None and self._frames >= SETTLED and self._rested <= REST:
+        if before is not None and self._frames >= SETTLED and (told & before[2]).any():
             both = told & before[2]
-            # The mean of what changed, not the mean change: which of two cells sees a window's edge varies by itself.
-            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max()
-            if both.any() and moved < STILL * room.sum(axis=(0, 1)).max():
-                ratio = np.log(shown[both] / before[1][both])
-                if np.quantile(np.abs(ratio), 0.8) < 2.0 * STILL and abs(np.median(ratio)) < STILL:
-                    return True
+            # The sum of what changed, not of changes: which of two cells sees a window's edge varies by itself.
+            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max() / room.sum(axis=(0, 1)).max()
+            ratio = np.log(shown[both] / before[1][both])
+            moved = max(moved, abs(float(np.median(ratio))), 0.5 * float(np.quantile(np.abs(ratio), 0.8)))
+            if self._rested <= (REST if moved < STILL else 1 if moved < SUDDEN else 0):
+                return True
         self._seen, self._rested = (room, shown, told), 0
         return False
 
