@@ -641,6 +641,12 @@ def test_a_lamp_over_a_part_of_the_desk_is_other_light(scene):
     assert not solver.rests(cells, observations)
 
 
+def test_a_dark_room_rests_until_it_is_lit(scene):
+    solver = settled_solver(scene)
+    assert [solver.rests(*what_is_seen(room=0.0)) for _ in range(2)] == [False, True]
+    assert not solver.rests(*what_is_seen())
+
+
 def test_a_frame_without_surfaces_is_no_proof(scene):
     solver = settled_solver(scene)
     cells, observations = what_is_seen()

@@ -836,7 +836,7 @@ class Recovery:
         if before is not None and self._frames >= SETTLED and (told & before[2]).any():
             both = told & before[2]
             # The sum of what changed, not of changes: which of two cells sees a window's edge varies by itself.
-            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max() / room.sum(axis=(0, 1)).max()
+            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max() / max(room.sum(axis=(0, 1)).max(), 1e-9)
             ratio = np.log(shown[both] / before[1][both])
             moved = max(moved, abs(float(np.median(ratio))), 0.5 * float(np.quantile(np.abs(ratio), 0.8)))
             if self._rested <= (REST if moved < STILL else 1 if moved < SUDDEN else 0):
