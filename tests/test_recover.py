@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 from scipy.optimize import nnls
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from tests.error_model import check_error
 from tests.reference import recover as reference
@@ -453,6 +454,24 @@ def test_errors_are_shared_by_what_is_near():
     half = recovery.shared_errors(overlap, plane, np.arange(103) % 2 == 0)
     assert len(half) == 52
     assert half[2:] == pytest.approx(0.5 * shared[4::2], rel=0.03)
+
+
+def test_two_solvers_leave_blas_as_it_was():
+    """The first that begins ends first: the second must not set back what it found."""
+    one = recovery._ONE_BLAS_THREAD
+
+    def threads():
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    with threadpool_limits(2, user_api="blas"):
+        before = threads()
+        one.__enter__()
+        one.__enter__()
+        assert threads() == [1] * len(before)
+        one.__exit__()
+        assert threads() == [1] * len(before)
+        one.__exit__()
+        assert threads() == before
 
 
 def test_nothing_clipped_nothing_added(device, scene):

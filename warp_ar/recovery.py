@@ -40,14 +40,14 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import functools
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels.recover import LOST, SurfacePoint
@@ -185,10 +185,29 @@ Trace = Callable[[NDArray[np.float32]], Array]
 """Irradiance at every surface point per unit intensity of lamps (q, 4: position, radius), (n, q)."""
 
 
-@functools.cache
-def _blas_threads() -> ThreadpoolController:
-    """Of NumPy's BLAS: products here take microseconds, and waking threads for them more where cores are busy."""
-    return ThreadpoolController().select(user_api="blas")
+class _OneBlasThread:
+    """NumPy's BLAS on one thread: products here take microseconds, and waking threads for them more.
+
+    The number belongs to the process. Where several solvers are at work the first sets it, the last sets it back.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._limit = threadpool_limits(1, user_api="blas")
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._limit.restore_original_limits()
+
+
+_ONE_BLAS_THREAD = _OneBlasThread()
 
 
 # ---- surface points --------------------------------------------------------------------------------------------------
@@ -861,7 +880,7 @@ class Recovery:
             observations: Records of ``Observation``, (n,).
             trace: Traces lamps at finite distances; None: all light is distant.
         """
-        with _blas_threads().limit(limits=1):
+        with _ONE_BLAS_THREAD:
             return self._solve(cells, transfer, mirrored, observations, trace)
 
     def _solve(
