@@ -29,6 +29,7 @@ import warp as wp
 from bench.common import copy_bandwidth, measure, report
 from warp_ar.geometry import torus_mesh
 from warp_ar.kernels.structs import FrameParams, RayScene
+from warp_ar.kernels.visibility import intersect_mesh
 from warp_ar.pipeline import TRACK, Pipeline
 from warp_ar.quality import PRESETS, Quality
 from warp_ar.scene import Scene, bundled_scenes, load_scene
@@ -112,9 +113,9 @@ def trace_only_kernel(
     shape = scene.objects[0]
     direction = wp.transpose(shape.rotation) * (params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
     origin = wp.transpose(shape.rotation) * (params[0].camera_position - shape.position) / shape.scale
-    query = wp.mesh_query_ray(shape.mesh, origin, direction / shape.scale, 1.0e3)
-    if query.result:
-        depth_out[i, j] = query.t
+    met = intersect_mesh(shape, origin, direction / shape.scale, 1.0e3)
+    if met.t < 1.0e3:
+        depth_out[i, j] = met.t
 
 
 def _area(rect: Any) -> int:

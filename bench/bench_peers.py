@@ -24,6 +24,7 @@ from warp_ar.geometry import torus_mesh
 from warp_ar.kernels import probe, summed_area
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import FrameParams, Probe
+from warp_ar.kernels.wide_bvh import walk_closest
 from warp_ar.ray_scene import make_ray_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}
@@ -229,10 +230,18 @@ def resample_kernel(picture: wp.array2d[wp.vec3], places: wp.array2d[wp.vec2], o
 
 @wp.kernel(enable_backward=False)
 def trace_kernel(mesh: wp.uint64, origin: wp.vec3, directions: wp.array2d[wp.vec3], depth_out: wp.array2d[wp.float32]):
-    """Closest hit of each ray."""
+    """Closest hit of each ray, by Warp's own tree."""
     i, j = wp.tid()
     query = wp.mesh_query_ray(mesh, origin, directions[i, j], 1.0e3)
     depth_out[i, j] = wp.where(query.result, query.t, -1.0)
+
+
+@wp.kernel(enable_backward=False)
+def walk_kernel(tree: wp.uint64, origin: wp.vec3, directions: wp.array2d[wp.vec3], depth_out: wp.array2d[wp.float32]):
+    """Closest hit of each ray, by the tree for CPUs."""
+    i, j = wp.tid()
+    near = walk_closest(tree, origin, directions[i, j], 1.0e3)
+    depth_out[i, j] = wp.where(near[0] < 1.0e3, near[0], -1.0)
 
 
 def bench_unwrap(device: str) -> None:
@@ -323,12 +332,25 @@ def bench_rays(device: str) -> None:
         rays = wp.array(directions, dtype=wp.vec3, device=device)
         depth = wp.zeros(RAYS, dtype=wp.float32, device=device)
 
-        def ours(mesh: Any = mesh, rays: Any = rays, depth: Any = depth) -> None:
+        def by_warp(mesh: Any = mesh, rays: Any = rays, depth: Any = depth) -> None:
             wp.launch(trace_kernel, RAYS, [mesh.mesh.id, origin, rays], [depth], device=device)
 
-        ours()
+        def by_walk(mesh: Any = mesh, rays: Any = rays, depth: Any = depth) -> None:
+            wp.launch(walk_kernel, RAYS, [mesh.tree_address, origin, rays], [depth], device=device)
+
+        by_warp()
         hit = depth.numpy() >= 0.0
-        contenders: dict[str, Callable[[], object]] = {"ours": ours}
+        contenders: dict[str, Callable[[], object]] = {"ours": by_warp}
+        if mesh.tree is not None:
+            by_walk()
+            assert ((depth.numpy() >= 0.0) == hit).all()
+            # The best tree that Warp builds for a CPU: that of the mesh itself is not meant to be walked.
+            walked = wp.Mesh(mesh.mesh.points, mesh.mesh.indices, bvh_constructor="sah", bvh_leaf_size=4)
+
+            def by_sah(mesh: Any = walked, rays: Any = rays, depth: Any = depth) -> None:
+                wp.launch(trace_kernel, RAYS, [mesh.id, origin, rays], [depth], device=device)
+
+            contenders = {"ours": by_walk, "warp": by_sah}
         if embree is not None:
             scenes = importlib.import_module("embreex.rtcore_scene")
             meshes = importlib.import_module("embreex.mesh_construction")

@@ -31,7 +31,8 @@ class Frame:
         normals, uvs = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
         if kind == "mesh":
             self.mesh = make_ray_mesh(torus_mesh(radius * 2 / 3, radius / 3, radius * 3e-4), device)
-            record["kind"], record["mesh"], record["extent"] = structs.MESH, self.mesh.mesh.id, self.mesh.half
+            record["kind"], record["extent"] = structs.MESH, self.mesh.half
+            record["mesh"], record["tree"] = self.mesh.mesh.id, self.mesh.tree_address
             normals, uvs = self.mesh.normals, self.mesh.uvs
         self.config = TraceConfig((int(record["kind"][0]),), ())
         self.scene = structs.RayScene()

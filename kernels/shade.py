@@ -23,7 +23,7 @@ import warp as wp
 
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, nearest_of_object
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
@@ -252,7 +252,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
     """
     shade_sample = make_shade_sample(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def shade_kernel(
         # In:
         row_start: wp.int32,
@@ -334,7 +334,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
     """Kernel that shades every sample of the edges that were listed."""
     shade_sample = make_shade_sample(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sample_edges_kernel(
         # In:
         threads: wp.int32,

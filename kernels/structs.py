@@ -84,6 +84,7 @@ class Shape:
         wp.vec3
     )  # local: half sizes (plane: x, y; box: x, y, z); radius (sphere: x); major, minor radius (torus: x, y)
     mesh: wp.uint64  # id of the wp.Mesh in local space, for MESH
+    tree: wp.uint64  # on CPU the address of its tree of kernels/wide_bvh.py; 0: rays walk the wp.Mesh's own
     first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
     material: wp.int32  # index into the materials; -1 for proxies
     smooth: wp.int32  # 1: interpolate vertex normals

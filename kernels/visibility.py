@@ -1,6 +1,7 @@
 """What rays meet: shapes, the closest hit, any hit, and the primary rays of a frame.
 
-Spheres, boxes and planes are intersected analytically, meshes through Warp's BVH in local space. Functions that walk
+Spheres, boxes and planes are intersected analytically, meshes through a BVH in local space: Warp's own on CUDA, one of
+eight children per node on CPU (``kernels/wide_bvh.py``). Functions that walk
 the scene come from ``make_trace``, specialised to the kinds of shape that are there: a scene of spheres holds no mesh
 code. Ray parameters ``t`` are in multiples of the direction's length, which need not be 1; every test accepts 0 < t <
 t_max.
@@ -31,6 +32,7 @@ import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -160,12 +162,21 @@ def intersect_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.
     contact.t = FAR
     start = enter_mesh(shape.extent, origin, direction)
     if start < t_max:
-        query = wp.mesh_query_ray(shape.mesh, origin + start * direction, direction, t_max - start)
-        if query.result:
-            contact.t = start + query.t
-            contact.face = query.face
-            contact.u = query.u
-            contact.v = query.v
+        entry = origin + start * direction
+        if shape.tree != wp.uint64(0):
+            near = walk_closest(shape.tree, entry, direction, t_max - start)
+            contact.face = wp.cast(near[3], wp.int32)
+            if contact.face >= 0:
+                contact.t = start + near[0]
+                contact.u = near[1]
+                contact.v = near[2]
+        else:
+            query = wp.mesh_query_ray(shape.mesh, entry, direction, t_max - start)
+            if query.result:
+                contact.t = start + query.t
+                contact.face = query.face
+                contact.u = query.u
+                contact.v = query.v
     return contact
 
 
@@ -175,7 +186,10 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
     start = enter_mesh(shape.extent, origin, direction)
     if start >= t_max:
         return False
-    return wp.mesh_query_ray_anyhit(shape.mesh, origin + start * direction, direction, t_max - start)
+    entry = origin + start * direction
+    if shape.tree != wp.uint64(0):
+        return walk_any(shape.tree, entry, direction, t_max - start)
+    return wp.mesh_query_ray_anyhit(shape.mesh, entry, direction, t_max - start)
 
 
 @wp.func

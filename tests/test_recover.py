@@ -458,7 +458,7 @@ def test_errors_are_shared_by_what_is_near():
 
 def test_two_solvers_leave_blas_as_it_was():
     """The first that begins ends first: the second must not set back what it found."""
-    one = recovery._ONE_BLAS_THREAD
+    one = recovery._OneBlasThread()
 
     def threads():
         return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]

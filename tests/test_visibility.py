@@ -84,7 +84,8 @@ class World:
         record["rotation"], record["scale"], record["smooth"], record["material"] = rotation, scale, 1, -1
         if mesh is not None:
             made = make_ray_mesh(mesh, self.device)
-            record["mesh"], record["first_vertex"], extent = made.mesh.id, self._corners, made.half
+            record["mesh"], record["tree"] = made.mesh.id, made.tree_address
+            record["first_vertex"], extent = self._corners, made.half
             position = position + scale * rotation @ made.center
             triangles = (mesh.vertices.astype(np.float64) - made.center)[mesh.faces]
             self._corners += len(made.normals)

@@ -23,6 +23,7 @@ from warp_ar.errors import SceneError
 from warp_ar.geometry import Mesh, load_mesh, load_texture, rotation_matrix, silhouette_tolerance, torus_mesh
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.tracking import Pose
 
 FloatArray = npt.NDArray[np.float64]
@@ -36,9 +37,9 @@ BOX_MARGIN: Final = 2.0**-18
 """How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
 
 BVH_CONSTRUCTOR: Final = "sah"
-"""On CUDA too, where Warp's own choice is quicker to build, and a fifth to a half slower to walk."""
-BVH_LEAF_SIZE: Final = {"cpu": 4, "cuda": 1}
-"""Triangles per leaf: on CUDA a ray that tests triangles holds up those beside it that still walk."""
+"""On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
+BVH_LEAF_SIZE: Final = 1
+"""Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
 
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
 _LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
@@ -169,6 +170,13 @@ class RayMesh:
     """Unit normal of each corner, (3 m, 3)."""
     uvs: npt.NDArray[np.float32]
     """Texture coordinates of each corner, (3 m, 2)."""
+    tree: Any
+    """On CPU what rays walk, of ``kernels.wide_bvh``; None: they walk the ``wp.Mesh``'s own."""
+
+    @property
+    def tree_address(self) -> int:
+        """What ``structs.Shape.tree`` is to be."""
+        return 0 if self.tree is None else int(self.tree.ptr)
 
 
 def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
@@ -176,7 +184,8 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
 
     The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
     refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
-    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest.
+    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU that
+    is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
 
     Args:
         mesh: The triangles.
@@ -191,11 +200,14 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
     points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
     indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
-    leaf_size = BVH_LEAF_SIZE["cpu" if points.device.is_cpu else "cuda"]
-    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=BVH_CONSTRUCTOR, bvh_leaf_size=leaf_size)
+    on_cpu = points.device.is_cpu
+    constructor = "median" if on_cpu else BVH_CONSTRUCTOR
+    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=constructor, bvh_leaf_size=BVH_LEAF_SIZE)
     wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
+    tree = build_wide_bvh(corners, float(margin)) if on_cpu else None
     uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    return RayMesh(ray_mesh, center, half, mesh.normals[mesh.faces].reshape(-1, 3), uvs[mesh.faces].reshape(-1, 2))
+    normals = mesh.normals[mesh.faces].reshape(-1, 3)
+    return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
 
 
 def linear_texture(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -311,7 +323,8 @@ class HostScene:
             key = _mesh_key(thing)
             if key is not None:
                 _, mesh, record["first_vertex"] = self._load(key, device)
-                record["mesh"], record["extent"], record["smooth"] = mesh.mesh.id, mesh.half, 1
+                record["mesh"], record["tree"] = mesh.mesh.id, mesh.tree_address
+                record["extent"], record["smooth"] = mesh.half, 1
                 position = position + rotation @ (scale * mesh.center)
             elif isinstance(thing, scenes.Object) and thing.shape == "sphere":
                 record["extent"] = thing.radius

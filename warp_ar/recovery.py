@@ -40,6 +40,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Final
@@ -47,7 +48,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels.recover import LOST, SurfacePoint
@@ -194,10 +195,15 @@ class _OneBlasThread:
     def __init__(self) -> None:
         self._lock, self._inside = threading.Lock(), 0
 
+    @functools.cached_property
+    def _controller(self) -> ThreadpoolController:
+        """What finds the libraries; to look for them takes as long as four fits."""
+        return ThreadpoolController()
+
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                self._limit = threadpool_limits(1, user_api="blas")
+                self._limit = self._controller.limit(limits=1, user_api="blas")
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
