@@ -26,7 +26,7 @@ COSTS = Costs(
         "environment_height": {"32": -2.0, "64": 0.0, "128": 8.0, "256": 36.0},
         "diffuse": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
         "specular": {"box_mip": -2.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
-        "room_shadow": {"none": -8.0, "coarse": 0.0, "fine": 30.0},
+        "room_shadow": {"none": -8.0, "coarse": 0.0, "bounce": 30.0},
     },
     {"environment_height": {"32": {"specular": 0.25}, "128": {"specular": 4.0}, "256": {"specular": 16.0}}},
 )
@@ -36,7 +36,7 @@ ERRORS = {
     "environment_height": {"32": 0.03, "64": 0.01, "128": 0.007, "256": 0.0},
     "diffuse": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
     "specular": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
-    "room_shadow": {"none": 0.06, "coarse": 0.03, "fine": 0.0},
+    "room_shadow": {"none": 0.06, "coarse": 0.03, "bounce": 0.0},
 }
 UNSCALED = Costs(COSTS.base, COSTS.rungs)
 """The same prices as if they added up."""

@@ -125,7 +125,6 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
             "none": "none (the paper)",
             "coarse": "32 rays per estimate, every fifth pixel, and an estimate of reflected light",
             "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
-            "fine": "the same at every pixel",
             "brute_force": "every texel of the room at every pixel",
         },
     ),

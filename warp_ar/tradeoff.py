@@ -675,7 +675,7 @@ def measure_case(
     qualities = {name: PRESETS[name] for name in RUNS}
     best = None
     if not case.truth:
-        quality = PRESETS["reference"] if not quick else turn(PRESETS["reference"], {"room_shadow": "fine"})
+        quality = PRESETS["reference"] if not quick else turn(PRESETS["reference"], {"room_shadow": "bounce"})
         best = run(case, quality, device, between=light_only(quality), timed=1)
     reference = case.truth or (best.images if best is not None else {})
     everything = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))

@@ -137,7 +137,6 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_reflect.py::test_points_of_the_desk_are_where_they_project_at_any_scale": (
         (14, "object_light", "*"),
         (14, "room_shadow", "bounce"),
-        (14, "room_shadow", "fine"),
         (14, "room_shadow", "brute_force"),
     ),
     "test_reflect.py::test_a_face_turned_away_is_not_in_the_picture": ((13, "object_light", "*"),),

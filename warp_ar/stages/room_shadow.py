@@ -36,7 +36,6 @@ class Rung:
 RUNGS: Mapping[str, Rung] = {
     "coarse": Rung(32, 4, 5, "estimated"),
     "bounce": Rung(64, 4, 2, "traced", 0.5),
-    "fine": Rung(64, 4, 1, "traced", 0.5),
     "brute_force": Rung(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
 """Cheapest first, after ``none``."""
