@@ -6,9 +6,27 @@ Per pixel of an object, two things replace what the distant environment alone wo
 it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the way shows
 what the distant room makes of it. So an object's underside sees the shadow that it stands in, not an empty desk.
 
-*Mirrored*, premultiplied radiance of what is near and its share of the lobe; ``shade`` fills the rest with the
-prefiltered environment. A mirror sends one ray. A glossy lobe sends a few, another few from each pixel of a tile; only
-the near part carries their noise, since what misses everything reads the environment prefiltered with the whole lobe.
+*Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
+sends one ray. A glossy lobe sends a few, another few from each pixel of a tile. What is near hides part of the lobe,
+and what it hides may be much darker than the rest: at the rim of a window that a desk cuts off, half of the rays meet
+the desk and hardly any of the light is gone. So every ray reads the environment as well. With the means over the rays
+
+    s  share of the rays that meet something near,      N  their radiance, 0 for the others,
+    B  the environment along all rays,                  M  the environment along those that meet nothing,
+
+the lobe holds N + M. M is noisy where much of the lobe is open, and there L, the environment prefiltered with the
+whole lobe, is known: M = (|M| / |B|) L, as L is B without noise. Where hardly any of it is open the noise of M is a
+small part of the sum, and L may be all that is hidden. Hence
+
+    | N + s M + (1 - s) (|M| / |B|) L |,    |.| the brightness: share = 1 - (1 - s) |M| / |B|.
+
+A ray among n stands for the solid angle 1 / (n pdf). The environment's level of the same width is read, twice as wide
+so that neighbours overlap: for a half vector h, GGX has pdf D = k^2 / pi, k = alpha / (sin^2 + alpha^2 cos^2) of the
+angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has the width alpha / sqrt n. So
+
+    | width = 2 / (k sqrt n) |,    Phong: 2 alpha / sqrt(n cos^e), e its exponent.
+
+With one width for all, the few rays in the long tails of GGX would show lamps as squares of a tile's size.
 
 Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``room_shadow`` does;
 mirrors are not.
@@ -24,8 +42,9 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_shade_unoccluded
-from warp_ar.kernels.room_samples import RoomSample, sample_toward, sobol_second
+from warp_ar.kernels.room_samples import RoomSample, brightness, sample_toward, sobol_second
 from warp_ar.kernels.sampling import (
     frame_from_normal,
     radical_inverse,
@@ -39,6 +58,10 @@ wp.set_module_options({"enable_backward": False})
 
 SHARP = wp.constant(wp.float32(0.02))
 """Width alpha of a lobe below which it is a mirror: one ray, not averaged."""
+MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
+"""Brightness, in camera values, below which a lobe's share is 0 over 0."""
+RAY_WIDTH = 2.0
+"""Width of one ray of many, over the width that its share of the lobe has."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 """Cosine of the angle up to which neighbours' normals are those of one surface."""
 
@@ -69,6 +92,19 @@ def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) ->
     if model == PHONG:
         return 1.0 / wp.sqrt(wp.max(shininess, 1.0))
     return 0.0
+
+
+@wp.func
+def ggx_ray_width(cos_theta: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Width of a ray, times the root of their number, whose half vector is this far from the normal."""
+    cos2 = wp.min(cos_theta * cos_theta, 1.0)
+    return (1.0 - cos2) / alpha + alpha * cos2
+
+
+@wp.func
+def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float32) -> wp.float32:
+    """The same for a ray this far from the mirror direction; no wider than the hemisphere."""
+    return wp.min(alpha * wp.exp(-0.5 * exponent * wp.log(wp.max(cos_theta, 1.0e-3))), 1.0)
 
 
 @functools.cache
@@ -147,6 +183,7 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
         # Out:
         irradiance_out: wp.array2d[wp.vec3],
         mirrored_out: wp.array2d[wp.vec4],
+        passed_out: wp.array2d[wp.vec4],
     ):
         i, j = wp.tid()
         i += row_start
@@ -203,6 +240,8 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
 
         if wp.static(config.room.specular):
             mirrored = wp.vec4(0.0)
+            passed = wp.vec4(0.0)
+            leaving = float(0.0)  # rays; those into the surface are part of its reflectance
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
                 count = wp.where(alpha < SHARP, 1, wp.static(lobes))
@@ -210,18 +249,21 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                 center = reflect(wo, normal)
                 for k in range(count):
                     outward = center
+                    width = alpha
                     if alpha >= SHARP:
                         index = wp.uint32(set_index * wp.static(lobes) + k)
                         shift = wp.static(0.5 / (lobes * side * side))
                         u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
                         if surface.model == PHONG:
                             outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+                            width = phong_ray_width(wp.dot(outward, center), surface.shininess, alpha)
                         else:
                             half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
                             outward = reflect(wo, half)
+                            width = ggx_ray_width(wp.dot(half, normal), alpha)
                     if wp.dot(outward, geometric) > 0.0:
                         origin = offset_origin(hit.point, geometric, outward, hit.error)
-                        mirrored += look_near(
+                        near = look_near(
                             params[0],
                             frame,
                             decode_table,
@@ -233,8 +275,19 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                             outward,
                             FAR,
                         )
-                mirrored = mirrored / wp.float32(count)
+                        leaving += 1.0
+                        mirrored += near
+                        if alpha >= SHARP:
+                            level = level_from_alpha(
+                                wp.static(RAY_WIDTH / (math.sqrt(lobes) * side)) * width, room.level_height
+                            )
+                            distant = sample_levels(room.levels, outward, level, room.level_height)
+                            missed = (1.0 - near[3]) * distant
+                            passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
+                mirrored = mirrored / wp.max(leaving, 1.0)
+                passed = passed / wp.max(leaving, 1.0)
             mirrored_out[i, j] = mirrored
+            passed_out[i, j] = passed
 
     return object_light_kernel
 
@@ -254,6 +307,7 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
         hits: wp.array2d[Hit],
         irradiance: wp.array2d[wp.vec3],
         mirrored: wp.array2d[wp.vec4],
+        passed: wp.array2d[wp.vec4],
         # Out:
         irradiance_out: wp.array2d[wp.vec3],
         mirrored_out: wp.array2d[wp.vec4],
@@ -272,6 +326,7 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
+        distant = wp.vec4(0.0)
         reach = wp.static(side // 2)
         for a in range(-reach, reach + 1):
             for b in range(-reach, reach + 1):
@@ -284,12 +339,21 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
                             light += weight * irradiance[i + a, j + b]
                         if wp.static(config.room.specular):
                             glossy += weight * mirrored[i + a, j + b]
+                            distant += weight * passed[i + a, j + b]
         if wp.static(config.room.diffuse != "none"):
             irradiance_out[i, j] = light / weights
         if wp.static(config.room.specular):
-            mirrored_out[i, j] = glossy / weights
             if sharp:
                 mirrored_out[i, j] = mirrored[i, j]
+                return
+            near = glossy / weights
+            distant = distant / weights
+            missed = brightness(wp.vec3(distant[0], distant[1], distant[2]))
+            left = wp.where(distant[3] > MIN_LIGHT, (1.0 - near[3]) * missed / distant[3], 1.0 - near[3])
+            for channel in range(3):
+                near[channel] += near[3] * distant[channel]
+            near[3] = 1.0 - left
+            mirrored_out[i, j] = near
 
     return filter_object_light_kernel
 
@@ -309,6 +373,7 @@ def light_objects(
     hits: wp.array2d[Hit],
     irradiance_out: wp.array2d[wp.vec3] | None,
     mirrored_out: wp.array2d[wp.vec4] | None,
+    passed_out: wp.array2d[wp.vec4] | None,
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -328,7 +393,9 @@ def light_objects(
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         irradiance_out: (H, W) irradiance; written only where an object is seen.
-        mirrored_out: (H, W) premultiplied near radiance and its share of the lobe; likewise.
+        mirrored_out: (H, W) premultiplied near radiance and its share of the rays; likewise.
+        passed_out: (H, W) of glossy lobes: the environment along rays that meet nothing near, and its brightness along
+            all of them.
         rows: Band of rows; None means all.
     """
     stride = 0 if samples is None else samples.shape[0] // config.side**2
@@ -349,7 +416,7 @@ def light_objects(
             hit_object,
             hits,
         ],
-        [irradiance_out, mirrored_out],
+        [irradiance_out, mirrored_out, passed_out],
         rows=rows,
         device=rays.device,
     )
@@ -363,16 +430,20 @@ def filter_object_light(
     hits: wp.array2d[Hit],
     irradiance: wp.array2d[wp.vec3] | None,
     mirrored: wp.array2d[wp.vec4] | None,
+    passed: wp.array2d[wp.vec4] | None,
     irradiance_out: wp.array2d[wp.vec3] | None,
     mirrored_out: wp.array2d[wp.vec4] | None,
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Average the estimates over tiles, along objects only; arguments as ``light_objects``."""
+    """Average the estimates over tiles, along objects only; arguments as ``light_objects``.
+
+    The last of ``mirrored_out`` is the share of the prefiltered environment that ``shade`` leaves out.
+    """
     launch_rows(
         make_filter_kernel(config),
         hit_object.shape,
-        [params, scene, hit_object, hits, irradiance, mirrored],
+        [params, scene, hit_object, hits, irradiance, mirrored, passed],
         [irradiance_out, mirrored_out],
         rows=rows,
         device=hit_object.device,

@@ -71,7 +71,7 @@ class Nearby:
 
     known: wp.bool  # False: the distant room is all that the point receives
     irradiance: wp.vec3
-    mirrored: wp.vec4  # premultiplied radiance of what is near, and its share of the lobe
+    mirrored: wp.vec4  # radiance that adds to the prefiltered room, and the share of that which it replaces
 
 
 @functools.cache

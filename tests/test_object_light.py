@@ -11,7 +11,7 @@ from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, reco
 from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
 from warp_ar.graph import make_plan
 from warp_ar.kernels import object_light, reflect
-from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.prefilter import integrate_lobes, lobe_texels
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
@@ -26,7 +26,17 @@ RADIUS = 0.05
 LEVEL_HEIGHT = 8
 
 
-def run(objects, materials, code=255, filtered=True, ratio=None, added=None, rows=None, environment=None):
+def run(
+    objects,
+    materials,
+    code=255,
+    filtered=True,
+    ratio=None,
+    added=None,
+    rows=None,
+    environment=None,
+    levels=None,
+):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = RoomConfig(
         TraceConfig((SPHERE,), (DESK["kind"],)),
@@ -60,12 +70,14 @@ def run(objects, materials, code=255, filtered=True, ratio=None, added=None, row
     room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
     room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
     room.level_height = LEVEL_HEIGHT
+    if levels is not None:
+        room.levels, room.level_height = levels
     rays = wp.array(RAYS, dtype=wp.vec2)
     hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
     trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
     drawn = draw(environment)
     frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
-    irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
+    irradiance, mirrored, passed = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4), wp.zeros((H, W), wp.vec4)
     layers = [None if layer is None else wp.array(layer, dtype=wp.vec3) for layer in (ratio, added)]
     object_light.light_objects(
         config,
@@ -81,10 +93,11 @@ def run(objects, materials, code=255, filtered=True, ratio=None, added=None, row
         hits,
         irradiance,
         mirrored,
+        passed,
         rows=rows,
     )
     if filtered:
-        raw = irradiance, mirrored
+        raw = irradiance, mirrored, passed
         irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
         object_light.filter_object_light(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
     return irradiance.numpy(), mirrored.numpy(), hit_object.numpy(), hits.numpy(), drawn
@@ -168,7 +181,90 @@ def test_glossy_share_is_between(device):
     np.testing.assert_allclose(mirrored[found >= 0][:, :3], share[found >= 0][:, None].repeat(3, 1), atol=1e-5)
 
 
-def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None):
+def horizon(up, down, size=(32, 64)):
+    """An environment of two radiances, above and below the horizon."""
+    rows = np.where(np.arange(size[0]) < size[0] // 2, up, down)
+    return np.broadcast_to(rows[:, None, None], (*size, 3)).astype(np.float32)
+
+
+def prefiltered(environment, lobe):
+    levels = wp.zeros(lobe_texels(len(environment)), wp.vec3)
+    integrate_lobes(wp.array(environment, dtype=wp.vec3), lobe, levels)
+    return levels, len(environment)
+
+
+# Of a step from 0 to 1 in a lobe 13 degrees wide: pixels of a tile, averaged, turn it by six degrees either way, where
+# the share is a tenth in five degrees; half of that shows, as light above and below cancels. 64 rays add 0.01.
+STEP_ERROR = 0.08
+
+
+def test_dark_ground_takes_no_light_from_a_lobe_that_it_cuts(device):
+    """Under a horizon as black as the ground, a lobe keeps all of its light, whatever share is cut off."""
+    glossy = {"model": PHONG, "base_color": (0, 0, 0), "specular": (1, 1, 1), "shininess": 20.0}
+    environment = horizon(1.0, 0.0, (128, 256))
+    levels = prefiltered(environment, "phong")
+    near = sphere((0.0, 0.0, 0.24), 0.19)  # close to the camera: a pixel turns the mirror direction by three degrees
+    ground = sphere(
+        (0.0, 0.0, -49.99), 50.0
+    )  # an object, so that all of it is known and not only what the picture shows
+    coal = {"model": LAMBERT, "base_color": (0, 0, 0)}
+    _, mirrored, found, hits, _ = run([near, ground], [glossy, coal], environment=environment, levels=levels)
+    normal, point = hits["normal"].astype(float), hits["point"].astype(float)
+    view = point - CAMERA
+    view /= np.linalg.norm(view, axis=-1, keepdims=True)
+    outward = view - 2 * (view * normal).sum(-1, keepdims=True) * normal
+    # Share of a lobe of cos^20 above the horizon, by the angle of its axis: summed over its sphere, in float64.
+    rng = np.random.default_rng(5)
+    cosine = rng.uniform(0, 1, 200_000) ** (1 / 21)
+    turn = rng.uniform(0, 2 * np.pi, cosine.size)
+    inner = (found == 0) & (np.abs(outward[..., 2]) < 0.5) & (normal[..., 2] > 0.4)
+    assert inner.sum() > 20
+    z = outward[inner, 2]
+    sine = np.sqrt(1 - cosine**2)
+    above = np.array([(cosine * c + sine * np.cos(turn) * np.sqrt(1 - c * c) > 0).mean() for c in z])
+    shown = mirrored[inner, 0] + (1 - mirrored[inner, 3]) * above
+    np.testing.assert_allclose(shown, above, atol=STEP_ERROR)
+    # What the ground cuts off by count alone would be lost twice.
+    assert (above * (1 - above)).max() > 2 * STEP_ERROR
+
+
+def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
+    """1 / pdf, over what it is at the peak, where the width is alpha: GGX by its own formula, Phong by the cosine."""
+    cosine = np.cos(np.linspace(0, 1.5, 40))
+    for alpha in (0.02, 0.1, 0.6):
+        density = alpha**2 / (np.pi * (cosine**2 * (alpha**2 - 1) + 1) ** 2)
+        exponent = 1 / alpha**2
+        out = wp.zeros((2, cosine.size), wp.float32)
+        angles = wp.array(cosine.astype(np.float32), dtype=wp.float32)
+        wp.launch(_width_kernel, dim=cosine.size, inputs=[angles, alpha, exponent], outputs=[out])
+        ggx, phong = out.numpy()
+        # Near the peak a cosine of float32 is known to 6e-8, of sin^2 over alpha^2 = 4e-4.
+        np.testing.assert_allclose(ggx, alpha * np.sqrt(1 / (np.pi * alpha**2) / density), rtol=5e-4)
+        # exp and log of float32, times exponents up to 2500, where the width is below 1.
+        np.testing.assert_allclose(
+            phong, np.exp(np.minimum(np.log(alpha) - exponent / 2 * np.log(cosine), 0)), rtol=1e-3
+        )
+
+
+@wp.kernel(enable_backward=False)
+def _width_kernel(cosine: wp.array[wp.float32], alpha: wp.float32, exponent: wp.float32, out: wp.array2d[wp.float32]):
+    i = wp.tid()
+    out[0, i] = object_light.ggx_ray_width(cosine[i], alpha)
+    out[1, i] = object_light.phong_ray_width(cosine[i], exponent, alpha)
+
+
+def test_share_follows_the_light(device):
+    """Half of the rays meet something near; the other half carries nine tenths of the light, or none is known."""
+    found = np.zeros((16, 16), int)
+    mirrored = np.broadcast_to(np.array([0.2, 0.2, 0.2, 0.5]), (16, 16, 4))
+    for missed, light, left in ((0.9, 1.0, 0.5 * 0.9), (0.0, 1.0, 0.0), (0.0, 0.0, 0.5)):
+        passed = np.broadcast_to(np.array([missed, missed, missed, light]), (16, 16, 4))
+        _, out = average(found, (0, 0, 1), np.zeros((16, 16, 3)), mirrored, (PHONG,), passed=passed)
+        np.testing.assert_allclose(out[..., :3], 0.2 + 0.5 * missed, rtol=1e-6)
+        np.testing.assert_allclose(out[..., 3], 1 - left, rtol=1e-6)
+
+
+def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None, passed=None):
     """Filter estimates as given, (h, w); object k has material k."""
     height, width = found.shape
     forms = RoomConfig(TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False)
@@ -187,6 +283,7 @@ def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rec
         wp.array(hits, dtype=Hit),
         wp.array(irradiance.astype(np.float32), dtype=wp.vec3),
         wp.array(mirrored.astype(np.float32), dtype=wp.vec4),
+        wp.array(np.zeros_like(mirrored, np.float32) if passed is None else passed.astype(np.float32), dtype=wp.vec4),
         *outputs,
     )
     return tuple(output.numpy() for output in outputs)

@@ -52,6 +52,7 @@ class ObjectLight(Stage):
         if config.diffuse != "none":
             specs["object_irradiance"] = specs["object_light_irradiance"] = ArraySpec((height, width), wp.vec3)
         if config.specular:
+            specs["object_light_passed"] = ArraySpec((height, width), wp.vec4)
             specs["object_mirrored"] = specs["object_light_mirrored"] = ArraySpec((height, width), wp.vec4)
         return {**specs, **room_arrays(config, self.name)}
 
@@ -68,7 +69,7 @@ class ObjectLight(Stage):
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
         inputs += [arrays.get("physical_ratio"), arrays.get("physical_added"), arrays["ray_scene"], room]
         inputs += [arrays["room_samples"] if forms.diffuse != "none" else None, arrays["hit_object"], arrays["hits"]]
-        raw = arrays.get("object_light_irradiance"), arrays.get("object_light_mirrored")
+        raw = [arrays.get(f"object_light_{name}") for name in ("irradiance", "mirrored", "passed")]
         out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
 
         def estimate(rows: Rows | None) -> None:
