@@ -11,7 +11,7 @@ from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, reco
 from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
 from warp_ar.graph import make_plan
 from warp_ar.kernels import object_light, reflect
-from warp_ar.kernels.prefilter import integrate_lobes, lobe_texels
+from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
@@ -35,7 +35,6 @@ def run(
     added=None,
     rows=None,
     environment=None,
-    levels=None,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = RoomConfig(
@@ -70,8 +69,6 @@ def run(
     room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
     room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
     room.level_height = LEVEL_HEIGHT
-    if levels is not None:
-        room.levels, room.level_height = levels
     rays = wp.array(RAYS, dtype=wp.vec2)
     hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
     trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
@@ -179,53 +176,6 @@ def test_glossy_share_is_between(device):
     ring = (found >= 0) & (np.abs(hits["normal"][..., 2] - np.cos(np.pi / 4)) < 0.1)
     assert 0.1 < share[ring].mean() < 0.9
     np.testing.assert_allclose(mirrored[found >= 0][:, :3], share[found >= 0][:, None].repeat(3, 1), atol=1e-5)
-
-
-def horizon(up, down, size=(32, 64)):
-    """An environment of two radiances, above and below the horizon."""
-    rows = np.where(np.arange(size[0]) < size[0] // 2, up, down)
-    return np.broadcast_to(rows[:, None, None], (*size, 3)).astype(np.float32)
-
-
-def prefiltered(environment, lobe):
-    levels = wp.zeros(lobe_texels(len(environment)), wp.vec3)
-    integrate_lobes(wp.array(environment, dtype=wp.vec3), lobe, levels)
-    return levels, len(environment)
-
-
-# Of a step from 0 to 1 in a lobe 13 degrees wide: pixels of a tile, averaged, turn it by six degrees either way, where
-# the share is a tenth in five degrees; half of that shows, as light above and below cancels. 64 rays add 0.01.
-STEP_ERROR = 0.08
-
-
-def test_dark_ground_takes_no_light_from_a_lobe_that_it_cuts(device):
-    """Under a horizon as black as the ground, a lobe keeps all of its light, whatever share is cut off."""
-    glossy = {"model": PHONG, "base_color": (0, 0, 0), "specular": (1, 1, 1), "shininess": 20.0}
-    environment = horizon(1.0, 0.0, (128, 256))
-    levels = prefiltered(environment, "phong")
-    near = sphere((0.0, 0.0, 0.24), 0.19)  # close to the camera: a pixel turns the mirror direction by three degrees
-    ground = sphere(
-        (0.0, 0.0, -49.99), 50.0
-    )  # an object, so that all of it is known and not only what the picture shows
-    coal = {"model": LAMBERT, "base_color": (0, 0, 0)}
-    _, mirrored, found, hits, _ = run([near, ground], [glossy, coal], environment=environment, levels=levels)
-    normal, point = hits["normal"].astype(float), hits["point"].astype(float)
-    view = point - CAMERA
-    view /= np.linalg.norm(view, axis=-1, keepdims=True)
-    outward = view - 2 * (view * normal).sum(-1, keepdims=True) * normal
-    # Share of a lobe of cos^20 above the horizon, by the angle of its axis: summed over its sphere, in float64.
-    rng = np.random.default_rng(5)
-    cosine = rng.uniform(0, 1, 200_000) ** (1 / 21)
-    turn = rng.uniform(0, 2 * np.pi, cosine.size)
-    inner = (found == 0) & (np.abs(outward[..., 2]) < 0.5) & (normal[..., 2] > 0.4)
-    assert inner.sum() > 20
-    z = outward[inner, 2]
-    sine = np.sqrt(1 - cosine**2)
-    above = np.array([(cosine * c + sine * np.cos(turn) * np.sqrt(1 - c * c) > 0).mean() for c in z])
-    shown = mirrored[inner, 0] + (1 - mirrored[inner, 3]) * above
-    np.testing.assert_allclose(shown, above, atol=STEP_ERROR)
-    # What the ground cuts off by count alone would be lost twice.
-    assert (above * (1 - above)).max() > 2 * STEP_ERROR
 
 
 def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
