@@ -269,11 +269,13 @@ class Pipeline:
         self._rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, height, 0, width))
         for name in RECTS:
             add(f"{name}_rows", functools.partial(self._rows, name))
-        params = self._block.host("params")
+        # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
+        values = self._block.host("params")
+        params = self._params = {name: values[name] for name in values.dtype.names}
         add("seconds", lambda: float(params["time"][0]))
-        params["focal"] = (self.camera.fx, self.camera.fy)
-        params["principal"] = (self.camera.cx, self.camera.cy)
-        params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
+        params["focal"][0] = (self.camera.fx, self.camera.fy)
+        params["principal"][0] = (self.camera.cx, self.camera.cy)
+        params["distortion"][0] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
         self._write_exposure(self.scene)
 
     def update(self, scene: Scene) -> bool:
@@ -342,7 +344,7 @@ class Pipeline:
 
     def _write_exposure(self, scene: Scene) -> None:
         scale = scene.exposure.scale
-        self._block.host("params")["exposure_scale"] = 1.0 if isinstance(scale, str) else scale
+        self._params["exposure_scale"][0] = 1.0 if isinstance(scale, str) else scale
         self._arrays.touch("exposure")
 
     def _probe_values(self) -> npt.NDArray[Any]:
@@ -522,36 +524,31 @@ class Pipeline:
         return np.ascontiguousarray(image)
 
     def _set_frame_values(self, frame: _Frame) -> None:
-        params = self._block.host("params")
+        params, pose = self._params, frame.pose
         touched: list[str] = ["clock"]
-        before = params.copy()
-        pose = frame.pose
-        if pose is not None:
-            inverse = pose.inverse()
-            params["camera_position"] = inverse.translation
-            params["world_from_camera"] = inverse.rotation
         if self._host_scene.write_lights(self._block.host("lights"), frame.seconds) or frame.index == 0:
             touched.append("lights")
         if self._host_scene.write_objects(self._block.host("objects"), frame.seconds) or frame.index == 0:
             touched.append("objects")
-        moved = (
-            pose is not None
-            and (params["camera_position"] != before["camera_position"]).any()
-            | (params["world_from_camera"] != before["world_from_camera"]).any()
-        )
-        if moved or self._arrays.version("pose") == 0:
-            touched.append("pose")
+        moved = False
         if pose is not None:
+            position, rotation = params["camera_position"], params["world_from_camera"]
+            before = position.tobytes(), rotation.tobytes()
+            inverse = pose.inverse()
+            position[0], rotation[0] = inverse.translation, inverse.rotation
+            moved = before != (position.tobytes(), rotation.tobytes())
             outlines = self._outlines()
             rects = dict(zip(outlines, screen_rects(list(outlines.values()), pose, self.camera), strict=True))
             rects.setdefault("light", rects["direct"])
             self._rects.update(rects)
             for name, rect in rects.items():
-                params[f"{name}_rect"] = rect
-        params["time"] = frame.seconds
-        params["time_step"] = frame.step
-        params["frame_index"] = frame.index
-        params["environment_reset"] = int(not self._has_light)
+                params[f"{name}_rect"][0] = rect
+        if moved or self._arrays.version("pose") == 0:
+            touched.append("pose")
+        params["time"][0] = frame.seconds
+        params["time_step"][0] = frame.step
+        params["frame_index"][0] = frame.index
+        params["environment_reset"][0] = not self._has_light
         self._block.upload()
         for name in touched:
             self._arrays.touch(name)

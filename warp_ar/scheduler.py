@@ -165,7 +165,7 @@ class Scheduler:
 
     def _due(self, stage: Stage) -> tuple[int, ...] | None:
         """Versions of what ``stage`` reads, or None if it has already seen them."""
-        versions = tuple(self.arrays.version(name) for name in stage.wiring.reads)
+        versions = self.arrays.versions(stage.wiring.reads)
         return None if self._seen.get(stage.name) == versions else versions
 
     def _publish(self, stage: Stage) -> None:

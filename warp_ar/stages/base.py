@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 from warp_ar.quality import Quality
@@ -109,6 +109,10 @@ class Arrays(Mapping[str, Any]):
     def version(self, name: str) -> int:
         """Version of ``name``: 0 until it is first written."""
         return self._versions[name]
+
+    def versions(self, names: Iterable[str]) -> tuple[int, ...]:
+        """Versions of several."""
+        return tuple(map(self._versions.__getitem__, names))
 
 
 class Stage(abc.ABC):
