@@ -349,7 +349,9 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
             near = glossy / weights
             distant = distant / weights
             missed = brightness(wp.vec3(distant[0], distant[1], distant[2]))
-            left = wp.where(distant[3] > MIN_LIGHT, (1.0 - near[3]) * missed / distant[3], 1.0 - near[3])
+            # What passes is no more than all; rounding may say otherwise.
+            left = wp.where(distant[3] > MIN_LIGHT, wp.min(missed / distant[3], 1.0), 1.0)
+            left *= 1.0 - near[3]
             for channel in range(3):
                 near[channel] += near[3] * distant[channel]
             near[3] = 1.0 - left

@@ -16,6 +16,8 @@ from warp_ar.stages.visibility import GrowingRows
 
 LISTED_SHARE = 16
 """Edges that can be listed: one pixel in so many."""
+LISTED_LEAST = 1 << 12
+"""The same at least, if there are as many pixels: in a small picture most pixels may be edges."""
 
 
 def shade_config(request: Request) -> ShadeConfig:
@@ -70,7 +72,7 @@ class Shade(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
         width, height = self.request.size
-        edges = width * height // LISTED_SHARE
+        edges = min(width * height, max(width * height // LISTED_SHARE, LISTED_LEAST))
         return {
             "virtual": ArraySpec((height, width), wp.vec4),
             "shade_edge_count": ArraySpec((1,), wp.int32),
