@@ -34,6 +34,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warp_ar.kernels.structs import vec8
+
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 WIDTH = wp.constant(8)
@@ -48,7 +50,9 @@ BLOCK = wp.constant(16)
 NODE_BLOCKS = wp.constant(4)
 LEAF_BLOCKS = wp.constant(5)
 
-vec8 = wp.types.vector(length=8, dtype=wp.float32)
+STACK = 256
+"""Entries of the walk's stack."""
+
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # ---- walking ---------------------------------------------------------------------------------------------------------
@@ -98,7 +102,7 @@ _WALK = """
 
     float t_near = t_max, u_near = 0.0f, v_near = 0.0f;
     int face_near = -1, place = 0, waiting = 0;
-    int places[256];
+    int places[{stack}];
     {distances}
     while (true) {{
         if (place >= 0) {{
@@ -207,7 +211,8 @@ _GO_ON = """
 @wp.func_native(
     _WALK.format(
         missed="wp::vec4(t_max, 0.0f, 0.0f, 0.0f)",
-        distances="float distances[256];",
+        distances=f"float distances[{STACK}];",
+        stack=STACK,
         descend=_DESCEND_SORTED,
         meet=_MEET_CLOSEST,
         go_on=_GO_ON_NEARER,
@@ -217,7 +222,7 @@ def walk_closest(tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp
     """T of the closest triangle before ``t_max``, its first two barycentric weights, the bits of its number or -1."""
 
 
-@wp.func_native(_WALK.format(missed="false", distances="", descend=_DESCEND, meet=_MEET_ANY, go_on=_GO_ON))
+@wp.func_native(_WALK.format(missed="false", distances="", stack=STACK, descend=_DESCEND, meet=_MEET_ANY, go_on=_GO_ON))
 def walk_any(tree: wp.uint64, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
     """Whether a ray meets a triangle before ``t_max``."""
 

@@ -8,11 +8,9 @@ import warp as wp
 
 from warp_ar.geometry import Mesh, torus_mesh
 from warp_ar.kernels import wide_bvh
-from warp_ar.kernels.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, WIDTH, build_wide_bvh
+from warp_ar.kernels.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
 from warp_ar.ray_scene import BOX_MARGIN, make_ray_mesh
 
-STACK = 256
-"""Entries of the walk's stack."""
 MARGIN = 1e-4
 T_TOLERANCE = 1e-5
 """Where a ray meets a corner Warp goes on in float64; what a rounding of edge functions then does to t."""
