@@ -30,6 +30,7 @@ def rungs(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str,
         return wp.zeros(prefilter.lobe_texels(height), dtype=wp.vec3, device=device)
 
     box = wp.zeros(pyramid.packed_texels(height, 2 * height), dtype=wp.vec3, device=device)
+    blocks_done = wp.zeros(1, dtype=wp.int32, device=device)
     row_energy = wp.zeros(prefilter.lobe_rows(height), dtype=wp.vec3, device=device)
     energy = wp.zeros(prefilter.lobe_count(height), dtype=wp.vec3, device=device)
 
@@ -37,7 +38,7 @@ def rungs(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str,
         out, weights = levels(), wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
 
         def function() -> None:
-            pyramid.build_pyramid(environment, box, isotropic=smooth)
+            pyramid.build_pyramid(environment, blocks_done, box, isotropic=smooth)
             prefilter.mix_mips(box, weights, height, out, smooth=smooth)
             if smooth:
                 prefilter.measure_energy(out, height, row_energy, energy)
@@ -49,7 +50,7 @@ def rungs(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str,
         out, samples = levels(), prefilter.make_lobe_samples(height, lobe, count, device)
 
         def function() -> None:
-            pyramid.build_pyramid(environment, box, isotropic=True)
+            pyramid.build_pyramid(environment, blocks_done, box, isotropic=True)
             prefilter.sample_lobes(box, samples, height, out)
             prefilter.measure_energy(out, height, row_energy, energy)
             prefilter.scale_levels(energy, height, out)

@@ -55,7 +55,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle, wrap_texel
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
 from warp_ar.kernels.structs import FrameParams, KeyLight
 
 wp.set_module_options({"enable_backward": False})
@@ -251,15 +251,6 @@ def block_max(value: wp.float32) -> wp.float32:
 """)
 def team_max(value: wp.float32, blocks: wp.int32, turn: wp.int32) -> wp.float32:
     """Largest value of the team's blocks, known to all of them; arguments as ``team_sum``."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_block():
-    """Goes on once all threads of the block are here and what they wrote can be read."""
 
 
 @wp.func_native("""

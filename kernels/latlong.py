@@ -39,9 +39,13 @@ def latlong_from_direction(direction: wp.vec3, height: wp.int32, width: wp.int32
 
 @wp.func
 def texel_solid_angle(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
-    """Solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W as a product of sines (no cancellation)."""
+    """Solid angle of any texel of a row: (cos theta0 - cos theta1) 2 pi / W.
+
+    As a product of sines, and from the nearer pole: exact near both.
+    """
     half_step = 0.5 * PI / wp.float32(height)
-    return 2.0 * wp.sin((2.0 * wp.float32(row) + 1.0) * half_step) * wp.sin(half_step) * 2.0 * PI / wp.float32(width)
+    middle = wp.float32(wp.min(2 * row + 1, 2 * (height - row) - 1))
+    return 2.0 * wp.sin(middle * half_step) * wp.sin(half_step) * 2.0 * PI / wp.float32(width)
 
 
 @wp.func

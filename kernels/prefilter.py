@@ -72,6 +72,8 @@ wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 BLOCK = 64
+LARGE_LEVELS = wp.constant(3)
+"""Levels that have as many texels as the environment, if there are so many at all."""
 # How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as
 # [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small lamps, by error against brute force.
 SAMPLE_BIAS = 0.25
@@ -103,6 +105,11 @@ def lobe_offset(height: int, level: int) -> int:
 def lobe_texels(height: int) -> int:
     """Texels of all levels together: the length of ``specular_levels``."""
     return lobe_offset(height, lobe_count(height))
+
+
+def mixed_texels(height: int) -> int:
+    """Work items of ``mix_mips``: levels that are as large as level 0 are written along with it."""
+    return lobe_texels(height) - (min(LARGE_LEVELS, lobe_count(height)) - 1) * 2 * height**2
 
 
 def lobe_alpha(height: int, level: int) -> float:
@@ -322,28 +329,53 @@ def mix_mips_kernel(
     # Out:
     levels_out: wp.array[wp.vec3],
 ):
-    """One packed texel from the levels of a pyramid; no trigonometry, as both are latlong."""
+    """One texel from the levels of a pyramid, where levels are equally large one of each; no trigonometry is needed.
+
+    What several levels read of a mip at the same place is read once.
+    """
     index = wp.tid() + row_start
-    at = locate_texel(index, height)
-    h = height >> wp.max(at[0] - 2, 0)
-    w = 2 * height >> wp.max(at[0] - 2, 0)
+    texels = height * 2 * height
+    at = wp.vec4i(0, index / (2 * height), index % (2 * height), 0)
+    if index >= texels:
+        at = locate_texel(index + (LARGE_LEVELS - 1) * texels, height)
+    level = at[0]
+    h = height >> wp.max(level - 2, 0)
+    w = 2 * height >> wp.max(level - 2, 0)
     v = (wp.float32(at[1]) + 0.5) / wp.float32(h)
     u = (wp.float32(at[2]) + 0.5) / wp.float32(w)
     total = wp.vec3()
+    total_1 = wp.vec3()
+    total_2 = wp.vec3()
     offset = wp.int32(0)
     for m in range(weights.shape[1]):
         mip_height = height >> m
         mip_width = 2 * height >> m
-        weight = weights[at[0], m]
-        if weight > 0.0:
+        weight = weights[level, m]
+        weight_1 = wp.float32(0.0)
+        weight_2 = wp.float32(0.0)
+        if level == 0:
+            weight_1 = weights[1, m]
+            if weights.shape[0] > 2:
+                weight_2 = weights[2, m]
+        if weight + weight_1 + weight_2 > 0.0:
             row = v * wp.float32(mip_height)
             column = u * wp.float32(mip_width)
+            value = wp.vec3()
             if smooth != 0 and m > 0:
-                total += sample_packed_smooth(pyramid, offset, mip_height, mip_width, row, column) * weight
+                value = sample_packed_smooth(pyramid, offset, mip_height, mip_width, row, column)
             else:
-                total += sample_packed(pyramid, offset, mip_height, mip_width, row, column) * weight
+                value = sample_packed(pyramid, offset, mip_height, mip_width, row, column)
+            total += value * weight
+            total_1 += value * weight_1
+            total_2 += value * weight_2
         offset += mip_height * mip_width
+    if level > 0:
+        levels_out[index + (LARGE_LEVELS - 1) * texels] = total
+        return
     levels_out[index] = total
+    levels_out[index + texels] = total_1
+    if weights.shape[0] > 2:
+        levels_out[index + 2 * texels] = total_2
 
 
 @wp.kernel(enable_backward=False)
@@ -618,11 +650,11 @@ def mix_mips(
         height: Rows of the environment.
         levels_out: (lobe_texels(height),).
         smooth: Read mips through quadratic B-splines, as the fitted weights expect; else bilinearly, as the paper does.
-        rows: Band of packed texels; None means all.
+        rows: Band of ``mixed_texels``; None means all.
     """
     launch_rows(
         mix_mips_kernel,
-        levels_out.shape,
+        (mixed_texels(height),),
         [pyramid, weights, height, int(smooth)],
         [levels_out],
         rows=rows,

@@ -32,11 +32,15 @@ import math
 import warp as wp
 
 from warp_ar.kernels.latlong import latlong_from_direction, wrap_texel
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, is_last_block, launch_rows, launch_tiles, wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
+BLOCK = 512
+"""Threads of a block that takes a band of rows."""
+BAND_LEVELS = 3
+"""Levels that a block makes of its own band, of 2^3 rows."""
 MAX_RADIANCE = wp.constant(wp.float32(1.0e8))
 """Radiance that an infinite or larger texel counts as, in camera values: sums over any map stay finite in float32."""
 
@@ -126,9 +130,19 @@ def sample_packed_smooth(
         )
     total = wp.vec3()
     for di in range(3):
-        for dj in range(3):
-            texel = wrap_texel(i + di - 1, j + dj - 1, height, width)
-            total += levels[offset + texel[0] * width + texel[1]] * (wy[di] * wx[dj])
+        texel = wrap_texel(i + di - 1, j - 1, height, width)
+        row_offset = offset + texel[0] * width
+        middle = texel[1] + 1
+        if middle == width:
+            middle = 0
+        right = middle + 1
+        if right == width:
+            right = 0
+        total += (
+            levels[row_offset + texel[1]] * wx[0]
+            + levels[row_offset + middle] * wx[1]
+            + levels[row_offset + right] * wx[2]
+        ) * wy[di]
     return total
 
 
@@ -176,27 +190,68 @@ def copy_safe_kernel(
     levels_out[i * environment.shape[1] + j] = safe_radiance(environment[i, j])
 
 
-@wp.kernel(enable_backward=False)
-def reduce_level_kernel(
-    row_start: wp.int32,
-    # In:
+@wp.func
+def row_share(low: wp.int32, high: wp.int32, whole: wp.int32) -> wp.float32:
+    """Half of cos theta0 - cos theta1 between two rows, in units of 1 / whole of the map's height.
+
+    As a product of sines, and from the nearer pole: exact near both.
+    """
+    unit = 0.5 * PI / wp.float32(whole)
+    middle = wp.min(low + high, 2 * whole - low - high)
+    return wp.sin(unit * wp.float32(middle)) * wp.sin(unit * wp.float32(high - low))
+
+
+@wp.func
+def sum_columns(
+    levels: wp.array[wp.vec3],
+    row_offset: wp.int32,
+    source_width: wp.int32,
+    width: wp.int32,
+    column_first: wp.int32,
+    column_last: wp.int32,
+) -> wp.vec3:
+    """Sum of a row's texels times how much of each lies between two columns, in units of 1 / width of a texel."""
+    first = column_first / width
+    if first * width > column_first:
+        first -= 1  # integer division rounds toward zero
+    last = (column_last - 1) / width
+    if last * width > column_last - 1:
+        last -= 1
+    c = first % source_width
+    if c < 0:
+        c += source_width
+    total = levels[row_offset + c] * wp.float32(wp.min(column_last, (first + 1) * width) - column_first)
+    if last > first:
+        inner = wp.vec3()
+        for _ in range(last - first - 1):
+            c += 1
+            if c == source_width:
+                c = 0
+            inner += levels[row_offset + c]
+        total += inner * wp.float32(width)
+        c += 1
+        if c == source_width:
+            c = 0
+        total += levels[row_offset + c] * wp.float32(column_last - last * width)
+    return total
+
+
+@wp.func
+def reduce_texel(
+    levels: wp.array[wp.vec3],
     source_offset: wp.int32,
     source_height: wp.int32,
     source_width: wp.int32,
-    offset: wp.int32,
     height: wp.int32,
     width: wp.int32,
+    i: wp.int32,
+    j: wp.int32,
     isotropic: wp.int32,
-    # Out (and in: the source level):
-    levels_out: wp.array[wp.vec3],
-):
-    """One texel of a level from the level before it."""
-    i, j = wp.tid()
-    i += row_start
+) -> wp.vec3:
+    """Texel (i, j) of a (height, width) level from the level before it."""
     # Rows in units of 1 / (source_height * height) of the map's height, columns likewise.
     row_first = i * source_height
     row_last = row_first + source_height
-    unit = PI / (wp.float32(source_height) * wp.float32(height))
     column_first = j * source_width
     column_last = column_first + source_width
     if isotropic != 0:
@@ -216,23 +271,64 @@ def reduce_level_kernel(
     while r * height < row_last:
         low = wp.max(row_first, r * height)
         high = wp.min(row_last, (r + 1) * height)
-        # cos theta0 - cos theta1 as a product: exact near the poles.
-        row_weight = wp.sin(0.5 * unit * wp.float32(low + high)) * wp.sin(0.5 * unit * wp.float32(high - low))
-        row_total = wp.vec3()
-        c = column_first / width
-        if column_first < 0 and c * width > column_first:
-            c -= 1  # integer division rounds toward zero
-        while c * width < column_last:
-            overlap = wp.min(column_last, (c + 1) * width) - wp.max(column_first, c * width)
-            wrapped = c % source_width
-            if wrapped < 0:
-                wrapped += source_width
-            row_total += levels_out[source_offset + r * source_width + wrapped] * wp.float32(overlap)
-            c += 1
-        total += row_total * row_weight
+        row_weight = row_share(low, high, source_height * height)
+        row_offset = source_offset + r * source_width
+        total += sum_columns(levels, row_offset, source_width, width, column_first, column_last) * row_weight
         total_weight += row_weight
         r += 1
-    levels_out[offset + i * width + j] = total / (total_weight * wp.float32(column_last - column_first))
+    return total / (total_weight * wp.float32(column_last - column_first))
+
+
+@wp.kernel(enable_backward=False, launch_bounds=BLOCK)
+def build_pyramid_kernel(
+    # In:
+    environment: wp.array2d[wp.vec3],
+    isotropic: wp.int32,
+    band_levels: wp.int32,
+    # In and out:
+    blocks_done: wp.array[wp.int32],
+    # Out:
+    levels_out: wp.array[wp.vec3],
+):
+    """All levels: one block takes a band of rows through the first, the block that ends last does the rest."""
+    block, lane = wp.tid()
+    rows = environment.shape[0]
+    columns = environment.shape[1]
+    band = 1 << band_levels
+    for t in range(lane, band * columns, wp.block_dim()):
+        i = block * band + t / columns
+        j = t % columns
+        levels_out[i * columns + j] = safe_radiance(environment[i, j])
+    wait_for_block()
+    bands = rows / band
+    source_offset = wp.int32(0)
+    source_height = rows
+    source_width = columns
+    first = block * band
+    count = band
+    level = wp.int32(1)
+    while (wp.min(rows, columns) >> level) > 0:
+        height = wp.max(rows >> level, 1)
+        width = wp.max(columns >> level, 1)
+        if level == band_levels + 1:
+            if not is_last_block(blocks_done, bands):
+                return
+            first = 0
+            count = source_height
+        first = first / 2
+        count = wp.max(count / 2, 1)
+        offset = source_offset + source_height * source_width
+        for t in range(lane, count * width, wp.block_dim()):
+            i = first + t / width
+            j = t % width
+            levels_out[offset + i * width + j] = reduce_texel(
+                levels_out, source_offset, source_height, source_width, height, width, i, j, isotropic
+            )
+        wait_for_block()
+        source_offset = offset
+        source_height = height
+        source_width = width
+        level += 1
 
 
 @wp.kernel(enable_backward=False)
@@ -249,7 +345,6 @@ def reduce_latlong_kernel(
     source_width = radiance.shape[1]
     height = reduced_out.shape[0]
     width = reduced_out.shape[1]
-    unit = PI / (wp.float32(source_height) * wp.float32(height))
     row_first = i * source_height
     row_last = row_first + source_height
     column_first = j * source_width
@@ -260,7 +355,7 @@ def reduce_latlong_kernel(
     while r * height < row_last:
         low = wp.max(row_first, r * height)
         high = wp.min(row_last, (r + 1) * height)
-        row_weight = wp.sin(0.5 * unit * wp.float32(low + high)) * wp.sin(0.5 * unit * wp.float32(high - low))
+        row_weight = row_share(low, high, source_height * height)
         row_total = wp.vec3()
         c = column_first / width
         while c * width < column_last:
@@ -284,49 +379,36 @@ def copy_safe(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *
     launch_rows(copy_safe_kernel, environment.shape, [environment], [levels_out], rows=rows, device=environment.device)
 
 
-def reduce_level(
-    height: int,
-    width: int,
-    level: int,
+def build_pyramid(
+    environment: wp.array2d[wp.vec3],
+    blocks_done: wp.array[wp.int32],
     levels_out: wp.array[wp.vec3],
     *,
     isotropic: bool = False,
-    rows: Rows | None = None,
 ) -> None:
-    """Write one level of a pyramid from the level before it.
-
-    Args:
-        height: Rows of level 0.
-        width: Columns of level 0.
-        level: The level to write, at least 1.
-        levels_out: Packed pyramid, (packed_texels(height, width),).
-        isotropic: Widen footprints near the poles.
-        rows: Band of the level's rows; None means all.
-    """
-    source = level_size(height, width, level - 1)
-    size = level_size(height, width, level)
-    inputs = [
-        level_offset(height, width, level - 1),
-        *source,
-        level_offset(height, width, level),
-        *size,
-        int(isotropic),
-    ]
-    launch_rows(reduce_level_kernel, size, inputs, [levels_out], rows=rows, device=levels_out.device)
-
-
-def build_pyramid(environment: wp.array2d[wp.vec3], levels_out: wp.array[wp.vec3], *, isotropic: bool = False) -> None:
-    """Write a whole pyramid: one launch per level, each from the one before.
+    """Write a whole pyramid, in one launch: every level from the one before.
 
     Args:
         environment: (H, W) radiance, any size.
+        blocks_done: (1,) scratch, zero; it is left zero. Launches that may run side by side need one each.
         levels_out: Packed pyramid, (packed_texels(H, W),).
         isotropic: Widen footprints near the poles.
     """
     height, width = environment.shape
-    copy_safe(environment, levels_out)
-    for level in range(1, level_count(height, width)):
-        reduce_level(height, width, level, levels_out, isotropic=isotropic)
+    # A level's row lies within its band's rows of the level before as long as both divide evenly; the last level that
+    # bands make still is at least as many rows as there are bands.
+    band_levels = 0
+    while band_levels < BAND_LEVELS and height % (2 << band_levels) == 0:
+        band_levels += 1
+    band_levels = min(band_levels, level_count(height, width) - 1)
+    launch_tiles(
+        build_pyramid_kernel,
+        (height >> band_levels,),
+        [environment, int(isotropic), band_levels],
+        [blocks_done, levels_out],
+        block_dim=BLOCK,
+        device=environment.device,
+    )
 
 
 def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec3], *, scale: float = 1.0) -> None:

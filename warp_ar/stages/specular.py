@@ -55,6 +55,7 @@ class Specular(Stage):
         specs = {"specular_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
         if self.rung != "brute_force" and not self._mirrors_only:
             specs["specular_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
+            specs["specular_blocks_done"] = ArraySpec((1,), wp.int32)
         if self.rung not in ("box_mip", "brute_force") and not self._mirrors_only:
             specs["specular_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
             specs["specular_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
@@ -71,16 +72,16 @@ class Specular(Stage):
         if self.rung == "brute_force":
             return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
 
-        box = arrays["specular_pyramid"]
+        box, blocks_done = arrays["specular_pyramid"], arrays["specular_blocks_done"]
         isotropic = self.rung != "box_mip"
-        passes = [Pass(lambda rows: pyramid.build_pyramid(environment, box, isotropic=isotropic))]
+        passes = [Pass(lambda rows: pyramid.build_pyramid(environment, blocks_done, box, isotropic=isotropic))]
         if self.rung in ("box_mip", "energy_mip"):
             numbers = prefilter.mip_weights(height, lobe) if isotropic else prefilter.box_weights(height)
             weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
             passes.append(
                 Pass(
                     lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows),
-                    rows=texels,
+                    rows=prefilter.mixed_texels(height),
                 )
             )
         else:
