@@ -17,6 +17,7 @@ from bench.rooms import rooms
 from warp_ar.kernels import prefilter, pyramid
 
 HEIGHTS = {"cpu": (32, 64), "cuda": (32, 64, 128, 256)}
+RUNS = {"cpu": 30, "cuda": 200}
 FEW_ROWS = 64
 """Rows up to which brute force is timed as often as the rest on CUDA; beyond it takes tenths of a second a run."""
 SAMPLES = (8, 32, 128)
@@ -80,7 +81,8 @@ def mean_error(values: np.ndarray, exact: np.ndarray, height: int) -> float:
 
 def main(device: str) -> None:
     on_cpu = wp.get_device(device).is_cpu
-    for height in HEIGHTS["cpu" if on_cpu else "cuda"]:
+    kind = "cpu" if on_cpu else "cuda"
+    for height in HEIGHTS[kind]:
         for lobe in ("ggx", "phong"):
             errors: dict[str, dict[str, float]] = {}
             work: dict[str, tuple[Any, wp.array]] = {}
@@ -101,7 +103,7 @@ def main(device: str) -> None:
                 }
             else:
                 times = {}
-            for name, milliseconds in (measure(contenders, device) | times).items():
+            for name, milliseconds in (measure(contenders, device, RUNS[kind]) | times).items():
                 report(
                     f"prefilter {lobe} {name} {height}x{2 * height}", milliseconds, device, relative_rms=errors[name]
                 )

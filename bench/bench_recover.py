@@ -36,6 +36,8 @@ class Setup:
         probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
         probe = scene.probes[0]
         probes["center"], probes["radius"], probes["reflectance"] = probe.center, probe.radius, probe.reflectance
+        params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+        params["camera_position"], params["focal"] = (0.0, -0.5, 0.3), 800.0
         clipped = np.zeros((*shape, 3), np.float32)
         clipped[shape[0] // 4 : shape[0] // 4 + shape[0] // 16, shape[1] // 4 : shape[1] // 4 + shape[0] // 16] = 1.0
         with wp.ScopedDevice(self.device):
@@ -43,6 +45,8 @@ class Setup:
             self.probes = wp.array(probes, dtype=structs.Probe)
             self.radiance = wp.full(shape, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
             self.clipped = wp.array(clipped, dtype=wp.vec3)
+            self.lacking = wp.zeros(shape, dtype=wp.vec3)
+            self.params = wp.array(params, dtype=structs.FrameParams)
             self.confidence = wp.full(shape, 1.0, dtype=wp.float32)
             self.recovered = wp.zeros(shape, dtype=wp.vec3)
             self.cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell)
@@ -55,9 +59,13 @@ class Setup:
             self.traced = wp.zeros(count, dtype=wp.int32)
         self.solver = recovery.Recovery(surfaces, scene.marker.white, probe.center)
 
+    def weigh(self) -> None:
+        """Weigh the rims of what clips."""
+        kernels.weigh_rims(self.clipped, self.params, self.probes, self.lacking)
+
     def condense(self) -> None:
         """Condense the map."""
-        arrays = (self.radiance, self.confidence, self.clipped, self.probes, self.scene, self.cells)
+        arrays = (self.radiance, self.confidence, self.clipped, self.lacking, self.probes, self.scene, self.cells)
         kernels.condense_cells(*arrays, proxies=self.proxies)
 
     def trace(self) -> None:
@@ -68,7 +76,7 @@ class Setup:
 
     def add(self) -> None:
         """Apply an excess."""
-        kernels.add_excess(self.radiance, self.confidence, self.clipped, self.cells, self.excess, self.recovered)
+        kernels.add_excess(self.radiance, self.confidence, self.lacking, self.cells, self.excess, self.recovered)
 
     def solve(self) -> recovery.Estimate:
         """Solve on the host, warm after the first call."""
@@ -77,6 +85,7 @@ class Setup:
 
 
 def check(setup: Setup) -> None:
+    setup.weigh()
     setup.condense()
     setup.trace()
     setup.add()
@@ -89,7 +98,7 @@ def main(device: str) -> None:
     for height in HEIGHTS:
         setup = Setup(height, device)
         check(setup)
-        for name in ("condense", "trace", "add"):
+        for name in ("weigh", "condense", "trace", "add"):
             work = getattr(setup, name)
             report(f"recover/{name}/{height}", measure({name: work}, device)[name], device, points=len(setup.points))
         if wp.get_device(device).is_cpu:

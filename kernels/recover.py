@@ -10,6 +10,8 @@ The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_tr
 the same for lamps at finite distances. ``warp_ar.recovery`` solves for what is missing in the clipped cells,
 ``add_excess`` puts it into the map.
 
+**Rims.** Half a pixel around a lamp clips as well: ``weigh_rims``.
+
 **Cells.** The room is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with
 its mean radiance, its share at clipping, and the direction in which that share lies.
 
@@ -27,7 +29,13 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.color import decode
-from warp_ar.kernels.latlong import PI, direction_from_latlong, latlong_from_direction, texel_solid_angle
+from warp_ar.kernels.latlong import (
+    PI,
+    direction_from_latlong,
+    latlong_from_direction,
+    sample_latlong,
+    texel_solid_angle,
+)
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.probe import is_clipped, project, reflecting_normal
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
@@ -51,6 +59,12 @@ FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
 """Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
+MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
+"""Radians: balls of less than ten pixels are taken to have ten."""
+RIM_TAPS = wp.constant(5)
+"""Samples along each axis of a Gaussian, one standard deviation apart."""
+UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
+ASIDE = wp.constant(wp.vec3(1.0, 0.0, 0.0))
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -81,6 +95,7 @@ class Cell:
 
     radiance: wp.vec3  # mean, as captured
     clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
+    lacking: wp.vec3  # the same, rims of what clips counting less
     hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
     modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the room beyond
     middle: wp.vec3  # unit
@@ -100,6 +115,74 @@ def trust(confidence: wp.float32) -> wp.float32:
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
 
 
+@wp.kernel(enable_backward=False)
+def weigh_rims_kernel(
+    # In:
+    row_start: wp.int32,
+    clipped: wp.array2d[wp.vec3],
+    params: wp.array[FrameParams],
+    probes: wp.array[Probe],
+    # Out:
+    lacking_out: wp.array2d[wp.vec3],
+):
+    """A texel times the square of the mean around it."""
+    i, j = wp.tid()
+    i += row_start
+    share = clipped[i, j]
+    if not wp.max(share) > 0.0:
+        lacking_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        return
+    to_ball = probes[0].center - params[0].camera_position
+    pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
+    # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
+    half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
+    direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
+    across = wp.normalize(wp.cross(direction, wp.where(wp.abs(direction[2]) < 0.9, UP, ASIDE)))
+    upward = wp.cross(across, direction)
+    near = wp.vec3(0.0, 0.0, 0.0)
+    total = wp.float32(0.0)
+    for k in range(RIM_TAPS * RIM_TAPS):
+        a = wp.float32(k // RIM_TAPS - RIM_TAPS // 2)
+        b = wp.float32(k % RIM_TAPS - RIM_TAPS // 2)
+        weight = wp.exp(-0.5 * (a * a + b * b))
+        near += weight * sample_latlong(clipped, direction + half_pixel * (a * across + b * upward))
+        total += weight
+    near /= total
+    lacking_out[i, j] = wp.cw_mul(share, wp.cw_mul(near, near))
+
+
+def weigh_rims(
+    clipped: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    lacking_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Weigh what clips by how likely it is the light itself: rims count less.
+
+    A pixel at a light's rim shows part of the light, and clips all the same if that is bright: what clips in the
+    ball's picture is larger than the light by up to a pixel. A texel counts by the square of the mean share at clipping
+    around it, by a Gaussian of half a pixel's standard deviation: 1 inside of what is wide, a quarter at straight rims.
+    A lamp of a few pixels becomes as small as it is, and so do its shadows and highlights.
+
+    Args:
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P), at least one: the ball.
+        lacking_out: ``wp.vec3`` (h, w), 0 where nothing clips.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        weigh_rims_kernel,
+        clipped.shape,
+        [clipped, params, probes],
+        [lacking_out],
+        rows=rows,
+        device=clipped.device,
+    )
+
+
 @functools.cache
 def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
@@ -112,6 +195,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         radiance: wp.array2d[wp.vec3],
         confidence: wp.array2d[wp.float32],
         clipped: wp.array2d[wp.vec3],
+        lacking: wp.array2d[wp.vec3],
         probes: wp.array[Probe],
         scene: RayScene,
         # Out:
@@ -135,16 +219,19 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 cell.solid_angle += area
                 cell.radiance += area * radiance[i, j]
                 cell.clipped += area * lost
+                cell.lacking += area * seen * lacking[i, j]
                 cell.hidden += area * (1.0 - seen)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
+        cell.lacking /= cell.solid_angle
         cell.hidden /= cell.solid_angle
         if wp.max(cell.clipped) > _LOST:
             cell.hidden = 0.0
         else:
             cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
+            cell.lacking += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
         cell.middle = wp.normalize(toward)
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
@@ -160,6 +247,7 @@ def condense_cells(
     radiance: wp.array,
     confidence: wp.array,
     clipped: wp.array,
+    lacking: wp.array,
     probes: wp.array,
     scene: RayScene,
     cells_out: wp.array,
@@ -173,6 +261,7 @@ def condense_cells(
         radiance: ``wp.vec3`` (h, w), complete.
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        lacking: The same from ``weigh_rims``.
         probes: ``Probe`` (P), at least one.
         scene: Its proxies are known surfaces: what clips there is lit, not a light.
         cells_out: ``Cell``, ``cell_shape(h, w)``.
@@ -182,7 +271,7 @@ def condense_cells(
     launch_rows(
         make_condense_cells_kernel(proxies),
         cells_out.shape,
-        [radiance, confidence, clipped, probes, scene],
+        [radiance, confidence, clipped, lacking, probes, scene],
         [cells_out],
         rows=rows,
         device=cells_out.device,
@@ -190,10 +279,10 @@ def condense_cells(
 
 
 @wp.func
-def lacking(confidence: wp.float32, clipped: wp.vec3, unseen: wp.float32) -> wp.vec3:
+def lacking_share(confidence: wp.float32, lacking: wp.vec3, unseen: wp.float32) -> wp.vec3:
     """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
     seen = trust(confidence)
-    return seen * clipped + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
+    return seen * lacking + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -202,7 +291,7 @@ def add_excess_kernel(
     row_start: wp.int32,
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
-    clipped: wp.array2d[wp.vec3],
+    lacking: wp.array2d[wp.vec3],
     cells: wp.array2d[Cell],
     excess: wp.array2d[wp.vec3],
     # Out:
@@ -223,24 +312,24 @@ def add_excess_kernel(
     for i in range(top, bottom):
         area = texel_solid_angle(i, height, width)
         for j in range(left, right):
-            now += area * lacking(confidence[i, j], clipped[i, j], unseen)
+            now += area * lacking_share(confidence[i, j], lacking[i, j], unseen)
             solid_angle += area
     now /= solid_angle
     more = excess[row, column]
-    then = cells[row, column].clipped
+    then = cells[row, column].lacking
     for c in range(3):
         if now[c] > then[c]:
             more[c] *= then[c] / now[c]
     for i in range(top, bottom):
         for j in range(left, right):
-            share = lacking(confidence[i, j], clipped[i, j], unseen)
+            share = lacking_share(confidence[i, j], lacking[i, j], unseen)
             recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
 
 def add_excess(
     radiance: wp.array,
     confidence: wp.array,
-    clipped: wp.array,
+    lacking: wp.array,
     cells: wp.array,
     excess: wp.array,
     recovered_out: wp.array,
@@ -255,7 +344,7 @@ def add_excess(
     Args:
         radiance: As captured and completed, ``wp.vec3`` (h, w).
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        lacking: Share at clipping per channel from ``weigh_rims``, ``wp.vec3`` (h, w).
         cells: ``Cell``, ``cell_shape(h, w)``, of when the excess was found.
         excess: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
         recovered_out: ``wp.vec3`` (h, w).
@@ -264,7 +353,7 @@ def add_excess(
     launch_rows(
         add_excess_kernel,
         excess.shape,
-        [radiance, confidence, clipped, cells, excess],
+        [radiance, confidence, lacking, cells, excess],
         [recovered_out],
         rows=rows,
         device=recovered_out.device,

@@ -330,7 +330,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
                 else:
                     room = sample_latlong(desk.irradiance_map, hit.normal)
                 if wp.static(config.lamps):
-                    room = add_nearness(room, desk.lamps, desk.probes[0].center, hit.point, hit.normal)
+                    room = add_nearness(room, desk.lamps, hit.point, hit.normal)
                 if wp.static(config.share):
                     if not is_mirrored:
                         cells = desk.cells

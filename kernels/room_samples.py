@@ -56,7 +56,7 @@ class RoomSample:
     radiance: wp.vec3
     measure: wp.float32  # solid angle that the sample stands for
     distance: wp.float32  # metres from ``origin`` to the light; FAR_AWAY for the environment
-    origin: wp.vec3  # where it was captured: the ball's centre
+    origin: wp.vec3  # where it was captured: the ball's centre, or for a lamp the place that mirrors it
 
 
 @wp.struct
@@ -314,6 +314,7 @@ def place_lamps_kernel(
         cosine = wp.dot(lamp.direction, sample.direction)
         if cosine > nearest:
             nearest = cosine
+            samples_out[index].origin = lamp.origin
             samples_out[index].distance = wp.clamp(lamp.distance, MIN_LAMP_DISTANCE, FAR_AWAY)
 
 

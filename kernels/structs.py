@@ -139,6 +139,7 @@ class KeyLight:
 class RoomLamp:
     """A lamp of the room whose light clips in the ball; distant ones are directions."""
 
-    direction: wp.vec3  # unit, from the first ball; zero where there is no lamp
-    distance: wp.float32  # metres from the ball, infinite for a distant one
-    power: wp.vec3  # radiance times solid angle at the ball, beyond what was captured; * distance^2: radiant intensity
+    origin: wp.vec3  # where on the first ball the camera sees it mirrored
+    direction: wp.vec3  # unit, from there, as in the environment; zero where there is no lamp
+    distance: wp.float32  # metres from there, infinite for a distant one
+    power: wp.vec3  # radiance times solid angle from there, beyond what was captured; * distance^2: radiant intensity

@@ -23,22 +23,22 @@ def evaluate_kernel(
     # In:
     irradiance: wp.vec3,
     lamps: wp.array[RoomLamp],
-    center: wp.vec3,
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     # Out:
     irradiance_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    irradiance_out[i] = add_nearness(irradiance, lamps, center, points[i], normals[i])
+    irradiance_out[i] = add_nearness(irradiance, lamps, points[i], normals[i])
 
 
 def evaluate(device, irradiance, lamps, points, normals):
     records = np.zeros(len(lamps), np.dtype(RoomLamp.numpy_dtype()))
     for record, (direction, distance, power) in zip(records, lamps, strict=True):
-        record["direction"], record["distance"], record["power"] = direction, distance, power
+        record["origin"], record["direction"] = CENTER, direction
+        record["distance"], record["power"] = distance, power
     out = wp.zeros(len(points), dtype=wp.vec3, device=device)
-    inputs = [wp.array(records, dtype=RoomLamp, device=device), wp.vec3(*CENTER)]
+    inputs = [wp.array(records, dtype=RoomLamp, device=device)]
     inputs += [wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in (points, normals)]
     wp.launch(evaluate_kernel, len(points), [wp.vec3(*irradiance), *inputs], [out], device=device)
     return out.numpy()

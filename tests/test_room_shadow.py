@@ -261,14 +261,14 @@ def test_texels_list_the_map(device):
     np.testing.assert_allclose(samples.numpy()["measure"].sum(), 4 * np.pi, rtol=SUM_ERROR)
 
 
-def lamp_at(*positions):
+def lamp_at(*positions, origin=ORIGIN):
     """Records of lamps at positions in the world, and an unused one; None stands for a distant lamp straight up."""
     values = []
     for at in positions:
-        offset = np.array([0, 0, 1.0]) if at is None else np.asarray(at) - ORIGIN
+        offset = np.array([0, 0, 1.0]) if at is None else np.asarray(at) - origin
         distance = np.linalg.norm(offset)
         far = np.inf if at is None else distance
-        values.append({"direction": offset / distance, "distance": far})
+        values.append({"origin": origin, "direction": offset / distance, "distance": far})
     return records(RoomLamp, *values, {})
 
 
@@ -286,6 +286,22 @@ def test_lamps_give_their_samples_a_place(device):
     np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
     np.testing.assert_allclose(found["distance"][near], np.linalg.norm(at - ORIGIN), rtol=1e-5)
     assert np.isfinite(found["distance"]).all()
+
+
+def test_lamps_are_placed_from_where_the_ball_mirrors_them(device):
+    at, mirrors = np.array([0.3, -0.1, 0.2]), np.array([0.01, 0.02, 0.06])
+    direction = (at - mirrors) / np.linalg.norm(at - mirrors)
+    environment = sky(0.5, (256, 512))
+    environment[reference.texel_directions(256, 512)[0] @ direction > np.cos(0.1)] = 40.0
+    _, _, samples = list_texels(environment)
+    room_samples.place_lamps(lamp_at(at, origin=mirrors), samples)
+    found = samples.numpy()
+    near = found["distance"] < 1e29
+    places = found["origin"][near] + found["distance"][near, None] * found["direction"][near]
+    weights = found["measure"][near, None]
+    # The mean over a disc of 0.1 rad lies its sagitta short of its middle.
+    np.testing.assert_allclose((weights * places).sum(0) / weights.sum(), at, atol=0.002)
+    np.testing.assert_allclose(found["origin"][~near], np.broadcast_to(ORIGIN, (int((~near).sum()), 3)), rtol=1e-6)
 
 
 # --- Ratio ------------------------------------------------------------------------------------------------------------

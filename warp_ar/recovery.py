@@ -11,7 +11,8 @@ reflectance 1 / u_k; the card's is known.
     pi L(x) u_k = e(x) + sum_r a_r(x) s_r + sum_j b_j(x) p_j,     e = T radiance,  a_r = T clipped over the cells of r,
 
 linear in the unknowns, none of which is negative. Divided by pi L and by u's last estimate a residual is a relative
-error: the surface's texture, transport that the model leaves out. Points that clip bind from one side only: they count
+error: the surface's texture, transport that the model leaves out; how large it is, points of a surface say by how far
+they scatter (``measured_noise``). Points that clip bind from one side only: they count
 while the prediction is under what they show. Where the card clips in whole, the sum of the energy has a lower bound
 only, and the estimate says so; ink, a twentieth as bright, and surfaces in shadow then carry it as far as priors on
 their reflectances allow.
@@ -26,7 +27,9 @@ distribution: a second pass draws each to the mean of all three, in the hue of t
 **Peaks** are chosen one by one, among all directions that may lack light and a grid of distances, by how far they
 lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then
 moved to neighbouring cells and distances while that helps, and kept if the cost falls by more than ``EVIDENCE``. A
-lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D.
+lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D. D counts
+from where the ball mirrors the lamp to the camera, which may lie a ball's radius beside its middle. A lamp that is
+known moves only for a larger gain: lamps stand still.
 
 Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
 without it, the more parts and equations there are, the more all of them would shrink together.
@@ -77,6 +80,10 @@ TIE: Final = 0.06
 """Relative standard deviation between the reflectances of one box's faces."""
 EVIDENCE: Final = 7.0
 """Fall of the cost (twice a log likelihood) that a peak must be worth."""
+BETTER: Final = 0.1
+"""Fall of the cost for which a peak that is being added goes to a neighbouring place."""
+WORTH_MOVING: Final = 1.0
+"""The same for a peak that was known before: lamps stand still, and what differs from view to view is noise."""
 PEAKS: Final = 4
 """Most peaks at a time."""
 SEARCH_EVERY: Final = 2
@@ -129,7 +136,13 @@ class Kind(enum.IntEnum):
 GRID: Final = 0.06
 """Metres between points on planes."""
 _NOISE: Final = np.array([0.02, 0.04, 0.12, 0.04])
-"""Relative standard deviation of one equation, by kind."""
+"""Relative standard deviation of one equation, by kind, where points scatter so much or are too few to tell."""
+LEAST_NOISE: Final = 0.01
+"""The same of the most even surface: transport that the model leaves out."""
+SCATTER_POINTS: Final = 12
+"""Points of a surface that tell how much they scatter."""
+SCATTER_ITERATIONS: Final = 5
+"""Of reweighting by which shadows and stains are left out of that."""
 _SHARED: Final = np.array([4.0, 8.0, 2.0, 3.0])
 """Equations that share one error of transport that the model leaves out, by kind, however far apart."""
 _TEXTURE: Final = np.array([0.0, 0.0, 0.03, 0.03])
@@ -162,10 +175,12 @@ class Surfaces:
 class Lamp:
     """A source of light that was found by what it does."""
 
+    origin: Array
+    """Where on the ball the camera sees it mirrored, metres, (3,)."""
     direction: Array
-    """Unit, from the ball, (3,)."""
+    """Unit, from there, (3,)."""
     distance: float
-    """Metres from the ball; infinite where none was found."""
+    """Metres from there; infinite where none was found."""
     power: Array
     """Radiance times solid angle as seen from the ball, per channel, beyond what the map shows, (3,)."""
 
@@ -331,6 +346,45 @@ def texture_overlap(
     return overlap
 
 
+def measured_noise(
+    points: NDArray[Any], surface: NDArray[np.int64], kinds: NDArray[np.int64], light: Array, exact: NDArray[np.bool_]
+) -> Array:
+    """Relative standard deviation of one equation, by surface: how far its points scatter about a smooth course.
+
+    The course is a quadratic in the surface's own coordinates, of the logarithm: a lamp's light falls off like that.
+    An even box or card says more than a table's texture, and more than all boxes and cards would have it.
+
+    Args:
+        points: Records of ``SurfacePoint``, (n,).
+        surface: That each lies on, (n,).
+        kinds: ``Kind`` of each surface, (surfaces,).
+        light: pi times the radiance that each shows, (n, 3).
+        exact: Where that does not clip and says something, (n, 3).
+
+    Returns:
+        Between ``LEAST_NOISE`` and what is usual for the kind, (surfaces,).
+    """
+    noise = np.array(_NOISE[kinds])
+    for number in range(len(kinds)):
+        own = np.flatnonzero((surface == number) & exact.all(axis=1))
+        if len(own) < SCATTER_POINTS:
+            continue
+        at, normal, tangent = (points[name][own].astype(float) for name in ("position", "normal", "tangent"))
+        places = np.column_stack([(at * axis).sum(axis=1) for axis in (tangent, np.cross(normal, tangent))])
+        u, v = ((places - places.mean(axis=0)) / np.maximum(places.std(axis=0), 1e-9)).T
+        terms = np.column_stack([np.ones(len(own)), u, v, u * u, u * v, v * v])
+        logs = np.log(light[own]).mean(axis=1)
+        weights = np.ones(len(own))
+        for _ in range(SCATTER_ITERATIONS):
+            course = np.linalg.lstsq(terms * weights[:, None], logs * weights, rcond=None)[0]
+            off = np.abs(logs - terms @ course)
+            scatter = 1.4826 * float(np.median(off))
+            weights = 1.0 / np.sqrt(1.0 + (off / (2.0 * scatter + 1e-6)) ** 2)
+        scatter *= np.sqrt(len(own) / (len(own) - terms.shape[1]))
+        noise[number] = np.clip(scatter, LEAST_NOISE, noise[number])
+    return noise
+
+
 def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: NDArray[np.bool_]) -> Array:
     """Number of equations that share the error of each of the points that are seen.
 
@@ -340,6 +394,22 @@ def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: N
         seen: Points that have an equation, (n,).
     """
     return np.asarray(np.maximum(_SHARED[kind], overlap @ seen.astype(np.float32))[seen])
+
+
+def mirroring_points(directions: Array, center: Array, radius: float, camera: Array | None) -> Array:
+    """Where on a ball a camera far away sees what lies in each direction, (m, 3).
+
+    Args:
+        directions: Unit, (m, 3).
+        center: Of the ball, metres, (3,).
+        radius: Of the ball, metres.
+        camera: Where it stands, metres, (3,); None: the centre for all.
+    """
+    if camera is None:
+        return np.broadcast_to(center, directions.shape)
+    view = (camera - center) / np.linalg.norm(camera - center)
+    halfway = directions + view
+    return np.asarray(center + radius * halfway / np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-3))
 
 
 # ---- regions ---------------------------------------------------------------------------------------------------------
@@ -470,17 +540,18 @@ class _Problem:
         surfaces: Surfaces,
         white: float,
         trace: Trace | None,
-        center: Array,
+        origin: Array,
     ) -> None:
         self.shape = cells.shape
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
-        self.lacking = cells["clipped"].reshape(-1, 3).astype(float)
+        self.lost = cells["clipped"].reshape(-1, 3).astype(float)
+        self.lacking = cells["lacking"].reshape(-1, 3).astype(float)
         self.direction = cells["direction"].reshape(-1, 3).astype(float)
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         modelled = cells["modelled"].ravel() > 0.5
-        clipped = self.lacking.max(axis=1) - cells["hidden"].ravel()
-        self.may_hold_peak = (self.lacking.max(axis=1) > 0.1) & ~modelled
-        self._trace, self._center = trace, center
+        clipped = self.lost.max(axis=1) - cells["hidden"].ravel()
+        self.may_hold_peak = (self.lost.max(axis=1) > 0.1) & ~modelled
+        self._trace, self.origin = trace, origin
         self._traced: dict[_Peak, Array] = {}
 
         # What clips on modelled surfaces is not joined to what clips beyond.
@@ -521,6 +592,7 @@ class _Problem:
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > DARK) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
+        self.noise = measured_noise(surfaces.points[seen], self.surface, self.kinds, self.light, self.exact)
         # With what clips taken to be some ten times as bright: only the order of magnitude matters.
         bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
         sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
@@ -608,7 +680,7 @@ class _Problem:
             | (self.bound[:, c] & usable[self.surface])
             | (self.bound[:, c] & known)
         )
-        light, surface, kind = self.light[rows, c], self.surface[rows], self.kind[rows]
+        light, surface = self.light[rows, c], self.surface[rows]
         exact = self.exact[rows, c]
         matrix = np.zeros((len(rows), len(z)))
         matrix[:, :parts] = self.columns[c][rows] / light[:, None]
@@ -641,7 +713,7 @@ class _Problem:
             prior[row, u_at + a], prior[row, u_at + b] = 1.0, -1.0
 
         one_sided = ~exact
-        sigma, shared = np.hypot(_NOISE[kind], MIRROR_TRUST * self.mirrored_share[rows]), self.shared[rows]
+        sigma, shared = np.hypot(self.noise[surface], MIRROR_TRUST * self.mirrored_share[rows]), self.shared[rows]
         deviation = np.ones(len(prior))
         hessian = np.zeros((len(z), len(z)))
         weights = np.zeros(len(rows))
@@ -714,7 +786,7 @@ class _Problem:
         if self._trace is not None and near:
             new = [k for k in near if peaks[k] not in self._traced]
             if new:
-                at = self._center + distances[new, None] * self.direction[cells[new]]
+                at = self.origin[cells[new]] + distances[new, None] * self.direction[cells[new]]
                 lamps = np.column_stack([at, LAMP_SHARE * distances[new]]).astype(np.float32)
                 traced = self._trace(lamps)[self.index] * distances[new] ** 2
                 self._traced.update((peaks[k], column) for k, column in zip(new, traced.T, strict=True))
@@ -734,7 +806,7 @@ class _Problem:
         if np.isfinite(peak.distance):
             column = self.power_columns([peak])[:, 0]
             near = patch[:, 0] > 0.0
-            block = np.stack([column * (self.lacking[near, c].max() > LOST) for c in range(3)])
+            block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
         else:
             block = np.stack([self.transfer @ (patch[:, c] * self.lacking[:, c]) for c in range(3)])
         self.peaks.append(peak)
@@ -771,17 +843,20 @@ class _Problem:
                 best = (peak, cost)
         if best is None or best[1] > fit.cost - EVIDENCE:
             return None
-        self.push(self.settled(*best, fit, c))
+        self.push(self.settled(*best, fit, c, BETTER))
         return self.fit(c, self.with_peak(fit.z), ITERATIONS)
 
-    def settled(self, peak: _Peak, cost: float, fit: _Fit, c: int) -> _Peak:
-        """Where a peak that is not among the unknowns of ``fit``, and would lead to ``cost``, does best."""
+    def settled(self, peak: _Peak, cost: float, fit: _Fit, c: int, least: float) -> _Peak:
+        """Where a peak that is not among the unknowns of ``fit``, and would lead to ``cost``, does best.
+
+        A step must lower the cost by more than ``least``.
+        """
         for _ in range(2):
             around = self.neighbours(peak)
             moved = False
             for place in np.argsort(-self.gains(fit, c, self.power_columns(around)), kind="stable")[:3]:
                 other = self.tried(around[place], fit.z, c, 4).cost
-                if other < cost - 0.1:
+                if other < cost - least:
                     peak, cost, moved = around[place], other, True
             if not moved:
                 break
@@ -792,7 +867,7 @@ class _Problem:
         peak = self.peaks.pop(0)
         self.peak_columns = self.peak_columns[:, :, 1:]
         fit = self.fit(c, self.start(mean), ITERATIONS)
-        self.push(self.settled(peak, self.tried(peak, fit.z, c, 4).cost, fit, c))
+        self.push(self.settled(peak, self.tried(peak, fit.z, c, 4).cost, fit, c, WORTH_MOVING))
 
     def neighbours(self, peak: _Peak) -> list[_Peak]:
         """Peaks in cells nearby, and at distances nearby."""
@@ -824,13 +899,22 @@ class _Problem:
 class Recovery:
     """Estimates what clipping took, frame by frame; keeps the lamps that it found."""
 
-    def __init__(self, surfaces: Surfaces, white: float, center: Sequence[float], *, rung: str = "shading") -> None:
+    def __init__(
+        self,
+        surfaces: Surfaces,
+        white: float,
+        center: Sequence[float],
+        *,
+        radius: float = 0.0,
+        rung: str = "shading",
+    ) -> None:
         """Prepare.
 
         Args:
             surfaces: From ``find_surfaces``.
             white: Reflectance of the card's paper.
             center: Centre of the ball, metres.
+            radius: Of the ball, metres: lamps are seen from its surface. 0: from its centre.
             rung: ``white_card`` or ``shading``.
 
         Raises:
@@ -839,7 +923,7 @@ class Recovery:
         if rung not in RUNGS[1:]:
             raise ValueError(f"recover: no rung {rung!r} to estimate; expected {' or '.join(RUNGS[1:])}")
         self.surfaces, self.rung = surfaces, rung
-        self._white, self._center = white, np.array(center, float)
+        self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[_Peak] = []
         self._frames = 0
         self._rested = 0
@@ -876,6 +960,7 @@ class Recovery:
         mirrored: NDArray[Any],
         observations: NDArray[Any],
         trace: Trace | None = None,
+        camera: Array | None = None,
     ) -> Estimate:
         """Estimate from one frame.
 
@@ -885,9 +970,10 @@ class Recovery:
             mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
             trace: Traces lamps at finite distances; None: all light is distant.
+            camera: Where the camera stands, metres, (3,); None: lamps are as seen from the ball's centre.
         """
         with _ONE_BLAS_THREAD:
-            return self._solve(cells, transfer, mirrored, observations, trace)
+            return self._solve(cells, transfer, mirrored, observations, trace, camera)
 
     def _solve(
         self,
@@ -896,9 +982,11 @@ class Recovery:
         mirrored: NDArray[Any],
         observations: NDArray[Any],
         trace: Trace | None,
+        camera: Array | None,
     ) -> Estimate:
         """``update``, by the thread that asks for it alone."""
-        problem = _Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, self._center)
+        origin = mirroring_points(cells["direction"].reshape(-1, 3).astype(float), self._center, self._radius, camera)
+        problem = _Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, origin)
         self._frames += 1
         means, bounds = problem.card_means()
         if self.rung == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
@@ -954,7 +1042,7 @@ class Recovery:
         lamps = []
         for peak, power in zip(problem.peaks, powers, strict=True):
             excess += problem.patch(peak.cell) * power
-            lamps.append(Lamp(problem.direction[peak.cell], peak.distance, power))
+            lamps.append(Lamp(problem.origin[peak.cell], problem.direction[peak.cell], peak.distance, power))
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
         return self._estimate(problem, excess, bounds, tuple(lamps))
 

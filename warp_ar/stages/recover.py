@@ -89,6 +89,7 @@ class Recover(Stage):
             "environment": ArraySpec(shape, wp.vec3),
             **{name: ArraySpec((recovery.PEAKS,), RoomLamp) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
+            "recover_lacking": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
             "recover_cells_now": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
@@ -109,14 +110,15 @@ class Recover(Stage):
         proxies = trace_config(scene).proxies
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
-        solver = recovery.Recovery(self._surfaces, scene.marker.white, scene.probes[0].center, rung=self.rung)
+        ball = scene.probes[0]
+        solver = recovery.Recovery(self._surfaces, scene.marker.white, ball.center, radius=ball.radius, rung=self.rung)
         self._progress = _Progress(solver)
         self._asks = self._arrives = self._news = False
         self._worker: ThreadPoolExecutor | None = None
         cells = arrays["recover_cells_now"]
         points = len(self._surfaces.points)
         arrays.add("recover_status", self.status)
-        equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations")
+        equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations", "params")
         effects = ("recover_excess", "recover_cells", *(name for name in self.wiring.writes if name == "lamps"))
         self._equations = HostCopies({name: arrays[name] for name in equations}, device)
         self._effects = HostCopies({name: arrays[name] for name in effects}, device)
@@ -126,11 +128,17 @@ class Recover(Stage):
         self._stream = None if device.is_cpu else wp.Stream(device)
         self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
+        def weigh(rows: Rows | None) -> None:
+            kernels.weigh_rims(
+                arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_lacking"], rows=rows
+            )
+
         def condense(rows: Rows | None) -> None:
             kernels.condense_cells(
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
                 arrays["environment_clipped"],
+                arrays["recover_lacking"],
                 arrays["probes"],
                 arrays["ray_scene"],
                 cells,
@@ -169,7 +177,7 @@ class Recover(Stage):
             kernels.add_excess(
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
-                arrays["environment_clipped"],
+                arrays["recover_lacking"],
                 arrays["recover_cells"],
                 arrays["recover_excess"],
                 arrays["environment"],
@@ -183,6 +191,7 @@ class Recover(Stage):
 
         passes = [
             Pass(self._take, on_host=True, due=lambda: self._arrives),
+            Pass(weigh, rows=height),
             Pass(condense, rows=cells.shape[0], due=lambda: self._asks),
             Pass(observe, rows=points, due=lambda: self._asks),
             Pass(transfer, rows=points, due=lambda: self._asks),
@@ -227,7 +236,12 @@ class Recover(Stage):
         if solver.rests(cells, sides["recover_observations"]):
             return None
         estimate = solver.update(
-            cells, sides["recover_transfer"], sides["recover_mirrored"], sides["recover_observations"], self._trace
+            cells,
+            sides["recover_transfer"],
+            sides["recover_mirrored"],
+            sides["recover_observations"],
+            self._trace,
+            sides["params"]["camera_position"][0].astype(float),
         )
         return _Solution(estimate, cells)
 
@@ -266,7 +280,8 @@ class Recover(Stage):
         if "lamps" in self.wiring.writes:
             records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
             for record, lamp in zip(records, solution.estimate.lamps, strict=False):
-                record["direction"], record["distance"], record["power"] = lamp.direction, lamp.distance, lamp.power
+                record["origin"], record["direction"] = lamp.origin, lamp.direction
+                record["distance"], record["power"] = lamp.distance, lamp.power
             values["lamps"] = records
         self._effects.send(values, self._frames_stream)
 
