@@ -34,6 +34,7 @@ from warp_ar.kernels.latlong import (
     direction_from_latlong,
     latlong_from_direction,
     sample_latlong,
+    sample_row,
     texel_solid_angle,
 )
 from warp_ar.kernels.launch import Rows, launch_rows
@@ -61,10 +62,10 @@ GRAZING = wp.constant(wp.float32(1.0e-3))
 """Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
 MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
 """Radians: balls of less than ten pixels are taken to have ten."""
-RIM_TAPS = wp.constant(5)
-"""Samples along each axis of a Gaussian, one standard deviation apart."""
-UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
-ASIDE = wp.constant(wp.vec3(1.0, 0.0, 0.0))
+RIM_REACH = wp.constant(2)
+"""Samples of a Gaussian to each side, one standard deviation apart."""
+NEAR_POLE = wp.constant(wp.float32(6.0))
+"""Standard deviations from a pole within which a Gaussian is taken around directions, not along rows and columns."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -115,6 +116,47 @@ def trust(confidence: wp.float32) -> wp.float32:
     return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
 
 
+@wp.func
+def mean_around(clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32) -> wp.vec3:
+    """Gaussian mean around a texel, of a standard deviation in radians."""
+    height = wp.float32(clipped.shape[0])
+    width = wp.float32(clipped.shape[1])
+    sine = wp.sin(PI * (wp.float32(i) + 0.5) / height)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    total_weight = wp.float32(0.0)
+    a = wp.int32(-RIM_REACH)
+    if sine < NEAR_POLE * deviation:
+        # A circle of latitude is no straight line here.
+        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
+        across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
+        upward = wp.cross(across, direction)
+        while a <= RIM_REACH:
+            b = wp.int32(-RIM_REACH)
+            while b <= RIM_REACH:
+                toward = direction + deviation * (wp.float32(a) * across + wp.float32(b) * upward)
+                weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
+                total += weight * sample_latlong(clipped, toward)
+                total_weight += weight
+                b += 1
+            a += 1
+        return total / total_weight
+    down_step = deviation * height / PI
+    across_step = deviation * width / (2.0 * PI * sine)
+    # One row of samples at a time, those unrolled: their loads do not wait for each other.
+    while a <= RIM_REACH:
+        y = wp.float32(i) + down_step * wp.float32(a)
+        row = wp.int32(wp.floor(y))
+        part = y - wp.floor(y)
+        for b in range(wp.static(-RIM_REACH), wp.static(RIM_REACH + 1)):
+            x = wp.float32(j) + across_step * wp.float32(b)
+            top = sample_row(clipped, row, x)
+            weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
+            total += weight * (top + part * (sample_row(clipped, row + 1, x) - top))
+            total_weight += weight
+        a += 1
+    return total / total_weight
+
+
 @wp.kernel(enable_backward=False)
 def weigh_rims_kernel(
     # In:
@@ -136,18 +178,7 @@ def weigh_rims_kernel(
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
     # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
-    across = wp.normalize(wp.cross(direction, wp.where(wp.abs(direction[2]) < 0.9, UP, ASIDE)))
-    upward = wp.cross(across, direction)
-    near = wp.vec3(0.0, 0.0, 0.0)
-    total = wp.float32(0.0)
-    for k in range(RIM_TAPS * RIM_TAPS):
-        a = wp.float32(k // RIM_TAPS - RIM_TAPS // 2)
-        b = wp.float32(k % RIM_TAPS - RIM_TAPS // 2)
-        weight = wp.exp(-0.5 * (a * a + b * b))
-        near += weight * sample_latlong(clipped, direction + half_pixel * (a * across + b * upward))
-        total += weight
-    near /= total
+    near = mean_around(clipped, i, j, half_pixel)
     lacking_out[i, j] = wp.cw_mul(share, wp.cw_mul(near, near))
 
 

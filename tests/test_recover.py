@@ -247,7 +247,15 @@ def test_rims_weigh_the_same_everywhere_on_the_sphere(device):
     height, pixels = 256, 20.0
     d, area = reference.cell_directions(height, 2 * height)
     shares = []
-    for toward in ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0.001, 0), (0.6, 0.5, 0.62)):
+    for toward in (
+        (0, 0, 1),
+        (0, 0, -1),
+        (1, 0, 0),
+        (-1, 0.001, 0),
+        (0.6, 0.5, 0.62),
+        (0.3, 0, 0.954),
+        (0, 0.15, -0.98),
+    ):
         toward = np.array(toward) / np.linalg.norm(toward)
         disc = (d @ toward > np.cos(0.12)).astype(float)
         got = weighed_rims(device, disc.reshape(height, -1, 1) * np.ones(3), pixels).reshape(-1, 3)[:, 0]
