@@ -178,8 +178,8 @@ def weigh_rims_kernel(
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
     # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    near = mean_around(clipped, i, j, half_pixel)
-    lacking_out[i, j] = wp.cw_mul(share, wp.cw_mul(near, near))
+    near = wp.max(mean_around(clipped, i, j, half_pixel))
+    lacking_out[i, j] = share * (near * near)
 
 
 def weigh_rims(
@@ -194,8 +194,9 @@ def weigh_rims(
 
     A pixel at a light's rim shows part of the light, and clips all the same if that is bright: what clips in the
     ball's picture is larger than the light by up to a pixel. A texel counts by the square of the mean share at clipping
-    around it, by a Gaussian of half a pixel's standard deviation: 1 inside of what is wide, a quarter at straight rims.
-    A lamp of a few pixels becomes as small as it is, and so do its shadows and highlights.
+    around it, in the channel that clips most, by a Gaussian of half a pixel's standard deviation: 1 inside of what is
+    wide, a quarter at straight rims. A lamp of a few pixels becomes as small as it is, and so do its shadows and
+    highlights.
 
     Args:
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).

@@ -98,8 +98,10 @@ MOST_CANDIDATES: Final = 160
 """Directions that are tried for a peak at first."""
 LATER_CANDIDATES: Final = 40
 """Directions that are tried in a later search, others each time."""
-DISTANCES: Final = np.array([2.0, 1.2, 0.8, 0.6, 0.45, 0.35, 0.26, 0.2])
+DISTANCES: Final = np.array([2.0, 1.2, 0.8, 0.6, 0.45, 0.35])
 """Metres from the ball that are tried for a lamp, beside infinity."""
+NEAREST: Final = 0.25
+"""Metres from the ball within which no lamp is looked for: it would stand in the picture, in front of the desk."""
 PEAK_ANGLE: Final = 0.12
 """Radians around a peak's direction that share its light."""
 LAMP_SHARE: Final = 0.06
@@ -874,7 +876,8 @@ class _Problem:
         close = np.flatnonzero((self.direction @ self.direction[peak.cell] > np.cos(0.2)) & self.may_hold_peak)
         found = [_Peak(int(cell), peak.distance) for cell in close]
         if np.isfinite(peak.distance):
-            found += [_Peak(peak.cell, peak.distance * factor) for factor in (0.83, 0.91, 1.1, 1.2)]
+            nearby = [peak.distance * factor for factor in (0.83, 0.91, 1.1, 1.2)]
+            found += [_Peak(peak.cell, distance) for distance in nearby if distance > NEAREST]
         return found
 
     def find_peaks(self, c: int, z: Array, most: int, *, candidates: int = MOST_CANDIDATES, turn: int = 0) -> Array:
