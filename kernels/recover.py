@@ -62,10 +62,12 @@ GRAZING = wp.constant(wp.float32(1.0e-3))
 """Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
 MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
 """Radians: balls of less than ten pixels are taken to have ten."""
+WIDE = wp.constant(wp.float32(6.0))
+"""Half pixels: what is wider clips hardly beyond its rim, for it is not so much brighter than clipping as a lamp is."""
+SHARPNESS = wp.constant(wp.float32(2.0))
+"""Exponent of the share around a texel of the smallest lamp."""
 RIM_REACH = wp.constant(2)
 """Samples of a Gaussian to each side, one standard deviation apart."""
-NEAR_POLE = wp.constant(wp.float32(6.0))
-"""Standard deviations from a pole within which a Gaussian is taken around directions, not along rows and columns."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -117,15 +119,20 @@ def trust(confidence: wp.float32) -> wp.float32:
 
 
 @wp.func
-def mean_around(clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32) -> wp.vec3:
-    """Gaussian mean around a texel, of a standard deviation in radians."""
+def mean_around(
+    clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32, near_pole: wp.float32
+) -> wp.vec3:
+    """Gaussian mean around a texel, of a standard deviation in radians.
+
+    ``near_pole`` standard deviations from a pole it is taken around directions, elsewhere along rows and columns.
+    """
     height = wp.float32(clipped.shape[0])
     width = wp.float32(clipped.shape[1])
     sine = wp.sin(PI * (wp.float32(i) + 0.5) / height)
     total = wp.vec3(0.0, 0.0, 0.0)
     total_weight = wp.float32(0.0)
     a = wp.int32(-RIM_REACH)
-    if sine < NEAR_POLE * deviation:
+    if sine < near_pole * deviation:
         # A circle of latitude is no straight line here.
         direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
         across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
@@ -167,7 +174,7 @@ def weigh_rims_kernel(
     # Out:
     lacking_out: wp.array2d[wp.vec3],
 ):
-    """A texel times the square of the mean around it."""
+    """A texel times a power of the mean around it."""
     i, j = wp.tid()
     i += row_start
     share = clipped[i, j]
@@ -178,8 +185,11 @@ def weigh_rims_kernel(
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
     # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    near = wp.max(mean_around(clipped, i, j, half_pixel))
-    lacking_out[i, j] = share * (near * near)
+    near = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
+    if near < 0.999:
+        wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
+        near = wp.pow(near, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
+    lacking_out[i, j] = share * near
 
 
 def weigh_rims(
@@ -193,10 +203,13 @@ def weigh_rims(
     """Weigh what clips by how likely it is the light itself: rims count less.
 
     A pixel at a light's rim shows part of the light, and clips all the same if that is bright: what clips in the
-    ball's picture is larger than the light by up to a pixel. A texel counts by the square of the mean share at clipping
-    around it, in the channel that clips most, by a Gaussian of half a pixel's standard deviation: 1 inside of what is
-    wide, a quarter at straight rims. A lamp of a few pixels becomes as small as it is, and so do its shadows and
-    highlights.
+    ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
+    in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
+
+        2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
+
+    A lamp of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep their rims (w
+    is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
 
     Args:
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).

@@ -232,15 +232,19 @@ def test_rims_count_less_and_the_inside_in_full(device):
     everywhere = np.ones((height, 2 * height, 3))
     assert weighed_rims(device, everywhere, pixels) == pytest.approx(1.0, abs=1e-5)
     assert not weighed_rims(device, 0.0 * everywhere, pixels).any()
-    # A hemisphere beyond a straight rim: the square of a Gaussian's integral, of half a pixel. Five taps are a little
-    # narrower than it.
+    # A hemisphere is as wide as can be: it keeps its rim.
     depth = np.arcsin(d @ np.array([0.6, 0.0, 0.8]))
     got = weighed_rims(device, (depth > 0.0)[..., None] * everywhere, pixels)[..., 0]
+    assert got[depth > 0.0].min() > 0.8
+    # A lamp of two pixels across: the integral of a Gaussian over a disc is 1 - exp(-(radius / deviation)^2 / 2) in its
+    # middle, for either deviation.
     half_pixel = 1.0 / pixels
-    for at, expected in ((0.25, 0.36), (1.0, 0.71), (2.0, 0.95)):
-        ring = np.abs(depth / half_pixel - at) < 0.25
-        assert got[ring].mean() == pytest.approx(expected, abs=0.04)
-    assert got[depth > 3.0 * half_pixel].min() > 0.999
+    away = np.arccos(np.clip(d @ np.array([0.6, 0.0, 0.8]), -1.0, 1.0)) / half_pixel
+    got = weighed_rims(device, (away < 2.0)[..., None] * everywhere, pixels)[..., 0]
+    near, wide = (1.0 - np.exp(-0.5 * (2.0 / deviation) ** 2) for deviation in (1.0, 6.0))
+    assert got[away < 0.3].mean() == pytest.approx(near ** (2.0 * (1.0 - 2.0 * wide)), abs=0.05)
+    assert got[np.abs(away - 1.8) < 0.2].mean() < 0.65 * got[away < 0.3].mean()
+    assert not got[away > 2.0].any()
 
 
 def test_rims_weigh_the_same_everywhere_on_the_sphere(device):
