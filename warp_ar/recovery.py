@@ -139,7 +139,7 @@ GRID: Final = 0.06
 """Metres between points on planes."""
 _NOISE: Final = np.array([0.02, 0.04, 0.12, 0.04])
 """Relative standard deviation of one equation, by kind, where points scatter so much or are too few to tell."""
-LEAST_NOISE: Final = 0.01
+LEAST_NOISE: Final = 0.015
 """The same of the most even surface: transport that the model leaves out."""
 SCATTER_POINTS: Final = 12
 """Points of a surface that tell how much they scatter."""
