@@ -187,6 +187,7 @@ def weigh_rims_kernel(
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
     near = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
     if near < 0.999:
+        # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
         wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
         near = wp.pow(near, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
     lacking_out[i, j] = share * near
