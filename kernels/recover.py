@@ -68,6 +68,8 @@ SHARPNESS = wp.constant(wp.float32(2.0))
 """Exponent of the share around a texel of the smallest lamp."""
 RIM_REACH = wp.constant(2)
 """Samples of a Gaussian to each side, one standard deviation apart."""
+MOST_LEFT = wp.constant(wp.float32(4.0))
+"""How much more light what still clips of a cell may get because less of it clips."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -364,8 +366,8 @@ def add_excess_kernel(
     more = excess[row, column]
     then = cells[row, column].lacking
     for c in range(3):
-        if now[c] > then[c]:
-            more[c] *= then[c] / now[c]
+        if now[c] > 0.0:
+            more[c] *= wp.min(then[c] / now[c], MOST_LEFT)
     for i in range(top, bottom):
         for j in range(left, right):
             share = lacking_share(confidence[i, j], lacking[i, j], unseen)
@@ -384,8 +386,9 @@ def add_excess(
 ) -> None:
     """Give texels back what they lost.
 
-    Where more of a cell clips than when its excess was found, the energy stays what was found: a thousandth that clips
-    can have a high excess, and in the next frame be half of the cell.
+    Where more or less of a cell clips than when its excess was found, the energy stays what was found: a thousandth
+    that clips can have a high excess, and in the next frame be half of the cell; a video codec takes the weakest
+    channel of a lamp across the limit and back. Below a quarter of the share the energy falls with it.
 
     Args:
         radiance: As captured and completed, ``wp.vec3`` (h, w).
