@@ -14,12 +14,14 @@ centre. ``--bundle`` writes one frame of each scene as ``truth/SCENE_NNNN.png``,
 (or the clipping that a shorter exposure undoes) change nothing: what ``warp_ar.tradeoff`` compares pictures with.
 
 Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly,
-and wants LLVM 16 or later (DRJIT_LIBLLVM_PATH names the library). Open Image Denoise takes off the last noise.
+and wants LLVM 19 (DRJIT_LIBLLVM_PATH names the library; 16 and 22 do not compile the scene ``torus``). Open Image
+Denoise takes off the last noise.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import pathlib
@@ -645,17 +647,97 @@ BUNDLED = {"desk": 24, "torus": 84, "mirror": 24, "wire_coincident": 36, "wire_o
 # ---- the virtual things of a scene file, for truth -----------------------------------------------
 
 
+def leaving_share(exponent: float, count: int = 512) -> np.ndarray:
+    """Share of a Phong lobe above the surface, by the cosine of the mirror direction, 0 to 1 in ``count`` steps.
+
+    The mean over the lobe's own cosine, cos = u^(1 / (n + 1)), of the share of that cone which lies above.
+    """
+    cosine = ((np.arange(4096) + 0.5) / 4096) ** (1 / (exponent + 1))
+    sine = np.sqrt(1 - cosine**2)
+    up = np.linspace(0, 1, count)[:, None]
+    # Around the mirror direction a ray rises to up * cosine + sqrt(1 - up^2) * sine * cos(turn).
+    lowest = -up * cosine / np.maximum(np.sqrt(1 - up**2) * sine, 1e-9)
+    return (np.arccos(np.clip(lowest, -1, 1)) / np.pi).mean(axis=1)
+
+
+@functools.cache
+def register_phong() -> str:
+    """Name of a BSDF that is ``warp_ar.kernels.materials``' Phong; Mitsuba has none.
+
+    Lambert's, beside a lobe of the radiance form: what is seen is the mean of what arrives, weighted by cos^n of the
+    angle to the mirror direction, over the part of the lobe that leaves the surface.
+    """
+    import drjit as dr
+
+    class Phong(mi.BSDF):  # type: ignore[misc]
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.diffuse, self.specular = (mi.Color3f(props[name]) for name in ("diffuse", "specular"))
+            self.exponent = props["exponent"]
+            self.leaving = mi.Float(leaving_share(self.exponent).astype(np.float32))
+            flags = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection
+            self.m_components = [flag | mi.BSDFFlags.FrontSide for flag in flags]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def lobe(self, si: Any, wo: Any) -> Any:
+            """Density of the lobe over directions that leave the surface; 0 below it."""
+            mirrored = mi.reflect(si.wi)
+            place = dr.maximum(mi.Frame3f.cos_theta(mirrored), 0) * (dr.width(self.leaving) - 1)
+            low = dr.minimum(mi.UInt32(place), dr.width(self.leaving) - 2)
+            below, above = (dr.gather(mi.Float, self.leaving, low + k) for k in (0, 1))
+            share = dr.lerp(below, above, place - low)
+            power = dr.power(dr.maximum(dr.dot(mirrored, wo), 0), self.exponent)
+            return dr.select(mi.Frame3f.cos_theta(wo) > 0, (self.exponent + 1) / (2 * dr.pi) * power / share, 0)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> Any:
+            scattered = mi.warp.square_to_cosine_hemisphere(sample2)
+            cosine = dr.power(sample2.x, 1 / (self.exponent + 1))
+            sine, turn = dr.safe_sqrt(1 - cosine * cosine), 2 * dr.pi * sample2.y
+            around = mi.Vector3f(sine * dr.cos(turn), sine * dr.sin(turn), cosine)
+            glossy = sample1 < 0.5
+            bs = mi.BSDFSample3f()
+            bs.wo = dr.select(glossy, mi.Frame3f(mi.reflect(si.wi)).to_world(around), scattered)
+            bs.pdf = self.pdf(ctx, si, bs.wo, active)
+            bs.eta = 1.0
+            bs.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
+            bs.sampled_type = dr.select(
+                glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            )
+            active &= bs.pdf > 0
+            return bs, dr.select(active, self.eval(ctx, si, bs.wo, active) / bs.pdf, 0)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            active &= (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+            value = self.diffuse * mi.warp.square_to_cosine_hemisphere_pdf(wo)
+            return dr.select(active, value + self.specular * self.lobe(si, wo), 0)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            active &= (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+            # Not divided by the share that leaves: rays into the surface are lost, and weighted so.
+            place = dr.dot(mi.reflect(si.wi), wo)
+            glossy = (self.exponent + 1) / (2 * dr.pi) * dr.power(dr.maximum(place, 0), self.exponent)
+            return dr.select(active, 0.5 * (glossy + mi.warp.square_to_cosine_hemisphere_pdf(wo)), 0)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self) -> str:
+            return f"Phong[exponent={self.exponent}]"
+
+    mi.register_bsdf("phong", Phong)
+    return "phong"
+
+
 def virtual_material(material: Dict) -> Dict:
     model = material["model"]
     if model == "metallic_roughness":
         return glossy(material["base_color"], material["roughness"], material["metallic"])
-    if model == "phong":  # Mitsuba 3 has none: a microfacet lobe as wide as cos^n, beside a diffuse one
-        diffuse, specular = np.array(material["diffuse"]), np.array(material["specular"])
-        share = float(np.clip(specular.max() / max(specular.max() + diffuse.max(), 1e-6), 1e-3, 1 - 1e-3))
-        alpha = float(np.sqrt(2 / (material["shininess"] + 2)))
-        lobe = {"type": "roughconductor", "material": "none", "alpha": alpha, "distribution": "ggx"}
-        lobe["specular_reflectance"] = rgb(specular / share)
-        return {"type": "blendbsdf", "weight": share, "a": matte(diffuse / (1 - share)), "b": lobe}
+    if model == "phong":
+        return {"type": register_phong()} | {
+            "diffuse": rgb(material["diffuse"]),
+            "specular": rgb(material["specular"]),
+            "exponent": float(material["shininess"]),
+        }
     return mirror(material["base_color"]) if model == "mirror" else matte(material["base_color"])
 
 
