@@ -7,6 +7,14 @@ being r = c + D d - x, it is
     E(x) = p (D / |r|)^2 max(n.r / |r|, 0)     and not, as the environment has it,     p max(n.d, 0).
 
 What is in the way is left out, as irradiance of the environment leaves it out.
+
+What mirrors shows the lamp along r as well. The environment is looked up there as if it were bent: for the direction w
+by the angle that turns u = r / |r| to d, times
+
+    (1 - s^4)^2,    s = |w - u| / max(REACH, 2.5 |d - u|) < 1,
+
+so that the lamp, and the glow around it, is seen once, at its place and undistorted, and what is farther from it stays.
+The factor keeps it one-to-one: (1 - s^4)^2 falls by no more than 2.2 per unit of s.
 """
 
 from __future__ import annotations
@@ -21,6 +29,10 @@ MAX_DISTANCE = wp.constant(wp.float32(100.0))
 """Metres from the ball beyond which a lamp is distant: E changes by less than 2 % over a metre."""
 MAX_GAIN = wp.constant(wp.float32(16.0))
 """Largest (D / |r|)^2: lamps have a size, and their distances an error."""
+REACH = wp.constant(wp.float32(0.2))
+"""Radians around a near lamp that turn with it, at least."""
+LEAST_TURN = wp.constant(wp.float32(1.0e-4))
+"""Radians that are not worth turning: the axis is known to some 1e-7 over that."""
 
 
 @wp.func
@@ -37,3 +49,22 @@ def add_nearness(irradiance: wp.vec3, lamps: wp.array[RoomLamp], point: wp.vec3,
             here = wp.min(gain * gain, MAX_GAIN) * wp.max(wp.dot(normal, to_lamp) / away, 0.0)
             result += (here - wp.max(wp.dot(normal, lamp.direction), 0.0)) * lamp.power
     return wp.max(result, wp.vec3(0.0, 0.0, 0.0))
+
+
+@wp.func
+def turn_to_lamps(lamps: wp.array[RoomLamp], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """Unit direction in which the environment shows what is seen from a point along a unit direction."""
+    turned = direction
+    for k in range(lamps.shape[0]):
+        lamp = lamps[k]
+        if lamp.distance > 0.0 and lamp.distance < MAX_DISTANCE:
+            to_lamp = wp.normalize(lamp.origin + lamp.distance * lamp.direction - point)
+            off = wp.length(lamp.direction - to_lamp)
+            s = wp.length(direction - to_lamp) / wp.max(REACH, 2.5 * off)
+            if s < 1.0 and off > LEAST_TURN:
+                weight = 1.0 - s * s * s * s
+                axis = wp.normalize(wp.cross(to_lamp, lamp.direction))
+                angle = 2.0 * weight * weight * wp.asin(wp.min(0.5 * off, 1.0))
+                along = wp.dot(axis, turned) * axis
+                turned = along + wp.cos(angle) * (turned - along) + wp.sin(angle) * wp.cross(axis, turned)
+    return wp.normalize(turned)

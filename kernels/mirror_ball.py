@@ -25,7 +25,7 @@ from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import Room, look_up_layer, make_find_in_frame
 from warp_ar.kernels.relight import Desk, RelightConfig, make_lit_by
-from warp_ar.kernels.shade import Nearby, ShadeConfig, make_sample_direction, make_shade_hit
+from warp_ar.kernels.shade import Nearby, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.visibility import (
@@ -34,6 +34,7 @@ from warp_ar.kernels.visibility import (
     TraceConfig,
     inside_rect,
     intersect_sphere,
+    make_sample_direction,
     make_trace,
     offset_origin,
 )

@@ -7,9 +7,11 @@ it (see ``reflect``), darkened by the objects' own shadows and brightened by vir
 what the distant room makes of it. So an object's underside sees the shadow that it stands in, not an empty desk.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
-sends one ray. A glossy lobe sends a few, another few from each pixel of a tile. What is near hides part of the lobe,
-and what it hides may be much darker than the rest: at the rim of a window that a desk cuts off, half of the rays meet
-the desk and hardly any of the light is gone. So every ray reads the environment as well. With the means over the rays
+sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
+read the environment as well, and the share is 1. A glossy lobe sends a few, another few from each pixel of a tile. What
+is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a desk
+cuts off, half of the rays meet the desk and hardly any of the light is gone. So every ray reads the environment as
+well. With the means over the rays
 
     s  share of the rays that meet something near,      N  their radiance, 0 for the others,
     B  the environment along all rays,                  M  the environment along those that meet nothing,
@@ -40,10 +42,18 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.lamps import turn_to_lamps
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
-from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_shade_unoccluded
+from warp_ar.kernels.reflect import (
+    Room,
+    RoomConfig,
+    look_up,
+    make_find_in_frame,
+    make_mirrored,
+    make_shade_unoccluded,
+)
 from warp_ar.kernels.room_samples import RoomSample, brightness, sample_toward, sobol_second
 from warp_ar.kernels.sampling import (
     frame_from_normal,
@@ -52,12 +62,20 @@ from warp_ar.kernels.sampling import (
     sample_phong_lobe,
 )
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, RayScene
-from warp_ar.kernels.visibility import FAR, Hit, inside_rect, make_trace, offset_origin
+from warp_ar.kernels.visibility import (
+    FAR,
+    Hit,
+    inside_rect,
+    make_primary,
+    make_sample_direction,
+    make_trace,
+    offset_origin,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 SHARP = wp.constant(wp.float32(0.02))
-"""Width alpha of a lobe below which it is a mirror: one ray, not averaged."""
+"""Width alpha of a lobe below which it is a mirror."""
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
 RAY_WIDTH = 2.0
@@ -76,6 +94,8 @@ class ObjectLightConfig:
     """Samples of the room per pixel, of each set."""
     lobe_count: int
     """Rays per pixel into a glossy lobe."""
+    mirror_samples: int
+    """Places within a pixel from which a mirror sends a ray, a square number."""
     side: int
     """Pixels along a tile."""
     ratio: bool
@@ -161,6 +181,9 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     look_near = make_look_near(config)
     surface_at = make_surface(config.room.models, config.room.textures)
+    distant_mirrored = make_mirrored(config.room)
+    closest_visible = make_primary(config.room.trace)
+    sample_direction = make_sample_direction(config.mirror_samples)
     side = config.side
     lobes = config.lobe_count
 
@@ -244,13 +267,45 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
             leaving = float(0.0)  # rays; those into the surface are part of its reflectance
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
-                count = wp.where(alpha < SHARP, 1, wp.static(lobes))
-                basis = frame_from_normal(normal)
-                center = reflect(wo, normal)
-                for k in range(count):
-                    outward = center
-                    width = alpha
-                    if alpha >= SHARP:
+                if alpha < SHARP:
+                    for k in range(wp.static(config.mirror_samples)):
+                        look = wp.normalize(sample_direction(params, ray, k))
+                        seen = closest_visible(scene, params[0].camera_position, look)
+                        if seen.shape == hit.shape:
+                            facing = wp.where(wp.dot(seen.geometric_normal, look) > 0.0, -1.0, 1.0)
+                            outer = facing * seen.geometric_normal
+                            outward = reflect(-look, seen.normal)
+                            if wp.dot(outward, outer) > 0.0:
+                                origin = offset_origin(seen.point, outer, outward, seen.error)
+                                near = look_near(
+                                    params[0],
+                                    frame,
+                                    decode_table,
+                                    physical_ratio,
+                                    physical_added,
+                                    scene,
+                                    room,
+                                    origin,
+                                    outward,
+                                    FAR,
+                                )
+                                if near[3] <= 0.0:
+                                    distant = distant_mirrored(
+                                        room,
+                                        surface.model,
+                                        surface.roughness,
+                                        surface.shininess,
+                                        seen.point,
+                                        outward,
+                                        0.0,
+                                    )
+                                    near = wp.vec4(distant[0], distant[1], distant[2], 1.0)
+                                leaving += 1.0
+                                mirrored += near
+                else:
+                    basis = frame_from_normal(normal)
+                    center = reflect(wo, normal)
+                    for k in range(wp.static(lobes)):
                         index = wp.uint32(set_index * wp.static(lobes) + k)
                         shift = wp.static(0.5 / (lobes * side * side))
                         u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
@@ -261,27 +316,29 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                             half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
                             outward = reflect(wo, half)
                             width = ggx_ray_width(wp.dot(half, normal), alpha)
-                    if wp.dot(outward, geometric) > 0.0:
-                        origin = offset_origin(hit.point, geometric, outward, hit.error)
-                        near = look_near(
-                            params[0],
-                            frame,
-                            decode_table,
-                            physical_ratio,
-                            physical_added,
-                            scene,
-                            room,
-                            origin,
-                            outward,
-                            FAR,
-                        )
-                        leaving += 1.0
-                        mirrored += near
-                        if alpha >= SHARP:
+                        if wp.dot(outward, geometric) > 0.0:
+                            origin = offset_origin(hit.point, geometric, outward, hit.error)
+                            near = look_near(
+                                params[0],
+                                frame,
+                                decode_table,
+                                physical_ratio,
+                                physical_added,
+                                scene,
+                                room,
+                                origin,
+                                outward,
+                                FAR,
+                            )
+                            leaving += 1.0
+                            mirrored += near
                             level = level_from_alpha(
                                 wp.static(RAY_WIDTH / (math.sqrt(lobes) * side)) * width, room.level_height
                             )
-                            distant = sample_levels(room.levels, outward, level, room.level_height)
+                            turned = outward
+                            if wp.static(config.room.lamps):
+                                turned = turn_to_lamps(room.lamps, hit.point, outward)
+                            distant = sample_levels(room.levels, turned, level, room.level_height)
                             missed = (1.0 - near[3]) * distant
                             passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
                 mirrored = mirrored / wp.max(leaving, 1.0)

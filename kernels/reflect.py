@@ -16,12 +16,13 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.irradiance import sh_irradiance
+from warp_ar.kernels.lamps import add_nearness, turn_to_lamps
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.probe import project
 from warp_ar.kernels.relight import meets_probe
-from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Probe, RayScene, RoomLamp
 from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -48,6 +49,8 @@ class RoomConfig:
     """Whether the prefiltered environment is read."""
     probes: bool
     """Whether there are mirror balls, which hide the desk."""
+    lamps: bool = False
+    """Whether lamps of the room are known by their places."""
 
 
 @wp.struct
@@ -61,6 +64,7 @@ class Room:
     level_height: wp.int32  # rows of level 0
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
+    lamps: wp.array[RoomLamp]
 
 
 @wp.func
@@ -144,6 +148,7 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
     """``shade_unoccluded(scene, room, hit, direction) -> vec3``: an object's radiance under the distant room alone."""
     surface_at = make_surface(config.models, config.textures)
     glossy = make_mirrored(config)
+    room_irradiance = make_room_irradiance(config)
 
     @wp.func(module="unique")
     def shade_unoccluded(scene: RayScene, room: Room, hit: Hit, direction: wp.vec3) -> wp.vec3:
@@ -154,13 +159,10 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
         surface = surface_at(
             scene, room.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
         )
-        radiance = wp.vec3(0.0)
-        if wp.static(config.diffuse == "sh"):
-            radiance += wp.cw_mul(surface.diffuse, sh_irradiance(room.irradiance_sh, normal)) / wp.pi
-        if wp.static(config.diffuse == "map"):
-            radiance += wp.cw_mul(surface.diffuse, sample_latlong(room.irradiance_map, normal)) / wp.pi
+        radiance = wp.cw_mul(surface.diffuse, room_irradiance(room, hit.point, normal)) / wp.pi
         if wp.static(config.specular):
-            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, reflect(wo, normal), 0.0)
+            outward = reflect(wo, normal)
+            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
             radiance += wp.cw_mul(surface.reflectance, mirrored)
         return radiance
 
@@ -168,10 +170,29 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
 
 
 @functools.cache
-def make_mirrored(config: RoomConfig) -> wp.Function:
-    """``mirrored(room, model, roughness, shininess, direction, floor) -> vec3``: the distant room as a lobe sees it.
+def make_room_irradiance(config: RoomConfig) -> wp.Function:
+    """``room_irradiance(room, point, normal) -> vec3``: of a surface under the room's light; 0 where none is known."""
 
-    ``floor`` is the least level to read: 0 for what is looked at, more for what is only one ray of many.
+    @wp.func(module="unique")
+    def room_irradiance(room: Room, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+        irradiance = wp.vec3(0.0)
+        if wp.static(config.diffuse == "sh"):
+            irradiance = sh_irradiance(room.irradiance_sh, normal)
+        if wp.static(config.diffuse == "map"):
+            irradiance = sample_latlong(room.irradiance_map, normal)
+        if wp.static(config.lamps and config.diffuse != "none"):
+            irradiance = add_nearness(irradiance, room.lamps, point, normal)
+        return irradiance
+
+    return room_irradiance
+
+
+@functools.cache
+def make_mirrored(config: RoomConfig) -> wp.Function:
+    """``mirrored(room, model, roughness, shininess, point, direction, floor) -> vec3``: the room as a lobe sees it.
+
+    The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
+    what is looked at, more for what is only one ray of many.
     """
 
     @wp.func(module="unique")
@@ -180,9 +201,13 @@ def make_mirrored(config: RoomConfig) -> wp.Function:
         model: wp.int32,
         roughness: wp.float32,
         shininess: wp.float32,
+        point: wp.vec3,
         direction: wp.vec3,
         floor: wp.float32,
     ) -> wp.vec3:
+        toward = direction
+        if wp.static(config.lamps):
+            toward = turn_to_lamps(room.lamps, point, direction)
         level = level_from_roughness(roughness, room.level_height)
         if wp.static(PHONG in config.models):
             if model == PHONG:
@@ -190,6 +215,6 @@ def make_mirrored(config: RoomConfig) -> wp.Function:
         if wp.static(MIRROR in config.models):
             if model == MIRROR:
                 level = 0.0
-        return sample_levels(room.levels, direction, wp.max(level, floor), room.level_height)
+        return sample_levels(room.levels, toward, wp.max(level, floor), room.level_height)
 
     return mirrored

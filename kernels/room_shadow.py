@@ -59,7 +59,15 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
-from warp_ar.kernels.reflect import Room, RoomConfig, look_up, make_find_in_frame, make_mirrored, make_shade_unoccluded
+from warp_ar.kernels.reflect import (
+    Room,
+    RoomConfig,
+    look_up,
+    make_find_in_frame,
+    make_mirrored,
+    make_room_irradiance,
+    make_shade_unoccluded,
+)
 from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
@@ -237,6 +245,7 @@ def make_estimated(config: RoomConfig) -> wp.Function:
     """
     surface_at = make_surface(config.models, config.textures)
     mirrored = make_mirrored(config)
+    room_irradiance = make_room_irradiance(config)
 
     @wp.func(module="unique")
     def estimated(
@@ -256,11 +265,7 @@ def make_estimated(config: RoomConfig) -> wp.Function:
         surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cosine)
         sent = Sent()
         if wp.static(config.diffuse != "none"):
-            irradiance = wp.vec3(0.0)
-            if wp.static(config.diffuse == "sh"):
-                irradiance = sh_irradiance(room.irradiance_sh, normal)
-            else:
-                irradiance = sample_latlong(room.irradiance_map, normal)
+            irradiance = room_irradiance(room, hit.point, normal)
             # A surface sees (1 - n.up) / 2 of what an even desk sends to one that faces it.
             desk = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_desk, irradiance)
             sent.desk = wp.cw_mul(surface.diffuse, desk) / wp.pi
@@ -270,7 +275,7 @@ def make_estimated(config: RoomConfig) -> wp.Function:
             floor = level_from_alpha(alpha, room.level_height)
             radiance = wp.cw_mul(
                 surface.reflectance,
-                mirrored(room, surface.model, surface.roughness, surface.shininess, outward, floor),
+                mirrored(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor),
             )
             share = wp.clamp(0.5 - 0.5 * wp.dot(outward, up) / CAUSTIC_ALPHA, 0.0, 1.0)
             sent.desk += share * radiance
@@ -297,6 +302,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
     find_in_frame = make_find_in_frame(config.trace, config.probes)
     shade_unoccluded = make_shade_unoccluded(config)
     mirrored = make_mirrored(config)
+    room_irradiance = make_room_irradiance(config)
 
     @wp.func(module="unique")
     def bounced(
@@ -357,23 +363,20 @@ def make_bounced(config: RoomConfig) -> wp.Function:
             else:
                 received = sample_latlong(room.environment, outward)
             if is_rough:
-                if wp.static(config.diffuse == "sh"):
-                    received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
-                if wp.static(config.diffuse == "map"):
-                    received = sample_latlong(room.irradiance_map, normal) / wp.pi
+                if wp.static(config.diffuse != "none"):
+                    received = room_irradiance(room, hit.point, normal) / wp.pi
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
             received = shade_unoccluded(scene, room, other, outward)
         elif is_rough:
-            if wp.static(config.diffuse == "sh"):
-                received = sh_irradiance(room.irradiance_sh, normal) / wp.pi
-            if wp.static(config.diffuse == "map"):
-                received = sample_latlong(room.irradiance_map, normal) / wp.pi
+            received = room_irradiance(room, hit.point, normal) / wp.pi
         else:
             if wp.static(config.specular):
                 floor = level_from_alpha(alpha, room.level_height)
-                received = mirrored(room, surface.model, surface.roughness, surface.shininess, outward, floor)
+                received = mirrored(
+                    room, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor
+                )
         return wp.cw_mul(weight, received)
 
     return bounced

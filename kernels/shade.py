@@ -21,14 +21,12 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
-from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, nearest_of_object
+from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance, nearest_of_object
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import Hit, inside_rect, make_primary
+from warp_ar.kernels.visibility import Hit, inside_rect, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 
@@ -83,6 +81,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
     forms = config.room
     surface_at = make_surface(forms.models, forms.textures)
     glossy = make_mirrored(forms)
+    room_irradiance = make_room_irradiance(forms)
     reflect_direct = make_reflect_direct(forms.models)
     sample_light = make_sample_light(config.lights)
     is_lit = make_shadow(forms.trace)
@@ -112,11 +111,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
 
         radiance = wp.vec3(0.0)
         if wp.static(forms.diffuse != "none"):
-            irradiance = wp.vec3(0.0)
-            if wp.static(forms.diffuse == "sh"):
-                irradiance = sh_irradiance(room.irradiance_sh, normal)
-            if wp.static(forms.diffuse == "map"):
-                irradiance = sample_latlong(room.irradiance_map, normal)
+            irradiance = room_irradiance(room, hit.point, normal)
             if wp.static(config.near):
                 if near.known:
                     irradiance = near.irradiance
@@ -124,7 +119,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if wp.static(forms.specular):
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 outward = reflect(wo, normal)
-                mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, outward, 0.0)
+                mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
                 if wp.static(config.near):
                     if near.known:
                         close = wp.vec3(near.mirrored[0], near.mirrored[1], near.mirrored[2])
@@ -169,29 +164,6 @@ def differs(
     if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
         return True
     return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
-
-
-@functools.cache
-def make_sample_direction(count: int) -> wp.Function:
-    """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
-
-    Args:
-        count: Samples of a pixel, a square number; the only one is at the centre.
-    """
-    side = math.isqrt(count)
-
-    @wp.func(module="unique")
-    def sample_direction(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32) -> wp.vec3:
-        inner = wp.vec3(ray[0], ray[1], 1.0)
-        if wp.static(side > 1):
-            n = wp.static(float(side))
-            a = wp.float32(sample % wp.static(side))
-            b = wp.float32(sample / wp.static(side))
-            inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
-            inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
-        return params[0].world_from_camera * inner
-
-    return sample_direction
 
 
 @functools.cache

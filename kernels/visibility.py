@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import warp as wp
@@ -463,6 +464,29 @@ def make_primary(config: TraceConfig) -> wp.Function:
         return hit
 
     return closest_visible
+
+
+@functools.cache
+def make_sample_direction(count: int) -> wp.Function:
+    """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.
+
+    Args:
+        count: Samples of a pixel, a square number; the only one is at the centre.
+    """
+    side = math.isqrt(count)
+
+    @wp.func(module="unique")
+    def sample_direction(params: wp.array[FrameParams], ray: wp.vec2, sample: wp.int32) -> wp.vec3:
+        inner = wp.vec3(ray[0], ray[1], 1.0)
+        if wp.static(side > 1):
+            n = wp.static(float(side))
+            a = wp.float32(sample % wp.static(side))
+            b = wp.float32(sample / wp.static(side))
+            inner[0] += ((a + (b + 0.5) / n) / n - 0.5) / params[0].focal[0]
+            inner[1] += ((b + (n - 0.5 - a) / n) / n - 0.5) / params[0].focal[1]
+        return params[0].world_from_camera * inner
+
+    return sample_direction
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels.lamps import MAX_GAIN, add_nearness
+from warp_ar.kernels.lamps import MAX_GAIN, REACH, add_nearness, turn_to_lamps
 from warp_ar.kernels.structs import RoomLamp
 
 CENTER = np.array([-0.12, 0.03, 0.035])
@@ -77,3 +77,77 @@ def test_bounded_and_never_negative(device):
     assert np.isfinite(got).all()
     assert got.max() == pytest.approx(MAX_GAIN, rel=FLOAT)
     assert (evaluate(device, (0.1, 0.1, 0.1), lamps, points[2:], [(0, 0, 1)]) == 0.0).all()
+
+
+@wp.kernel(enable_backward=False)
+def turn_kernel(
+    # In:
+    lamps: wp.array[RoomLamp],
+    points: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    # Out:
+    turned_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    turned_out[i] = turn_to_lamps(lamps, points[i], directions[i])
+
+
+def turn(device, lamps, point, directions):
+    records = np.zeros(len(lamps), np.dtype(RoomLamp.numpy_dtype()))
+    for record, (direction, distance) in zip(records, lamps, strict=True):
+        record["origin"], record["direction"], record["distance"] = CENTER, direction, distance
+    out = wp.zeros(len(directions), dtype=wp.vec3, device=device)
+    inputs = [wp.array(records, dtype=RoomLamp, device=device)]
+    inputs += [
+        wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in ([point] * len(directions), directions)
+    ]
+    wp.launch(turn_kernel, len(directions), inputs, [out], device=device)
+    return out.numpy().astype(float)
+
+
+def sphere_of_directions(count):
+    """Evenly over the sphere, Fibonacci's spiral."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    turn = np.pi * (1 + np.sqrt(5)) * k
+    return np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+
+
+LAMP, DISTANCE = np.array([0.48, 0.6, 0.64]), 0.5
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.3, -0.2, 0.1), (-0.2, -0.3, 0.02)])
+def test_a_lamp_is_seen_at_its_place_and_once(device, moved):
+    point = CENTER + moved
+    to_lamp = CENTER + DISTANCE * LAMP - point
+    to_lamp /= np.linalg.norm(to_lamp)
+    assert turn(device, [(LAMP, DISTANCE)], point, [to_lamp]) == pytest.approx(LAMP[None], abs=FLOAT)
+    directions = sphere_of_directions(20_000)
+    turned = turn(device, [(LAMP, DISTANCE)], point, directions)
+    assert np.linalg.norm(turned, axis=1) == pytest.approx(1.0, abs=FLOAT)
+    off = np.linalg.norm(LAMP - to_lamp)
+    far = np.linalg.norm(directions - to_lamp, axis=1) > max(REACH, 2.5 * off)
+    assert turned[far] == pytest.approx(directions[far], abs=FLOAT)
+    # Nowhere folded: two directions a degree apart keep their sense of rotation.
+    across = np.cross(directions, [0.36, 0.48, 0.8])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    up = np.cross(across, directions)
+    step = np.radians(1.0)
+    sides = [
+        turn(device, [(LAMP, DISTANCE)], point, np.cos(step) * directions + np.sin(step) * d) for d in (across, up)
+    ]
+    sense = (np.cross(sides[0] - turned, sides[1] - turned) * turned).sum(axis=1) / step**2
+    assert (-sense if sense.mean() < 0 else sense).min() > 0.02
+    # What is as far from the lamp as it is wide is as far from it afterwards: a lamp keeps its shape.
+    close = np.linalg.norm(directions - to_lamp, axis=1) < 0.06
+    assert close.any()
+    between = [
+        np.linalg.norm(d - middle, axis=1) for d, middle in ((turned[close], LAMP), (directions[close], to_lamp))
+    ]
+    assert between[0] == pytest.approx(between[1], rel=0.01)
+
+
+def test_distant_lamps_and_none_turn_nothing(device):
+    directions = sphere_of_directions(100)
+    lamps = [(LAMP, np.inf), ((0.0, 0.0, 0.0), 0.0)]
+    assert turn(device, lamps, CENTER + 0.5, directions) == pytest.approx(directions, abs=FLOAT)

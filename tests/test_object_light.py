@@ -1,4 +1,5 @@
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -35,6 +36,8 @@ def run(
     added=None,
     rows=None,
     environment=None,
+    samples=1,
+    room_shows=1.0,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = RoomConfig(
@@ -45,7 +48,7 @@ def run(
         bool(set(models) - {LAMBERT}),
         False,
     )
-    config = object_light.ObjectLightConfig(forms, COUNT, 4, SIDE, ratio is not None, added is not None)
+    config = object_light.ObjectLightConfig(forms, COUNT, 4, samples, SIDE, ratio is not None, added is not None)
     params = records(
         FrameParams,
         {
@@ -67,7 +70,7 @@ def run(
     coefficients = np.zeros((9, 3), np.float32)
     coefficients[0] = np.pi / 0.28209479
     room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
-    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
+    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(*3 * [room_shows]), dtype=wp.vec3)
     room.level_height = LEVEL_HEIGHT
     rays = wp.array(RAYS, dtype=wp.vec2)
     hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
@@ -145,26 +148,60 @@ def test_dark_desk_darkens_the_flanks_not_the_top(device):
 
 
 def test_mirror_shows_the_picture_of_the_desk(device):
-    # A mirror ball next to a chalk ball: rays that go down see the desk, others the room (share 0) or the other ball.
+    # A mirror ball next to a chalk ball: rays that go down see the desk, others a black room or the other ball.
     things = [sphere(BALL, RADIUS), sphere((0.14, 0.0, 0.06), RADIUS)]
     ratio = np.full((H, W, 3), 0.5, np.float32)
     added = np.full((H, W, 3), 0.25, np.float32)
-    _, plain, found, hits, _ = run(things, [CHROME, CHALK])
-    _, layered, _, _, _ = run(things, [CHROME, CHALK], ratio=ratio, added=added)
+    _, plain, found, hits, _ = run(things, [CHROME, CHALK], room_shows=0.0)
+    _, layered, _, _, _ = run(things, [CHROME, CHALK], ratio=ratio, added=added, room_shows=0.0)
     ball = found == 0
-    share = plain[..., 3]
-    assert set(np.unique(share[ball])) == {0.0, 1.0}
-    np.testing.assert_allclose(plain[ball & (share == 1), :3], 1, atol=1e-5)
-    changed = ball & (share == 1) & (np.abs(layered[..., 0] - 1) > 1e-6)
+    assert (plain[ball, 3] == 1).all(), "nothing is left to the prefiltered room"
+    near = plain[..., 0]
+    np.testing.assert_allclose(near[ball & (near > 0)], 1, atol=1e-5)
+    changed = ball & (near > 0) & (np.abs(layered[..., 0] - 1) > 1e-6)
     np.testing.assert_allclose(layered[changed, :3], 0.75, atol=1e-5)
     # Reflected straight up from the top; to the desk beyond 45 degrees of tilt.
     up = hits["normal"][..., 2]
-    assert (share[ball & (up > 0.95)] == 0).all()
+    assert (near[ball & (up > 0.95)] == 0).all()
     assert changed.sum() > 5
     # What stays 1 in spite of the layers is the chalk ball, unoccluded under a sky of 1.
-    chalk = ball & (share == 1) & ~changed
+    chalk = ball & (near > 0) & ~changed
     assert chalk.sum() >= 1
     assert POINTS[chalk][:, 0].mean() > 0
+
+
+def shown_by_a_mirror(offset):
+    """What a mirror ball in a black room shows of a white desk from one place of each pixel; NaN beside the ball."""
+    rays = np.stack([*(RAYS + np.array(offset) / 60).transpose(2, 0, 1), np.ones((H, W))], -1) @ LOOK_DOWN.T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    to_ball = CAMERA - np.array(BALL)
+    along = rays @ to_ball
+    within = along**2 - to_ball @ to_ball + RADIUS**2
+    points = CAMERA - (along + np.sqrt(np.maximum(within, 0)))[..., None] * rays
+    normals = (points - np.array(BALL)) / RADIUS
+    mirrored = rays - 2 * (rays * normals).sum(-1, keepdims=True) * normals
+    with np.errstate(divide="ignore", invalid="ignore"):
+        desk = points + (-points[..., 2] / mirrored[..., 2])[..., None] * mirrored
+    reach = CAMERA[2] * np.array([RAYS[..., 0].max(), RAYS[..., 1].max()])
+    # From above, the ball hides no desk that it mirrors: objects are not in the picture.
+    seen = (mirrored[..., 2] < 0) & (np.abs(desk[..., :2]) < reach).all(-1)
+    return np.where(within > 0, seen, np.nan)
+
+
+def test_mirror_is_the_mean_over_its_pixel(device):
+    """A hundred places of each pixel, the ball's own only: near its rim neighbouring pixels have nothing in common."""
+    places = (np.arange(10) + 0.5) / 10 - 0.5
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        expected = np.nanmean([shown_by_a_mirror((x, y)) for x in places for y in places], axis=0)
+    errors = {}
+    for samples in (1, 16):
+        _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, room_shows=0.0)
+        errors[samples] = np.abs(mirrored[..., 0] - expected)[found == 0]
+    assert len(errors[1]) > 50
+    # A place of sixteen or two on the wrong side of the desk's picture.
+    assert errors[16].max() < 0.2
+    assert errors[16].mean() < 0.25 * errors[1].mean()
 
 
 def test_glossy_share_is_between(device):
@@ -218,7 +255,7 @@ def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rec
     """Filter estimates as given, (h, w); object k has material k."""
     height, width = found.shape
     forms = RoomConfig(TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False)
-    config = object_light.ObjectLightConfig(forms, COUNT, 4, SIDE, False, False)
+    config = object_light.ObjectLightConfig(forms, COUNT, 4, 1, SIDE, False, False)
     scene = RayScene()
     scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
     scene.materials = records(Material, *[{"model": model, "base_texture": -1} for model in models])

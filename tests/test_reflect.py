@@ -1,4 +1,4 @@
-"""Where the camera's picture shows a point of the desk, and where it does not."""
+"""Where the camera's picture shows a point of the desk, and where it does not; near lamps in the room's light."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import pytest
 import warp as wp
 
 from tests.test_relight import H, W, records, shape
-from warp_ar.kernels.reflect import make_find_in_frame
-from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Probe, RayScene, Shape
+from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.reflect import Room, RoomConfig, make_find_in_frame, make_mirrored, make_room_irradiance
+from warp_ar.kernels.structs import BOX, LAMBERT, MIRROR, PLANE, FrameParams, Probe, RayScene, RoomLamp, Shape
 from warp_ar.kernels.visibility import TraceConfig
 
 FOCAL = 60.0
@@ -117,3 +118,62 @@ def test_outside_the_picture_and_behind_the_camera(device):
     found = find(points, [UP, UP, UP, DOWN, UP])
     assert (found[:, 0] >= 0).tolist() == [True, False, False, False, False]
     assert np.isfinite(found).all()
+
+
+LAMP_AT = np.array([0.3, 0.2, 0.5])
+LEVEL_HEIGHT = 16
+
+
+@functools.cache
+def make_room_kernel(lamps):
+    config = RoomConfig(TraceConfig((), ()), (LAMBERT, MIRROR), False, "sh", True, False, lamps)
+    mirrored, irradiance = make_mirrored(config), make_room_irradiance(config)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def room_kernel(
+        # In:
+        room: Room,
+        point: wp.vec3,
+        direction: wp.vec3,
+        # Out:
+        shown_out: wp.array[wp.vec3],
+    ):
+        shown_out[0] = mirrored(room, wp.static(MIRROR), 0.0, 0.0, point, direction, 0.0)
+        shown_out[1] = irradiance(room, point, direction)
+
+    return room_kernel
+
+
+def test_near_lamps_are_mirrored_and_light_from_where_they_are(device):
+    """A lamp of a texel in a dim room: seen from the ball in one direction, from beside it in another."""
+    direction = LAMP_AT / np.linalg.norm(LAMP_AT)
+    distance = float(np.linalg.norm(LAMP_AT))
+    power = 0.7
+    row = int(np.arccos(direction[2]) / np.pi * LEVEL_HEIGHT)
+    column = int((np.arctan2(direction[1], direction[0]) / np.pi + 1.0) * LEVEL_HEIGHT)
+    level = np.full((LEVEL_HEIGHT, 2 * LEVEL_HEIGHT, 3), 0.1, np.float32)
+    level[row, column] = 9.0
+    packed = np.full((lobe_texels(LEVEL_HEIGHT), 3), 0.1, np.float32)
+    packed[: 2 * LEVEL_HEIGHT**2] = level.reshape(-1, 3)
+    room = Room()
+    room.irradiance_sh = wp.zeros(9, wp.vec3)  # of which more than there is cannot be taken
+    room.levels, room.level_height = wp.array(packed, dtype=wp.vec3), LEVEL_HEIGHT
+    lamp = {"direction": direction, "distance": distance, "power": 3 * [power]}
+    room.lamps = records(RoomLamp, lamp)
+    aside = np.array([0.25, 0.2, 0.0])
+    there = (LAMP_AT - aside) / np.linalg.norm(LAMP_AT - aside)
+
+    def shown(lamps, point, toward):
+        out = wp.zeros(2, wp.vec3)
+        wp.launch(make_room_kernel(lamps), dim=1, inputs=[room, wp.vec3(*point), wp.vec3(*toward)], outputs=[out])
+        return out.numpy()[:, 0]
+
+    for known in (False, True):
+        assert shown(known, (0.0, 0.0, 0.0), direction)[0] > 1.0
+    # The middle of the texel that holds the lamp is up to half its diagonal away: a quarter of it is the least.
+    assert shown(False, aside, there)[0] == pytest.approx(0.1, abs=1e-5)
+    assert shown(True, aside, there)[0] == pytest.approx(shown(True, (0.0, 0.0, 0.0), direction)[0], rel=1e-3)
+    assert shown(True, aside, direction)[0] == pytest.approx(0.1, abs=1e-5)
+    gain = (distance / np.linalg.norm(LAMP_AT - aside)) ** 2 - direction @ there
+    assert shown(False, aside, there)[1] == 0.0
+    assert shown(True, aside, there)[1] == pytest.approx(power * gain, rel=1e-4)

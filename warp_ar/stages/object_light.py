@@ -19,6 +19,8 @@ COUNT = 32
 """Samples of the room per pixel."""
 LOBE_COUNT = 4
 """Rays per pixel into a glossy lobe."""
+MIRROR_SAMPLES = 4
+"""Rays per pixel of a mirror."""
 
 
 class ObjectLight(Stage):
@@ -61,7 +63,13 @@ class ObjectLight(Stage):
         layers = layer_names(self.request)
         forms = room_config(self.request)
         config = object_light.ObjectLightConfig(
-            forms, COUNT, LOBE_COUNT, SIDE, "physical_ratio" in layers, "physical_added" in layers
+            forms,
+            COUNT,
+            LOBE_COUNT,
+            MIRROR_SAMPLES,
+            SIDE,
+            "physical_ratio" in layers,
+            "physical_added" in layers,
         )
         object_light.make_object_light_kernel(config)
         object_light.make_filter_kernel(config)

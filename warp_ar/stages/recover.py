@@ -328,3 +328,9 @@ class Recover(Stage):
 def recovers(request: Request) -> bool:
     """Whether the quality asks for recovery."""
     return request.quality.rung("recover") not in ("default", "clipped")
+
+
+def knows_lamps(request: Request) -> bool:
+    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``RoomLamp``."""
+    wiring = Recover.wire(request)
+    return isinstance(wiring, Wiring) and "lamps" in wiring.writes

@@ -11,6 +11,7 @@ from warp_ar.kernels.reflect import Room, RoomConfig, RoomDiffuse
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
 from warp_ar.ray_scene import has_textures, material_model, reflects_diffusely, reflects_glossily, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, Request
+from warp_ar.stages.recover import knows_lamps
 
 # Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
 DFG_SIZE = 32
@@ -30,13 +31,15 @@ def room_config(request: Request) -> RoomConfig:
         diffuse=diffuse,
         specular=bool(scene.probes) and any(map(reflects_glossily, materials)),
         probes=bool(scene.probes),
+        lamps=knows_lamps(request),
     )
 
 
 def room_reads(config: RoomConfig) -> tuple[str, ...]:
     """Resources that hold the forms of a ``RoomConfig``."""
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
-    return (*diffuse, "specular_levels") if config.specular else diffuse
+    specular = ("specular_levels",) if config.specular else ()
+    return (*diffuse, *specular, *(("lamps",) if config.lamps and (diffuse or specular) else ()))
 
 
 def room_arrays(config: RoomConfig, stage: str) -> Mapping[str, ArraySpec]:
@@ -59,4 +62,6 @@ def make_room(config: RoomConfig, request: Request, arrays: Arrays, stage: str) 
         integrate_dfg(table)
         room.dfg = table
     room.probes = arrays["probes"]
+    if config.lamps:
+        room.lamps = arrays["lamps"]
     return room

@@ -15,7 +15,8 @@ from warp_ar.kernels.room_shadow import count_parts
 from warp_ar.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shares_room
-from warp_ar.stages.room_samples import SAMPLES, knows_lamps
+from warp_ar.stages.recover import knows_lamps
+from warp_ar.stages.room_samples import SAMPLES
 from warp_ar.stages.shade import casts_soft, sees_near
 from warp_ar.stages.visibility import GrowingRows
 

@@ -11,7 +11,7 @@ from warp_ar.kernels import pyramid, room_samples
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room, shares_room
-from warp_ar.stages.recover import Recover
+from warp_ar.stages.recover import knows_lamps
 from warp_ar.stages.reflect import room_config
 from warp_ar.stages.shade import sees_near
 
@@ -30,12 +30,6 @@ def sample_names(request: Request) -> tuple[str, str, str]:
     """Arrays that shadows read: directions, flux, samples."""
     listed = "room_samples_texel_directions", "room_samples_texel_flux", "room_samples_texels"
     return listed if lists_texels(request) else ("room_samples_directions", "room_samples_flux", "room_samples")
-
-
-def knows_lamps(request: Request) -> bool:
-    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``RoomLamp``."""
-    wiring = Recover.wire(request)
-    return isinstance(wiring, Wiring) and "lamps" in wiring.writes
 
 
 class RoomSamples(Stage):

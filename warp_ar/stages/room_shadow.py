@@ -12,8 +12,9 @@ import warp as wp
 from warp_ar.kernels import room_shadow
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shades_room
+from warp_ar.stages.recover import knows_lamps
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
-from warp_ar.stages.room_samples import REFERENCE_SIZE, knows_lamps, sample_names
+from warp_ar.stages.room_samples import REFERENCE_SIZE, sample_names
 from warp_ar.stages.visibility import GrowingRows
 
 
