@@ -44,7 +44,7 @@ import warp as wp
 
 from warp_ar.kernels.lamps import turn_to_lamps
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.materials import Surface, make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
     Room,
@@ -74,8 +74,9 @@ from warp_ar.kernels.visibility import (
 
 wp.set_module_options({"enable_backward": False})
 
-SHARP = wp.constant(wp.float32(0.02))
-"""Width alpha of a lobe below which it is a mirror."""
+SHARP_ALPHA = 0.02
+"""Width of a lobe below which it is a mirror."""
+SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
 RAY_WIDTH = 2.0
@@ -93,9 +94,9 @@ class ObjectLightConfig:
     count: int
     """Samples of the room per pixel, of each set."""
     lobe_count: int
-    """Rays per pixel into a glossy lobe."""
+    """Rays per pixel into a glossy lobe; 0 if no object has one."""
     mirror_samples: int
-    """Places within a pixel from which a mirror sends a ray, a square number."""
+    """Places within a pixel from which a mirror sends a ray, a square number; 0 if no object is one."""
     side: int
     """Pixels along a tile."""
     ratio: bool
@@ -177,13 +178,69 @@ def make_look_near(config: ObjectLightConfig) -> wp.Function:
 
 
 @functools.cache
+def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
+    """``mirror_pixel(...) -> vec4``: mean radiance that a mirror shows within a pixel, and 1; zero if no ray leaves it.
+
+    Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
+    """
+    look_near = make_look_near(config)
+    distant_mirrored = make_mirrored(config.room)
+    closest_visible = make_primary(config.room.trace)
+    sample_direction = make_sample_direction(config.mirror_samples)
+
+    @wp.func(module="unique")
+    def mirror_pixel(
+        params: wp.array[FrameParams],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        physical_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        room: Room,
+        surface: Surface,
+        shape: wp.int32,
+        ray: wp.vec2,
+    ) -> wp.vec4:
+        total = wp.vec4(0.0)
+        for k in range(wp.static(config.mirror_samples)):
+            direction = wp.normalize(sample_direction(params, ray, k))
+            seen = closest_visible(scene, params[0].camera_position, direction)
+            if seen.shape == shape:
+                geometric = seen.geometric_normal
+                if wp.dot(geometric, direction) > 0.0:
+                    geometric = -geometric
+                outward = reflect(-direction, seen.normal)
+                if wp.dot(outward, geometric) > 0.0:
+                    origin = offset_origin(seen.point, geometric, outward, seen.error)
+                    shown = look_near(
+                        params[0],
+                        frame,
+                        decode_table,
+                        physical_ratio,
+                        physical_added,
+                        scene,
+                        room,
+                        origin,
+                        outward,
+                        FAR,
+                    )
+                    if shown[3] <= 0.0:
+                        distant = distant_mirrored(
+                            room, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
+                        )
+                        shown = wp.vec4(distant[0], distant[1], distant[2], 1.0)
+                    total += shown
+        return total / wp.max(total[3], 1.0)
+
+    return mirror_pixel
+
+
+@functools.cache
 def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     look_near = make_look_near(config)
     surface_at = make_surface(config.room.models, config.room.textures)
-    distant_mirrored = make_mirrored(config.room)
-    closest_visible = make_primary(config.room.trace)
-    sample_direction = make_sample_direction(config.mirror_samples)
+    mirror_pixel = make_mirror_pixel(config) if config.mirror_samples > 0 else None
     side = config.side
     lobes = config.lobe_count
 
@@ -267,16 +324,38 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
             leaving = float(0.0)  # rays; those into the surface are part of its reflectance
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
-                if alpha < SHARP:
-                    for k in range(wp.static(config.mirror_samples)):
-                        look = wp.normalize(sample_direction(params, ray, k))
-                        seen = closest_visible(scene, params[0].camera_position, look)
-                        if seen.shape == hit.shape:
-                            facing = wp.where(wp.dot(seen.geometric_normal, look) > 0.0, -1.0, 1.0)
-                            outer = facing * seen.geometric_normal
-                            outward = reflect(-look, seen.normal)
-                            if wp.dot(outward, outer) > 0.0:
-                                origin = offset_origin(seen.point, outer, outward, seen.error)
+                if wp.static(config.mirror_samples > 0):
+                    if alpha < SHARP:
+                        mirrored = mirror_pixel(
+                            params,
+                            frame,
+                            decode_table,
+                            physical_ratio,
+                            physical_added,
+                            scene,
+                            room,
+                            surface,
+                            hit.shape,
+                            ray,
+                        )
+                        leaving = 1.0
+                if wp.static(lobes > 0):
+                    if alpha >= SHARP:
+                        basis = frame_from_normal(normal)
+                        center = reflect(wo, normal)
+                        for k in range(wp.static(lobes)):
+                            index = wp.uint32(set_index * wp.static(lobes) + k)
+                            shift = wp.static(0.5 / (max(lobes, 1) * side * side))
+                            u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
+                            if surface.model == PHONG:
+                                outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+                                width = phong_ray_width(wp.dot(outward, center), surface.shininess, alpha)
+                            else:
+                                half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
+                                outward = reflect(wo, half)
+                                width = ggx_ray_width(wp.dot(half, normal), alpha)
+                            if wp.dot(outward, geometric) > 0.0:
+                                origin = offset_origin(hit.point, geometric, outward, hit.error)
                                 near = look_near(
                                     params[0],
                                     frame,
@@ -289,58 +368,17 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                     outward,
                                     FAR,
                                 )
-                                if near[3] <= 0.0:
-                                    distant = distant_mirrored(
-                                        room,
-                                        surface.model,
-                                        surface.roughness,
-                                        surface.shininess,
-                                        seen.point,
-                                        outward,
-                                        0.0,
-                                    )
-                                    near = wp.vec4(distant[0], distant[1], distant[2], 1.0)
                                 leaving += 1.0
                                 mirrored += near
-                else:
-                    basis = frame_from_normal(normal)
-                    center = reflect(wo, normal)
-                    for k in range(wp.static(lobes)):
-                        index = wp.uint32(set_index * wp.static(lobes) + k)
-                        shift = wp.static(0.5 / (lobes * side * side))
-                        u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
-                        if surface.model == PHONG:
-                            outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
-                            width = phong_ray_width(wp.dot(outward, center), surface.shininess, alpha)
-                        else:
-                            half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
-                            outward = reflect(wo, half)
-                            width = ggx_ray_width(wp.dot(half, normal), alpha)
-                        if wp.dot(outward, geometric) > 0.0:
-                            origin = offset_origin(hit.point, geometric, outward, hit.error)
-                            near = look_near(
-                                params[0],
-                                frame,
-                                decode_table,
-                                physical_ratio,
-                                physical_added,
-                                scene,
-                                room,
-                                origin,
-                                outward,
-                                FAR,
-                            )
-                            leaving += 1.0
-                            mirrored += near
-                            level = level_from_alpha(
-                                wp.static(RAY_WIDTH / (math.sqrt(lobes) * side)) * width, room.level_height
-                            )
-                            turned = outward
-                            if wp.static(config.room.lamps):
-                                turned = turn_to_lamps(room.lamps, hit.point, outward)
-                            distant = sample_levels(room.levels, turned, level, room.level_height)
-                            missed = (1.0 - near[3]) * distant
-                            passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
+                                level = level_from_alpha(
+                                    wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width, room.level_height
+                                )
+                                turned = outward
+                                if wp.static(config.room.lamps):
+                                    turned = turn_to_lamps(room.lamps, hit.point, outward)
+                                distant = sample_levels(room.levels, turned, level, room.level_height)
+                                missed = (1.0 - near[3]) * distant
+                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
                 mirrored = mirrored / wp.max(leaving, 1.0)
                 passed = passed / wp.max(leaving, 1.0)
             mirrored_out[i, j] = mirrored

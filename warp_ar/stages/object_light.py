@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels import object_light
+from warp_ar.ray_scene import reflects_glossily
+from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
@@ -21,6 +24,16 @@ LOBE_COUNT = 4
 """Rays per pixel into a glossy lobe."""
 MIRROR_SAMPLES = 4
 """Rays per pixel of a mirror."""
+
+
+def lobe_width(material: Material) -> float:
+    """Width alpha of what a material mirrors, as ``kernels.object_light`` has it."""
+    match material:
+        case MetallicRoughnessMaterial():
+            return material.roughness**2
+        case PhongMaterial():
+            return 1.0 / math.sqrt(max(material.shininess, 1.0))
+    return 0.0
 
 
 class ObjectLight(Stage):
@@ -62,11 +75,15 @@ class ObjectLight(Stage):
         """Estimates, then their mean."""
         layers = layer_names(self.request)
         forms = room_config(self.request)
+        widths = [
+            lobe_width(thing.material) for thing in self.request.scene.objects if reflects_glossily(thing.material)
+        ]
+        sharp = [width < object_light.SHARP_ALPHA for width in widths]
         config = object_light.ObjectLightConfig(
             forms,
             COUNT,
-            LOBE_COUNT,
-            MIRROR_SAMPLES,
+            0 if all(sharp) else LOBE_COUNT,
+            MIRROR_SAMPLES if any(sharp) else 0,
             SIDE,
             "physical_ratio" in layers,
             "physical_added" in layers,
