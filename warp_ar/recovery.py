@@ -83,7 +83,10 @@ EVIDENCE: Final = 7.0
 BETTER: Final = 0.1
 """Fall of the cost for which a peak that is being added goes to a neighbouring place."""
 WORTH_MOVING: Final = 1.0
-"""The same for a peak that was known before: lamps stand still, and what differs from view to view is noise."""
+"""The same for a peak that was known before: lamps stand still, and what differs from view to view is noise.
+
+With ``BETTER``, a lamp of ``torus`` wanders to where another comes on, a quarter of a metre from the ball.
+"""
 PEAKS: Final = 4
 """Most peaks at a time."""
 SEARCH_EVERY: Final = 2
