@@ -4,6 +4,7 @@ The real desk is known twice: as part of the environment, seen from the mirror b
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
+Lamps of the room that are known by their places are seen, and light objects, from there (see ``lamps``).
 """
 
 from __future__ import annotations
