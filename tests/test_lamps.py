@@ -138,7 +138,8 @@ def test_a_lamp_is_seen_at_its_place_and_once(device, moved):
     ]
     sense = (np.cross(sides[0] - turned, sides[1] - turned) * turned).sum(axis=1) / step**2
     assert (-sense if sense.mean() < 0 else sense).min() > 0.02
-    # What is as far from the lamp as it is wide is as far from it afterwards: a lamp keeps its shape.
+    # What is as far from the lamp as it is wide is as far from it afterwards: a lamp keeps its shape. At s = 0.3 the
+    # angle is 1.6 % less than in its middle, over a chord that is at most four tenths of the reach.
     close = np.linalg.norm(directions - to_lamp, axis=1) < 0.06
     assert close.any()
     between = [

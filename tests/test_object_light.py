@@ -48,7 +48,9 @@ def run(
         bool(set(models) - {LAMBERT}),
         False,
     )
-    config = object_light.ObjectLightConfig(forms, COUNT, 4, samples, SIDE, ratio is not None, added is not None)
+    # As the stage has it: what no material needs is not compiled.
+    lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
+    config = object_light.ObjectLightConfig(forms, COUNT, lobes, samples, SIDE, ratio is not None, added is not None)
     params = records(
         FrameParams,
         {
