@@ -64,7 +64,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
 from warp_ar.kernels.pyramid import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
@@ -166,7 +166,7 @@ def sh_irradiance(irradiance_sh: wp.array[wp.vec3], normal: wp.vec3) -> wp.vec3:
     return wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_columns_kernel(
     # In:
     environment: wp.array2d[wp.vec3],
@@ -184,7 +184,7 @@ def sum_columns_kernel(
         row_sums_out[i, k] = sums[0]
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_rows_kernel(
     # In:
     row_sums: wp.array2d[wp.vec3],
@@ -434,7 +434,7 @@ def cluster_cosine(cluster: Cluster, normal: wp.vec3) -> wp.float32:
     return reach * reach / (4.0 * half_width)
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_clusters_kernel(
     row_start: wp.int32,
     # In:

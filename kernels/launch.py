@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -52,9 +52,17 @@ def launch_rows(
         wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
 
 
-# Warp's CPU tiles take their memory from one arena per module, which nothing guards: two threads in one tile kernel
-# overrun it (seen with 1.19: an assertion in tile.h, or a crash).
+# On CPU a module's tiles lie on the stack of the kernel that began last, for there is one pointer to them per module:
+# two threads in kernels of that module, with tiles or without, take each other's (seen with 1.19 on x86-64: crashes).
 _CPU_TILES = threading.Lock()
+
+
+def tile_kernel(function: Callable[..., None]) -> Any:
+    """Declare a kernel that uses tiles: in a module of its own, where no other kernel moves them.
+
+    It may be launched by ``launch_tiles`` only, which sees to it that it does not meet itself.
+    """
+    return wp.kernel(function, enable_backward=False, module="unique")
 
 
 def launch_tiles(
@@ -69,7 +77,7 @@ def launch_tiles(
     """Launch a kernel whose blocks work together, one block per element of ``dim``; on CPU never two at a time.
 
     Args:
-        kernel: Kernel that uses tiles.
+        kernel: Declared by ``tile_kernel``, or without tiles.
         dim: Blocks along each axis.
         inputs: Arguments before the outputs.
         outputs: Arrays that the kernel writes.

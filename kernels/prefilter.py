@@ -64,7 +64,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels.latlong import latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles
+from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
 from warp_ar.kernels.pyramid import level_count, safe_radiance, sample_packed, sample_packed_smooth
 from warp_ar.kernels.sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
 
@@ -504,7 +504,7 @@ def locate_row(row: wp.int32, height: wp.int32) -> wp.vec4i:
     return wp.vec4i(level, row - first, offset + (row - first) * (2 * height >> wp.max(level - 2, 0)), 0)
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_level_rows_kernel(
     # In:
     levels: wp.array[wp.vec3],
@@ -525,7 +525,7 @@ def sum_level_rows_kernel(
         row_energy_out[row] = sums[0] * texel_solid_angle(at[1], h, w)
 
 
-@wp.kernel(enable_backward=False)
+@tile_kernel
 def sum_levels_kernel(
     # In:
     row_energy: wp.array[wp.vec3],

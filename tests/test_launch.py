@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import itertools
+import pkgutil
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import warp as wp
 
+import warp_ar.kernels
 from warp_ar.kernels import irradiance
 from warp_ar.kernels.launch import launch_rows
 
@@ -47,3 +53,54 @@ def test_tiles_from_several_threads() -> None:
                 )
             )
             np.testing.assert_array_equal(actual.numpy(), expected.numpy())
+
+
+BESIDE = """
+import faulthandler
+import itertools
+import threading
+import numpy as np
+import warp as wp
+from warp_ar.device import start_warp
+from warp_ar.kernels import irradiance
+
+faulthandler.enable()
+start_warp()
+environment = wp.array(np.random.default_rng(1).random((16, 32, 3), np.float32), dtype=wp.vec3, device="cpu")
+clusters, others = (wp.zeros(8 * 16, dtype=irradiance.Cluster, device="cpu") for _ in range(2))
+irradiance.gather_clusters(environment, (8, 16), clusters)
+expected, actual = (wp.zeros((64, 64), dtype=wp.vec3, device="cpu") for _ in range(2))
+irradiance.sum_clusters(clusters, expected)
+done = threading.Event()
+
+def gather():
+    while not done.is_set():
+        irradiance.gather_clusters(environment, (8, 16), others)
+
+beside = threading.Thread(target=gather)
+beside.start()
+try:
+    for _ in range(2000):
+        actual.zero_()
+        irradiance.sum_clusters(clusters, actual)
+        np.testing.assert_array_equal(actual.numpy(), expected.numpy())
+finally:
+    done.set()
+    beside.join()
+"""
+
+
+def test_tiles_beside_other_kernels() -> None:
+    """Were both in one module, the other's launches would move the tiles: that crashes within a few hundred rounds."""
+    done = subprocess.run([sys.executable, "-c", BESIDE], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_kernels_with_tiles_have_modules_of_their_own() -> None:
+    found = []
+    for module in pkgutil.iter_modules(warp_ar.kernels.__path__, "warp_ar.kernels."):
+        for thing in vars(importlib.import_module(module.name)).values():
+            if isinstance(thing, wp.Kernel) and "wp.tile" in inspect.getsource(thing.func):
+                found.append(thing.key)
+                assert list(thing.module.kernels) == [thing.key], f"{thing.key}: declare it with tile_kernel"
+    assert "sum_clusters_kernel" in found

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import dataclasses
+import faulthandler
 import itertools
 import json
 import os
@@ -381,4 +382,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    faulthandler.enable()  # should native code crash, the report says what it was at
     sys.exit(main())
