@@ -334,7 +334,8 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
         if inside_rect(i, j, params[0].light_rect):
             hit = seen_desk(params[0], rays, scene, desk, i, j)
             if hit.shape >= 0:
-                added = lit_by(scene, lights, desk, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                lit = lit_by(scene, lights, desk, hit, i, j, wp.vec3(), tile_turn(ci, cj))
+                added = lit.added
                 if added[0] + added[1] + added[2] > 0.0:
                     ray = rays[i, j]
                     # A pixel's solid angle is cos^3 / (fx fy), the distance to its point t / cos.

@@ -158,8 +158,8 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
                 if at[0] >= 0.0:
                     change += wp.cw_mul(seen, look_up_layer(physical_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
             if wp.static(config.relight is not None):
-                added = lit_by(scene, lights, desk, surface, i, j, rho, tile_turn(i, j))
-                change += wp.cw_mul(rho, added)
+                lit = lit_by(scene, lights, desk, surface, i, j, rho, tile_turn(i, j))
+                change += wp.cw_mul(rho, lit.added)
         mirrored_out[i, j] = change / wp.static(float(config.samples))
 
     return mirror_ball_kernel

@@ -49,6 +49,10 @@ the irradiance by virtual light that lit proxies send to each other is added to 
 Where the room is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key light's
 dominance.
 
+Edges. A lamp without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
+lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
+along outlines; what the camera's pixel says of the desk holds for all of them.
+
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
 """
@@ -67,10 +71,20 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.lamps import add_nearness
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.shadow import make_shadow, make_visible_share, sample_light, tile_turn
+from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, inside_rect, intersect_sphere, make_trace, surface_key
+from warp_ar.kernels.visibility import (
+    FAR,
+    Hit,
+    TraceConfig,
+    check_edge_samples,
+    inside_rect,
+    intersect_sphere,
+    make_sample_direction,
+    make_trace,
+    surface_key,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,6 +103,11 @@ SURROUNDINGS = 1.0 / 8.0
 """Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a lamp's falloff."""
 _HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
+_NOTHING = wp.constant(-1)
+_BALL = wp.constant(-2)
+_LIT = wp.constant(1 << 24)
+_MASKED = 24
+"""Lights whose shadows are told apart."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,10 +130,13 @@ class RelightConfig:
     """Whether ``reflectance`` knows which part of the room's light reaches a point."""
     bounced: bool = False
     """Whether light that lit proxies send to each other is known."""
+    edge_samples: int = 1
+    """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
 
     def __post_init__(self) -> None:
         if self.rung not in RUNGS:
             raise ValueError(f"rung: {self.rung!r} is none of {', '.join(RUNGS)}")
+        check_edge_samples(self.edge_samples)
 
 
 @wp.func
@@ -203,6 +225,14 @@ class Desk:
     irradiance_map: wp.array2d[wp.vec3]
     lamps: wp.array[RoomLamp]
     cells: DeskCells
+
+
+@wp.struct
+class Lit:
+    """What virtual light does at a point of the desk."""
+
+    added: wp.vec3  # radiance
+    hidden: wp.int32  # bits of lights without penumbra that something stands before
 
 
 @wp.struct
@@ -351,7 +381,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 
 @functools.cache
 def make_lit_by(config: RelightConfig) -> wp.Function:
-    """``lit_by(scene, lights, desk, hit, row, col, mirror, turn) -> vec3``: radiance that virtual light adds at a hit.
+    """``lit_by(scene, lights, desk, hit, row, col, mirror, turn) -> Lit``: what virtual light does at a hit.
 
     The pixel (row, col) shows the hit: straight where ``mirror`` is zero, else as a mirror ball of that reflectance has
     it, which says nothing about the hit's surroundings. ``turn`` is for ``visible_share``.
@@ -371,7 +401,8 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
         col: wp.int32,
         mirror: wp.vec3,
         turn: wp.float32,
-    ) -> wp.vec3:
+    ) -> Lit:
+        result = Lit()
         known = bool(False)  # what the desk is, found only once some light falls here
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
@@ -381,16 +412,21 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
             n_dot_l = wp.max(wp.dot(hit.normal, light.wi), 0.0)
             if wp.dot(hit.geometric_normal, light.wi) <= 0.0 or wp.max(light.irradiance_normal) <= 0.0:
                 continue
+            bit = 1 << (index % wp.static(_MASKED))
             visible = float(1.0)
             if wp.static(config.soft):
                 visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
                 if visible <= 0.0:
+                    if not has_penumbra(lights[index], light):
+                        result.hidden |= bit
                     continue
             else:
                 if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                    result.hidden |= bit
                     continue
             if wp.static(config.probes):
                 if meets_probe(desk.probes, hit.point, light.wi, light.distance):
+                    result.hidden |= bit
                     continue
             response = n_dot_l
             if wp.static(rung != "flat"):
@@ -416,7 +452,8 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
                     if not known:
                         matter = find_matter(scene, desk, hit, row, col, mirror)
                     added += wp.vec3(bounced[0], bounced[1], bounced[2])
-        return wp.cw_mul(matter.kd, added) * _INV_PI
+        result.added = wp.cw_mul(matter.kd, added) * _INV_PI
+        return result
 
     return lit_by
 
@@ -438,14 +475,16 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         desk: Desk,
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
+        seen_out: wp.array2d[wp.vec2i],
     ):
         i, j = wp.tid()
         i += row_start
         black = wp.vec3(0.0, 0.0, 0.0)
         physical_added_out[i, j] = black
-        rect = params[0].light_rect
-        if i < rect[0] or i >= rect[1] or j < rect[2] or j >= rect[3]:
+        if not inside_rect(i, j, params[0].light_rect):
             return
+        if wp.static(config.edge_samples > 1):
+            seen_out[i, j] = wp.vec2i(_NOTHING, 0)
         if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
                 cells = desk.cells
@@ -460,10 +499,85 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
             return
         if wp.static(config.probes):
             if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
+                if wp.static(config.edge_samples > 1):
+                    seen_out[i, j] = wp.vec2i(_BALL, 0)
                 return
-        physical_added_out[i, j] = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
+        lit = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
+        physical_added_out[i, j] = lit.added
+        if wp.static(config.edge_samples > 1):
+            surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+            seen_out[i, j] = wp.vec2i(surface, lit.hidden + wp.where(wp.max(lit.added) > 0.0, _LIT, 0))
 
     return relight_kernel
+
+
+@wp.func
+def is_edge(seen: wp.array2d[wp.vec2i], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
+    """Whether virtual light may change within a pixel, or between it and the next one.
+
+    Balls have light of their own, which ``mirror_ball`` adds.
+    """
+    here = seen[row, column]
+    if here[0] == _BALL:
+        return False
+    for k in range(4):
+        i = row + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
+        j = column + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
+        if inside_rect(i, j, rect):
+            there = seen[i, j]
+            if there[0] != _BALL:
+                # Bits of lights that only one of them sees, and whether anything is seen at all.
+                if ((here[1] ^ there[1]) & (_LIT - 1)) != 0:
+                    return True
+                if here[0] != there[0] and ((here[1] | there[1]) & _LIT) != 0:
+                    return True
+    return False
+
+
+@functools.cache
+def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel of ``smooth_edges``, specialised to ``config``."""
+    closest_proxy = make_trace(config.trace).closest_proxy
+    lit_by = make_lit_by(config)
+    sample_direction = make_sample_direction(config.edge_samples)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def smooth_edges_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        seen: wp.array2d[wp.vec2i],
+        # Out:
+        physical_added_out: wp.array2d[wp.vec3],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        rect = params[0].light_rect
+        if not inside_rect(i, j, rect):
+            return
+        if not is_edge(seen, rect, i, j):
+            return
+        black = wp.vec3(0.0, 0.0, 0.0)
+        total = wp.vec3()
+        count = float(0.0)
+        for k in range(wp.static(config.edge_samples)):
+            direction = sample_direction(params, rays[i, j], k)
+            hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+            if wp.static(config.probes):
+                if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
+                    continue
+            count += 1.0
+            if hit.shape >= 0 and wp.dot(hit.geometric_normal, direction) < 0.0:
+                lit = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
+                total += lit.added
+        if count > 0.0:
+            physical_added_out[i, j] = total / count
+
+    return smooth_edges_kernel
 
 
 def surroundings_size(height: int) -> int:
@@ -508,12 +622,15 @@ def relight(
     key_lights: wp.array | None,
     irradiance: wp.array | None,
     physical_added_out: wp.array,
+    seen_out: wp.array | None = None,
     *,
     lamps: wp.array | None = None,
     cells: DeskCells | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the desk; zero outside ``params[0].light_rect``.
+
+    One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
 
     Args:
         config: Rung and kinds of shape.
@@ -529,6 +646,8 @@ def relight(
         irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
             ``reflectance``.
         physical_added_out: (H, W) vec3, linear radiance in camera values.
+        seen_out: (H, W) vec2i, which surface a pixel sees and which lights do not; needed if ``config.edge_samples``
+            is more than 1. Only what lies in ``light_rect`` is written.
         lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
         cells: From ``desk_cells``; needed if ``config.share`` or ``config.bounced``.
         rows: Band of rows; None means all.
@@ -538,7 +657,42 @@ def relight(
         make_relight_kernel(config),
         frame.shape,
         [params, rays, scene, lights, desk],
-        [physical_added_out],
+        [physical_added_out, seen_out],
         rows=rows,
         device=frame.device,
+    )
+
+
+def smooth_edges(
+    config: RelightConfig,
+    params: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    lights: wp.array,
+    desk: Desk,
+    seen: wp.array,
+    physical_added_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Average ``config.edge_samples`` samples in pixels along the edges of shadows and of lit proxies.
+
+    Args:
+        config: As that of ``relight``, and so are all arguments that are not named here.
+        params: Likewise.
+        rays: Likewise.
+        scene: Likewise.
+        lights: Likewise.
+        desk: Of ``make_desk``.
+        seen: (H, W) vec2i as ``relight`` writes.
+        physical_added_out: (H, W) vec3 as ``relight`` writes; changed along edges.
+        rows: Band of rows; None means all.
+    """
+    launch_rows(
+        make_smooth_edges_kernel(config),
+        rays.shape,
+        [params, rays, scene, lights, desk, seen],
+        [physical_added_out],
+        rows=rows,
+        device=rays.device,
     )

@@ -26,7 +26,7 @@ from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance, nearest_of_object
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import Hit, inside_rect, make_primary, make_sample_direction
+from warp_ar.kernels.visibility import Hit, check_edge_samples, inside_rect, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,8 +59,7 @@ class ShadeConfig:
     """Whether ``object_light`` says what surrounds the objects at close range."""
 
     def __post_init__(self) -> None:
-        if self.edge_samples < 1 or math.isqrt(self.edge_samples) ** 2 != self.edge_samples:
-            raise ValueError(f"edge_samples is {self.edge_samples}; expected a square number such as 1, 4 or 16")
+        check_edge_samples(self.edge_samples)
 
 
 @wp.struct

@@ -118,6 +118,12 @@ def make_shadow(config: TraceConfig) -> wp.Function:
     return is_lit
 
 
+@wp.func
+def has_penumbra(light: Light, sample: LightSample) -> wp.bool:
+    """Whether a light is seen in part from around the point of a sample."""
+    return light.radius > 0.0 and light.kind != DIRECTIONAL and sample.distance > light.radius
+
+
 @functools.cache
 def make_visible_share(config: TraceConfig) -> wp.Function:
     """``visible_share(scene, point, geometric_normal, error, light, sample, turn) -> float32``: 0 hidden .. 1 seen.
@@ -140,7 +146,7 @@ def make_visible_share(config: TraceConfig) -> wp.Function:
         sample: LightSample,
         turn: wp.float32,
     ) -> wp.float32:
-        if light.radius <= 0.0 or light.kind == DIRECTIONAL or sample.distance <= light.radius:
+        if not has_penumbra(light, sample):
             return wp.where(is_lit(scene, point, geometric_normal, error, sample), 1.0, 0.0)
         basis = frame_from_normal(sample.wi)
         seen = wp.int32(0)

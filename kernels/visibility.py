@@ -466,6 +466,16 @@ def make_primary(config: TraceConfig) -> wp.Function:
     return closest_visible
 
 
+def check_edge_samples(count: int) -> None:
+    """Raise an error unless ``make_sample_direction`` can place so many samples.
+
+    Raises:
+        ValueError: It is no square number.
+    """
+    if count < 1 or math.isqrt(count) ** 2 != count:
+        raise ValueError(f"edge_samples is {count}; expected a square number such as 1, 4 or 16")
+
+
 @functools.cache
 def make_sample_direction(count: int) -> wp.Function:
     """``sample_direction(params, ray, sample) -> vec3``: where a pixel's sample looks in the world, not unit.

@@ -53,6 +53,11 @@ def shape(kind, position, extent):
     return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent, "material": -1}
 
 
+def turn_z(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
 DESK = shape(PLANE, (0, 0, 0), (5, 5, 0))
 
 
@@ -114,6 +119,48 @@ def run(
         rows=rows,
     )
     return out.numpy()
+
+
+def run_edges(
+    samples, lights, objects=(), proxies=(DESK,), probes=(), rect=(0, H, 0, W), detail=1, soft=False, rows=None
+):
+    """``relight`` on a white desk in a white room, and ``smooth_edges`` where samples are more than one.
+
+    ``detail`` times as many pixels along each axis see the same view.
+    """
+    height, width = H * detail, W * detail
+    columns, lines = np.meshgrid(
+        (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
+    )
+    kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
+    config = relight.RelightConfig(
+        "reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples
+    )
+    place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
+    params = records(FrameParams, place)
+    scene = RayScene()
+    scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
+    frame, table = (
+        wp.full((height, width), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub),
+        wp.zeros((height, width), wp.uint32),
+    )
+    summed_area.sum_area(frame, table)
+    keys = records(KeyLight, {"direction": (0, 0, 1), "dominance": 0.0})
+    rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
+    known = frame, tables()[0], table
+    balls, lamps = records(Probe, *probes), records(Light, *lights)
+    room = wp.array(constant_room((1, 1, 1)), dtype=wp.vec3)
+    out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.vec2i)
+    relight.relight(config, params, rays, *known, scene, balls, lamps, keys, room, out, seen)
+    if samples > 1:
+        desk = relight.make_desk(config, *known, balls, keys, room)
+        for band in rows or (None,):
+            relight.smooth_edges(config, params, rays, scene, lamps, desk, seen, out, rows=band)
+    return out.numpy()
+
+
+def pixel_means(image, detail):
+    return image.reshape(H, detail, W, detail, 3).mean((1, 3))
 
 
 def noise_frame(low=60, high=200, seed=0):
@@ -362,6 +409,79 @@ def test_reflectance_is_within_bounds_for_any_room(device, irradiance):
     got = run("reflectance", [point((0, 0, 0.3))], irradiance_map=room)
     white = run("flat", [point((0, 0, 0.3))]) / 0.5
     assert ((got >= 0.0) & (got <= white * (1.0 + FLOAT_ERROR))).all()
+
+
+# --- edges
+
+HANGING = {**shape(BOX, (0.02, 0.01, 0.15), (0.06, 0.04, 0.01)), "rotation": turn_z(0.4)}
+"""Throws a slanted shadow; nearer to the camera than the desk."""
+
+
+@pytest.mark.parametrize("samples", [4, 16])
+def test_edges_of_shadows_are_means_over_pixels(device, samples):
+    """Against 256 times as many pixels: n samples err less than n random ones would, by 1 / sqrt n of what one does."""
+    lights = [point((-0.1, 0.05, 0.5)), {**point((0.2, 0.1, 0.4)), "kind": DIRECTIONAL, "direction": unit(1, 0.5, -2)}]
+    hard = run_edges(1, lights, [HANGING])
+    truth = pixel_means(run_edges(1, lights, [HANGING], rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
+    smooth = run_edges(samples, lights, [HANGING])
+    edges = np.abs(hard - truth).max(-1) > 0.02 * truth.max()
+    assert edges.sum() > 50
+    before, after = (np.sqrt(((picture - truth)[edges] ** 2).mean()) for picture in (hard, smooth))
+    assert after < before / np.sqrt(samples)
+    changed = (hard != smooth).any(-1)
+    assert changed.sum() < 0.25 * H * W
+    assert np.abs(smooth - truth)[~edges].max() < 0.02 * truth.max()
+
+
+def test_edges_of_proxies_are_means_over_pixels(device):
+    """A lit box before the desk: where neither is lit, or one surface goes on, nothing changes."""
+    box = shape(BOX, (0.0, 0.0, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
+    lights = [point((0.0, 0.0, 0.5))]
+    hard = run_edges(1, lights, proxies=(DESK, box))
+    truth = pixel_means(run_edges(1, lights, proxies=(DESK, box), rect=(0, 16 * H, 0, 16 * W), detail=16), 16)
+    smooth = run_edges(16, lights, proxies=(DESK, box))
+    errors = [np.abs(picture - truth).mean() for picture in (hard, smooth)]
+    assert errors[1] < 0.4 * errors[0]
+    assert (hard == smooth).all(-1).mean() > 0.7
+    dark = run_edges(16, [point((0.0, 0.0, -1.0))], proxies=(DESK, box))
+    assert not dark.any()
+
+
+def test_edges_of_cones_and_penumbrae_stay(device):
+    """Both are smooth already: samples there would be wasted."""
+    spot = {**point((0.05, 0.0, 0.4)), "kind": SPOT, "direction": (0, 0, -1), "inner_angle": 0.1, "outer_angle": 0.3}
+    assert (run_edges(1, [spot]) == run_edges(16, [spot])).all()
+    wide = [point((-0.1, 0.05, 0.5), radius=0.05)]
+    hard, smooth = (run_edges(samples, wide, [HANGING], soft=True) for samples in (1, 16))
+    assert (hard == smooth).all()
+    assert len(np.unique(hard)) > 100, "no penumbra"
+
+
+def test_edges_leave_balls_to_themselves(device):
+    """Pixels of a ball stay black; those beside it are not darkened by what they see of it."""
+    ball = {"center": (0.0, 0.0, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
+    lights = [point((0.0, 0.0, 0.55))]
+    hard, smooth = (run_edges(samples, lights, probes=[ball]) for samples in (1, 16))
+    shown = np.hypot(COLUMNS, ROWS) < 0.03 / np.sqrt(0.57**2 - 0.03**2)
+    assert shown.sum() > 20
+    assert not smooth[shown].any()
+    outside = run_edges(1, lights)
+    beside = smooth[~shown].max(-1)
+    lit = beside > 0
+    assert lit.any()
+    assert (beside[lit] <= outside[~shown].max(-1)[lit] * (1 + 1e-4)).all()
+    assert (smooth == hard)[~shown].all(-1).mean() > 0.9
+
+
+def test_bands_give_the_same_edges(device):
+    lights = [point((-0.1, 0.05, 0.5))]
+    whole, banded = (run_edges(4, lights, [HANGING], rows=rows) for rows in (None, ((0, 7), (7, 30), (30, H))))
+    assert (whole == banded).all()
+
+
+def test_edge_samples_must_be_a_square_number():
+    with pytest.raises(ValueError, match="edge_samples is 3; expected a square number"):
+        relight.RelightConfig("flat", TraceConfig((), (PLANE,)), edge_samples=3)
 
 
 # --- culling

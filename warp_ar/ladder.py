@@ -61,14 +61,14 @@ _CONVERGING = (
 _LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples")
 KNOBS: tuple[Knob, ...] = (
     Knob("environment_height", ("32", "64", "128", "256"), _LIGHT),
-    Knob("edge_samples", ("1", "4", "16"), ("shade",)),
+    Knob("edge_samples", ("1", "4", "16"), ("relight", "shade")),
     Knob("light_shadow", ("hard", "soft"), ("relight", "shade")),
     *(Knob(stage.name, tuple(stage.rungs), (stage.name,)) for stage in STAGES if len(stage.rungs) > 1),
 )
 """All there are."""
 WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "environment_height": ("rows of the map that holds the room's light", {}),
-    "edge_samples": ("samples per pixel along the outlines of virtual objects", {}),
+    "edge_samples": ("samples per pixel along the outlines of virtual objects, and of shadows of virtual light", {}),
     "light_shadow": (
         "shadows of virtual lights",
         {"hard": "as if every lamp were a point (the paper)", "soft": "as wide as the lamp"},

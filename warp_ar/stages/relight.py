@@ -75,6 +75,8 @@ class Relight(Stage):
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
         specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
+        if self.request.quality.edge_samples > 1:
+            specs["relight_seen"] = ArraySpec((height, width), wp.vec2i)
         if shares_room(self.request):
             cells = _cells(self.request, _grain(self.request).share)
             specs["relight_share"] = ArraySpec(cells, wp.vec3)
@@ -107,19 +109,27 @@ class Relight(Stage):
             room,
         )
         lamps = arrays["lamps"] if "lamps" in reads else None
-        seen = arrays["params"], arrays["rays"]
+        camera = arrays["params"], arrays["rays"]
+        added, seen = arrays["physical_added"], arrays["relight_seen"] if config.edge_samples > 1 else None
 
         def launch(rows: Rows | None) -> None:
-            relight.relight(config, *seen, *known, arrays["physical_added"], lamps=lamps, cells=cells, rows=rows)
+            relight.relight(config, *camera, *known, added, seen, lamps=lamps, cells=cells, rows=rows)
 
         height = self.request.size[1]
         light_rows = arrays["light_rows"]
-        last = Pass(launch, rows=height, extent=GrowingRows(light_rows))
-        if not (config.share or config.bounced):
-            return [last]
-
+        last = [Pass(launch, rows=height, extent=GrowingRows(light_rows))]
         frame, decode, table, scene, probes, lights, key_lights, _ = known
         desk = relight.make_desk(config, frame, decode, table, probes, key_lights, room, lamps, cells)
+        if config.edge_samples > 1:
+
+            def smooth(rows: Rows | None) -> None:
+                relight.smooth_edges(config, *camera, scene, lights, desk, seen, added, rows=rows)
+
+            relight.make_smooth_edges_kernel(config)
+            last.append(Pass(smooth, rows=height, extent=light_rows))
+        if not (config.share or config.bounced):
+            return last
+
         place = desk_cells.CellConfig(config)
         passes: list[Pass] = []
 
@@ -145,7 +155,7 @@ class Relight(Stage):
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
                 own = arrays["room_samples"], grain.samples, size, share, surface
                 more = {"bounced": bounced, "sums_out": sums, "rows": rows}
-                desk_cells.share_room(place, *seen, scene, lights, desk, *own, **more)
+                desk_cells.share_room(place, *camera, scene, lights, desk, *own, **more)
 
             desk_cells.make_share_room_kernel(place)
             passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))
@@ -155,13 +165,13 @@ class Relight(Stage):
             step, wide = cells.bounced_stride, _stride(self.request, grain.patch)
 
             def send(rows: Rows | None) -> None:
-                desk_cells.send_light(place, *seen, scene, lights, desk, wide, patches, rows=rows)
+                desk_cells.send_light(place, *camera, scene, lights, desk, wide, patches, rows=rows)
 
             def arrange(rows: Rows | None) -> None:
                 desk_cells.list_patches(patches, listed, count, rows=rows)
 
             def gather(rows: Rows | None) -> None:
-                desk_cells.gather_light(place, *seen, scene, desk, listed, count, wide, step, bounced, lit, rows=rows)
+                desk_cells.gather_light(place, *camera, scene, desk, listed, count, wide, step, bounced, lit, rows=rows)
 
             desk_cells.make_send_light_kernel(place)
             desk_cells.make_gather_light_kernel(place)
@@ -172,7 +182,7 @@ class Relight(Stage):
             if config.share:
                 again = functools.partial(estimate, bounced=True)
                 passes.append(Pass(again, rows=len(share), extent=rows_of(size, len(share), 2)))
-        return [*passes, last]
+        return passes + last
 
 
 def _grain(request: Request) -> Grain:
@@ -220,6 +230,7 @@ def relight_config(request: Request) -> relight.RelightConfig:
         rung in ("reflectance", *GRAINS) and knows_lamps(request),
         shares_room(request),
         bounces_virtual(request),
+        request.quality.edge_samples,
     )
 
 
