@@ -92,24 +92,6 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
     return (1.0 - fy) * top + fy * bottom
 
 
-@wp.func
-def nearest_of_object(hit_object: wp.array2d[wp.int32], i: wp.int32, j: wp.int32, found: wp.int32) -> wp.vec2i:
-    """A pixel that shows an object: this one, else one of its eight neighbours, else (-1, -1)."""
-    if hit_object[i, j] == found:
-        return wp.vec2i(i, j)
-    nearest = wp.vec2i(-1, -1)
-    least = wp.int32(3)
-    for a in range(-1, 2):
-        for b in range(-1, 2):
-            row = i + a
-            column = j + b
-            if row >= 0 and column >= 0 and row < hit_object.shape[0] and column < hit_object.shape[1]:
-                if hit_object[row, column] == found and a * a + b * b < least:
-                    least = a * a + b * b
-                    nearest = wp.vec2i(row, column)
-    return nearest
-
-
 @functools.cache
 def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
     """``find_in_frame(params, height, width, scene, probes, point, geometric_normal) -> vec2``: (x, y), or x = -1."""

@@ -6,7 +6,7 @@ Edges. Inside a surface one sample per pixel is enough. Where a neighbour sees a
 tangent plane than two pixels' footprint, or a normal turned by more than 30 degrees, the pixel is traced again with n^2
 samples and averaged (a box filter, as a camera's pixels have). The samples are n-rooks in both axes, for n = 2 the
 rotated grid: no two of them share a row or column, so near-vertical and near-horizontal edges pass through n^2 shades,
-not n.
+not n. What surrounds a sample at close range is taken from the pixel around it whose normal is most like its own.
 
 Normals. Surfaces are seen from both sides: normals are turned toward the viewer. An interpolated normal can still point
 away at a silhouette; it is then tipped just as far as makes it perpendicular to the view, continuously, so that the
@@ -23,7 +23,7 @@ import warp as wp
 
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
-from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance, nearest_of_object
+from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import Hit, check_edge_samples, inside_rect, make_primary, make_sample_direction
@@ -165,6 +165,27 @@ def differs(
     return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
 
 
+@wp.func
+def most_alike(hit_object: wp.array2d[wp.int32], hits: wp.array2d[Hit], i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
+    """Of a pixel and its eight neighbours, the one that sees what is most like a hit; (-1, -1): none sees its object.
+
+    Normals decide, nearness where they are the same.
+    """
+    found = wp.vec2i(-1, -1)
+    best = float(-2.0)
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            row = i + a
+            column = j + b
+            if row >= 0 and column >= 0 and row < hit_object.shape[0] and column < hit_object.shape[1]:
+                if hit_object[row, column] == hit.shape:
+                    likeness = wp.dot(hits[row, column].normal, hit.normal) - 1.0e-3 * wp.float32(a * a + b * b)
+                    if likeness > best:
+                        best = likeness
+                        found = wp.vec2i(row, column)
+    return found
+
+
 @functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
     """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
@@ -180,6 +201,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         lights: wp.array[Light],
         room: Room,
         hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
         near_mirrored: wp.array2d[wp.vec4],
         i: wp.int32,
@@ -198,7 +220,9 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             return wp.vec4(0.0)
         near = Nearby()
         if wp.static(config.near):
-            pixel = nearest_of_object(hit_object, i, j, hit.shape)
+            pixel = wp.vec2i(i, j)
+            if not alone:
+                pixel = most_alike(hit_object, hits, i, j, hit)
             near.known = pixel[0] >= 0
             if near.known:
                 if wp.static(config.room.diffuse != "none"):
@@ -276,6 +300,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
                     lights,
                     room,
                     hit_object,
+                    hits,
                     near_irradiance,
                     near_mirrored,
                     i,
@@ -315,6 +340,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         lights: wp.array[Light],
         room: Room,
         hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
         near_mirrored: wp.array2d[wp.vec4],
         edge_count: wp.array[wp.int32],
@@ -333,6 +359,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
                 lights,
                 room,
                 hit_object,
+                hits,
                 near_irradiance,
                 near_mirrored,
                 edge[0],
@@ -417,18 +444,18 @@ def shade(
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    inputs = [params, rays, scene, lights, room, hit_object]
+    inputs = [params, rays, scene, lights, room, hit_object, hits]
     near = [near_irradiance, near_mirrored]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:
         kernel, outputs = make_shade_kernel(config), [virtual_out, None, None]
-        launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
+        launch_rows(kernel, rays.shape, [*inputs, *near], outputs, rows=rows, device=device)
         return
     count, edges, samples = edge_lists.count, edge_lists.edges, edge_lists.samples
     count.zero_()
     outputs = [virtual_out, count, edges]
     for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
-        launch_rows(kernel, rays.shape, [*inputs, hits, *near], outputs, rows=rows, device=device)
+        launch_rows(kernel, rays.shape, [*inputs, *near], outputs, rows=rows, device=device)
     listed = [count, edges]
     sampling = [EDGE_THREADS, *inputs, *near, *listed]
     wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)

@@ -11,7 +11,7 @@ from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
 from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
 from warp_ar.graph import make_plan
-from warp_ar.kernels import object_light, reflect
+from warp_ar.kernels import object_light, shade
 from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
@@ -328,19 +328,25 @@ def test_bands_agree_with_the_whole(device):
     assert not part[25:].any()
 
 
-def test_nearest_pixel_of_an_object(device):
-    found = wp.array(np.array([[-1, 3, -1], [-1, -1, -1], [-1, 5, 5]], np.int32), dtype=wp.int32)
-    out = wp.zeros(4, wp.vec2i)
-    wp.launch(_nearest_kernel, dim=1, inputs=[found], outputs=[out])
-    assert out.numpy().tolist() == [[0, 1], [2, 1], [-1, -1], [2, 2]]
+def test_a_sample_of_an_edge_takes_the_light_of_the_pixel_most_like_it(device):
+    """Of its object: first by the normal, then by nearness; none where no pixel around sees it."""
+    found = np.array([[-1, 3, -1], [3, 3, -1], [-1, 5, 5]], np.int32)
+    hits = np.zeros((3, 3), np.dtype(Hit.numpy_dtype()))
+    hits["normal"] = (0, 0, 1)
+    hits["normal"][0, 1], hits["normal"][1, 0] = (0.6, 0, 0.8), (0, 1, 0)
+    asked = np.zeros(5, hits.dtype)
+    asked["shape"] = 3, 3, 3, 5, 7
+    asked["normal"] = (0, 0, 1), (0.8, 0, 0.6), (0, 0.8, 0.6), (1, 0, 0), (0, 0, 1)
+    out = wp.zeros(len(asked), wp.vec2i)
+    inputs = [wp.array(found), wp.array(hits, dtype=Hit), wp.array(asked, dtype=Hit)]
+    wp.launch(_alike_kernel, dim=len(asked), inputs=inputs, outputs=[out])
+    assert out.numpy().tolist() == [[1, 1], [0, 1], [1, 0], [2, 1], [-1, -1]]
 
 
 @wp.kernel(enable_backward=False)
-def _nearest_kernel(found: wp.array2d[wp.int32], out: wp.array[wp.vec2i]):
-    out[0] = reflect.nearest_of_object(found, 1, 1, 3)
-    out[1] = reflect.nearest_of_object(found, 1, 1, 5)
-    out[2] = reflect.nearest_of_object(found, 1, 1, 7)
-    out[3] = reflect.nearest_of_object(found, 2, 2, 5)
+def _alike_kernel(found: wp.array2d[wp.int32], hits: wp.array2d[Hit], asked: wp.array[Hit], out: wp.array[wp.vec2i]):
+    k = wp.tid()
+    out[k] = shade.most_alike(found, hits, 1, 1, asked[k])
 
 
 def test_stage_follows_the_rung_of_shade():
