@@ -14,7 +14,13 @@ by the angle that turns u = r / |r| to d, times
     (1 - s^4)^2,    s = |w - u| / max(REACH, 2.5 |d - u|) < 1,
 
 so that the lamp, and the glow around it, is seen once, at its place and undistorted, and what is farther from it stays.
-The factor keeps it one-to-one: (1 - s^4)^2 falls by no more than 2.2 per unit of s.
+The factor keeps it one-to-one: (1 - s^4)^2 falls by no more than 2.2 per unit of s. Parts of one window are lamps side
+by side, which all turn much the same way; what lies between must not be turned by all of them in turn. With a lamp's
+factor f and its turn v, a rotation vector,
+
+    v = sum g v / (1 + sum g),    g = f / (1 - f),
+
+is f v for one lamp, between theirs for several, and each lamp's own where it stands.
 """
 
 from __future__ import annotations
@@ -31,6 +37,8 @@ MAX_GAIN = wp.constant(wp.float32(16.0))
 """Largest (D / |r|)^2: lamps have a size, and their distances an error."""
 REACH = wp.constant(wp.float32(0.2))
 """Radians around a near lamp that turn with it, at least."""
+NEARLY_ALL = wp.constant(wp.float32(1.0e-6))
+"""Least 1 - f: closer to a lamp its turn is as good as alone."""
 LEAST_TURN = wp.constant(wp.float32(1.0e-4))
 """Radians that are not worth turning: the axis is known to some 1e-7 over that."""
 
@@ -54,17 +62,25 @@ def add_nearness(irradiance: wp.vec3, lamps: wp.array[RoomLamp], point: wp.vec3,
 @wp.func
 def turn_to_lamps(lamps: wp.array[RoomLamp], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
     """Unit direction in which the environment shows what is seen from a point along a unit direction."""
-    turned = direction
+    spin = wp.vec3(0.0)
+    weights = float(1.0)
     for k in range(lamps.shape[0]):
         lamp = lamps[k]
         if lamp.distance > 0.0 and lamp.distance < MAX_DISTANCE:
             to_lamp = wp.normalize(lamp.origin + lamp.distance * lamp.direction - point)
             off = wp.length(lamp.direction - to_lamp)
             s = wp.length(direction - to_lamp) / wp.max(REACH, 2.5 * off)
-            if s < 1.0 and off > LEAST_TURN:
-                weight = 1.0 - s * s * s * s
-                axis = wp.normalize(wp.cross(to_lamp, lamp.direction))
-                angle = 2.0 * weight * weight * wp.asin(wp.min(0.5 * off, 1.0))
-                along = wp.dot(axis, turned) * axis
-                turned = along + wp.cos(angle) * (turned - along) + wp.sin(angle) * wp.cross(axis, turned)
+            if s < 1.0:
+                s4 = s * s * s * s
+                weight = (1.0 - s4) * (1.0 - s4) / wp.max(s4 * (2.0 - s4), NEARLY_ALL)
+                weights += weight
+                if off > LEAST_TURN:
+                    axis = wp.normalize(wp.cross(to_lamp, lamp.direction))
+                    spin += weight * 2.0 * wp.asin(wp.min(0.5 * off, 1.0)) * axis
+    angle = wp.length(spin) / weights
+    if angle <= LEAST_TURN:
+        return direction
+    axis = wp.normalize(spin)
+    along = wp.dot(axis, direction) * axis
+    turned = along + wp.cos(angle) * (direction - along) + wp.sin(angle) * wp.cross(axis, direction)
     return wp.normalize(turned)

@@ -148,6 +148,27 @@ def test_a_lamp_is_seen_at_its_place_and_once(device, moved):
     assert between[0] == pytest.approx(between[1], rel=0.01)
 
 
+def test_parts_of_a_window_turn_as_one(device):
+    """Each is seen where it is, and what lies between them is seen between them: not turned by one after another."""
+    parts = [LAMP + k * np.array([0.1, 0.05, -0.1]) for k in (-1, 0, 1)]
+    parts = [part / np.linalg.norm(part) for part in parts]
+    lamps = [(part, distance) for part, distance in zip(parts, (0.5, 0.52, 0.47), strict=True)]
+    point = CENTER + np.array([0.15, -0.1, 0.05])
+    seen = [CENTER + distance * part - point for part, distance in lamps]
+    seen = np.array([s / np.linalg.norm(s) for s in seen])
+    # A neighbour a third of the reach away counts 1e-6 times some 80 as much there; turns differ by 0.1.
+    assert turn(device, lamps, point, seen) == pytest.approx(np.array(parts), abs=1e-4)
+    share = np.linspace(0.0, 1.0, 41)[:, None]
+    for a, b in ((0, 1), (1, 2)):
+        between = (1 - share) * seen[a] + share * seen[b]
+        turned = turn(device, lamps, point, between / np.linalg.norm(between, axis=1, keepdims=True))
+        along = turned @ (parts[b] - parts[a])
+        assert (np.diff(along) > 0.0).all(), "folded"
+        chord = parts[b] - parts[a]
+        off = np.cross(turned - parts[a], chord / np.linalg.norm(chord))
+        assert np.linalg.norm(off, axis=1).max() < 0.15 * np.linalg.norm(chord)
+
+
 def test_distant_lamps_and_none_turn_nothing(device):
     directions = sphere_of_directions(100)
     lamps = [(LAMP, np.inf), ((0.0, 0.0, 0.0), 0.0)]
