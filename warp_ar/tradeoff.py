@@ -470,6 +470,8 @@ def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
     if name is None:
         return None
     arrays = pipeline.arrays
+    if name == "virtual" and name not in arrays:
+        name = "physical_added"  # no objects: what has edges is the shadows on the desk
     if name == "irradiance":
         if "irradiance_sh" in arrays:
             return irradiance_from_sh(arrays["irradiance_sh"].numpy())
