@@ -67,6 +67,7 @@ from typing import Literal
 import warp as wp
 
 from warp_ar.kernels.color import decode
+from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.lamps import add_nearness
 from warp_ar.kernels.latlong import sample_latlong
@@ -535,11 +536,43 @@ def is_edge(seen: wp.array2d[wp.vec2i], rect: wp.vec4i, row: wp.int32, column: w
 
 
 @functools.cache
-def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
-    """Kernel of ``smooth_edges``, specialised to ``config``."""
+def make_sample_lit(config: RelightConfig) -> wp.Function:
+    """``sample_lit(params, rays, scene, lights, desk, row, col, sample) -> vec4``: a sample's light, and 1.
+
+    Zero where it sees a ball: such a sample does not count.
+    """
     closest_proxy = make_trace(config.trace).closest_proxy
     lit_by = make_lit_by(config)
     sample_direction = make_sample_direction(config.edge_samples)
+
+    @wp.func(module="unique")
+    def sample_lit(
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        row: wp.int32,
+        col: wp.int32,
+        sample: wp.int32,
+    ) -> wp.vec4:
+        direction = sample_direction(params, rays[row, col], sample)
+        hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
+        if wp.static(config.probes):
+            if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
+                return wp.vec4(0.0)
+        if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
+            return wp.vec4(0.0, 0.0, 0.0, 1.0)
+        lit = lit_by(scene, lights, desk, hit, row, col, wp.vec3(), tile_turn(row, col))
+        return wp.vec4(lit.added[0], lit.added[1], lit.added[2], 1.0)
+
+    return sample_lit
+
+
+@functools.cache
+def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
+    """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
+    sample_lit = make_sample_lit(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def smooth_edges_kernel(
@@ -551,33 +584,98 @@ def make_smooth_edges_kernel(config: RelightConfig) -> wp.Kernel:
         lights: wp.array[Light],
         desk: Desk,
         seen: wp.array2d[wp.vec2i],
+        edge_count: wp.array[wp.int32],
+        edges: wp.array[wp.vec2i],
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
         i += row_start
+        if wp.static(left):
+            if edge_count[0] <= edges.shape[0]:
+                return
         rect = params[0].light_rect
         if not inside_rect(i, j, rect):
             return
         if not is_edge(seen, rect, i, j):
             return
-        black = wp.vec3(0.0, 0.0, 0.0)
-        total = wp.vec3()
-        count = float(0.0)
-        for k in range(wp.static(config.edge_samples)):
-            direction = sample_direction(params, rays[i, j], k)
-            hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
-            if wp.static(config.probes):
-                if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
-                    continue
-            count += 1.0
-            if hit.shape >= 0 and wp.dot(hit.geometric_normal, direction) < 0.0:
-                lit = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
-                total += lit.added
-        if count > 0.0:
-            physical_added_out[i, j] = total / count
+        total = wp.vec4()
+        for sample in range(wp.static(config.edge_samples)):
+            total += sample_lit(params, rays, scene, lights, desk, i, j, sample)
+        if total[3] > 0.0:
+            physical_added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
 
     return smooth_edges_kernel
+
+
+@wp.kernel(enable_backward=False)
+def list_edges_kernel(
+    # In:
+    params: wp.array[FrameParams],
+    seen: wp.array2d[wp.vec2i],
+    # Out:
+    edge_count_out: wp.array[wp.int32],
+    edges_out: wp.array[wp.vec2i],
+):
+    """List the pixels that ``is_edge`` finds."""
+    i, j = wp.tid()
+    rect = params[0].light_rect
+    if inside_rect(i, j, rect):
+        if is_edge(seen, rect, i, j):
+            list_edge(i, j, edge_count_out, edges_out)
+
+
+@functools.cache
+def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
+    """Kernel that takes every sample of the edges that were listed."""
+    sample_lit = make_sample_lit(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sample_lit_edges_kernel(
+        # In:
+        threads: wp.int32,
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        lights: wp.array[Light],
+        desk: Desk,
+        edge_count: wp.array[wp.int32],
+        edges: wp.array[wp.vec2i],
+        # Out:
+        samples_out: wp.array[wp.vec4],
+    ):
+        item = wp.tid()
+        stop = listed_edges(edge_count, edges) * wp.static(config.edge_samples)
+        while item < stop:
+            edge = edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = sample_lit(params, rays, scene, lights, desk, edge[0], edge[1], sample)
+            item += threads
+
+    return sample_lit_edges_kernel
+
+
+@wp.kernel(enable_backward=False)
+def average_lit_edges_kernel(
+    # In:
+    threads: wp.int32,
+    count: wp.int32,
+    edge_count: wp.array[wp.int32],
+    edges: wp.array[wp.vec2i],
+    samples: wp.array[wp.vec4],
+    # Out:
+    physical_added_out: wp.array2d[wp.vec3],
+):
+    """Mean of every listed edge's samples that count, in their order."""
+    item = wp.tid()
+    stop = listed_edges(edge_count, edges)
+    while item < stop:
+        total = wp.vec4(0.0)
+        for sample in range(count):
+            total += samples[item * count + sample]
+        if total[3] > 0.0:
+            physical_added_out[edges[item][0], edges[item][1]] = wp.vec3(total[0], total[1], total[2]) / total[3]
+        item += threads
 
 
 def surroundings_size(height: int) -> int:
@@ -673,6 +771,7 @@ def smooth_edges(
     seen: wp.array,
     physical_added_out: wp.array,
     *,
+    edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Average ``config.edge_samples`` samples in pixels along the edges of shadows and of lit proxies.
@@ -686,13 +785,21 @@ def smooth_edges(
         desk: Of ``make_desk``.
         seen: (H, W) vec2i as ``relight`` writes.
         physical_added_out: (H, W) vec3 as ``relight`` writes; changed along edges.
+        edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
         rows: Band of rows; None means all.
     """
-    launch_rows(
-        make_smooth_edges_kernel(config),
-        rays.shape,
-        [params, rays, scene, lights, desk, seen],
-        [physical_added_out],
-        rows=rows,
-        device=rays.device,
-    )
+    device = rays.device
+    inputs = [params, rays, scene, lights, desk]
+    if edge_lists is None:
+        kernel, given = make_smooth_edges_kernel(config), [*inputs, seen, None, None]
+        launch_rows(kernel, rays.shape, given, [physical_added_out], rows=rows, device=device)
+        return
+    listed = [edge_lists.count, edge_lists.edges]
+    edge_lists.count.zero_()
+    wp.launch(list_edges_kernel, rays.shape, [params, seen], listed, device=device)
+    kernel, given = make_smooth_edges_kernel(config, left=True), [*inputs, seen, *listed]
+    launch_rows(kernel, rays.shape, given, [physical_added_out], rows=None, device=device)
+    sampling = [EDGE_THREADS, *inputs, *listed]
+    wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [edge_lists.samples], device=device)
+    averaging = [EDGE_THREADS, config.edge_samples, *listed, edge_lists.samples]
+    wp.launch(average_lit_edges_kernel, EDGE_THREADS, averaging, [physical_added_out], device=device)

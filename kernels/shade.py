@@ -21,6 +21,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance
@@ -39,8 +40,6 @@ MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
 SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
 """What becomes of edges in a kernel of ``make_shade_kernel``."""
-EDGE_THREADS = 1 << 16
-"""Threads that share the samples of all edges."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,9 +287,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
                         samples = wp.static(config.edge_samples)
             if wp.static(edges == LISTED):
                 if samples > 1:
-                    place = wp.atomic_add(edge_count_out, 0, 1)
-                    if place < edges_out.shape[0]:
-                        edges_out[place] = wp.vec2i(i, j)
+                    list_edge(i, j, edge_count_out, edges_out)
                     return
             for sample in range(samples):
                 result += shade_sample(
@@ -317,12 +314,6 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         virtual_out[i, j] = result
 
     return shade_kernel
-
-
-@wp.func
-def listed_edges(edge_count: wp.array[wp.int32], edges: wp.array[wp.vec2i]) -> wp.int32:
-    """Edges in the list; none where it did not hold all."""
-    return wp.where(edge_count[0] <= edges.shape[0], edge_count[0], 0)
 
 
 @functools.cache
@@ -395,18 +386,6 @@ def average_edges_kernel(
         item += threads
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class EdgeLists:
-    """Scratch arrays for edges that are sampled on their own; where they do not hold all, all are sampled in place."""
-
-    count: wp.array[wp.int32]
-    """(1,): edges found."""
-    edges: wp.array[wp.vec2i]
-    """(n,): row and column of each."""
-    samples: wp.array[wp.vec4]
-    """(n * edge_samples,): radiance and coverage."""
-
-
 def shade(
     config: ShadeConfig,
     params: wp.array[FrameParams],
@@ -425,9 +404,8 @@ def shade(
 ) -> None:
     """Shade what ``trace_pixels`` found.
 
-    Samples of edges take many times as long as the pixels around them. On CUDA that holds up whole warps; given
-    ``edge_lists``, edges are listed first and their samples shaded side by side, with the same result but for the last
-    places, where CUDA's compiler contracts a product and a sum in one of the kernels alone.
+    Given ``edge_lists``, edges are sampled on their own, with the same result but for the last places, where CUDA's
+    compiler contracts a product and a sum in one of the kernels alone.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.

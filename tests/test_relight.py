@@ -7,6 +7,7 @@ from tests.reference import color as reference_color
 from tests.reference import relight as reference
 from tests.test_composite import tables
 from warp_ar.kernels import color, relight, summed_area
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.structs import (
     BOX,
     DIRECTIONAL,
@@ -122,7 +123,16 @@ def run(
 
 
 def run_edges(
-    samples, lights, objects=(), proxies=(DESK,), probes=(), rect=(0, H, 0, W), detail=1, soft=False, rows=None
+    samples,
+    lights,
+    objects=(),
+    proxies=(DESK,),
+    probes=(),
+    rect=(0, H, 0, W),
+    detail=1,
+    soft=False,
+    rows=None,
+    listed=0,
 ):
     """``relight`` on a white desk in a white room, and ``smooth_edges`` where samples are more than one.
 
@@ -153,9 +163,12 @@ def run_edges(
     out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.vec2i)
     relight.relight(config, params, rays, *known, scene, balls, lamps, keys, room, out, seen)
     if samples > 1:
-        desk = relight.make_desk(config, *known, balls, keys, room)
+        desk, lists = relight.make_desk(config, *known, balls, keys, room), None
+        if listed:
+            sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
+            lists = EdgeLists(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
         for band in rows or (None,):
-            relight.smooth_edges(config, params, rays, scene, lamps, desk, seen, out, rows=band)
+            relight.smooth_edges(config, params, rays, scene, lamps, desk, seen, out, edge_lists=lists, rows=band)
     return out.numpy()
 
 
@@ -477,6 +490,18 @@ def test_bands_give_the_same_edges(device):
     lights = [point((-0.1, 0.05, 0.5))]
     whole, banded = (run_edges(4, lights, [HANGING], rows=rows) for rows in (None, ((0, 7), (7, 30), (30, H))))
     assert (whole == banded).all()
+
+
+@pytest.mark.parametrize("listed", [5, H * W])
+def test_listed_edges_are_the_same(device, listed):
+    """Sampled on their own, or in place where the list does not hold them all."""
+    lights = [point((-0.1, 0.05, 0.5))]
+    box = shape(BOX, (0.0, 0.1, 0.04), (0.1, 0.06, 0.04)) | {"rotation": turn_z(0.3)}
+    ball = {"center": (0.1, -0.05, 0.03), "radius": 0.03, "reflectance": (0.6, 0.6, 0.6)}
+    expected, got = (run_edges(4, lights, [HANGING], (DESK, box), [ball], listed=n) for n in (0, listed))
+    hard = run_edges(1, lights, [HANGING], (DESK, box), [ball])
+    assert (expected != hard).any(-1).sum() > 50
+    np.testing.assert_allclose(got, expected, rtol=0 if device == "cpu" else 1e-6)
 
 
 def test_edge_samples_must_be_a_square_number():

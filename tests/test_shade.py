@@ -13,9 +13,10 @@ from tests.error_model import check_error
 from tests.reference import shade as reference
 from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
 from warp_ar.kernels.reflect import Room, RoomConfig
-from warp_ar.kernels.shade import EdgeLists, ShadeConfig, shade
+from warp_ar.kernels.shade import ShadeConfig, shade
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
 

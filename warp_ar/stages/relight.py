@@ -15,6 +15,7 @@ from warp_ar.kernels.room_shadow import count_parts
 from warp_ar.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shares_room
+from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.recover import knows_lamps
 from warp_ar.stages.room_samples import SAMPLES
 from warp_ar.stages.shade import casts_soft, sees_near
@@ -77,6 +78,7 @@ class Relight(Stage):
         specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_seen"] = ArraySpec((height, width), wp.vec2i)
+            specs |= edge_arrays(self.request, self.name)
         if shares_room(self.request):
             cells = _cells(self.request, _grain(self.request).share)
             specs["relight_share"] = ArraySpec(cells, wp.vec3)
@@ -121,11 +123,14 @@ class Relight(Stage):
         frame, decode, table, scene, probes, lights, key_lights, _ = known
         desk = relight.make_desk(config, frame, decode, table, probes, key_lights, room, lamps, cells)
         if config.edge_samples > 1:
+            lists = make_edge_lists(arrays, device, self.name)
 
             def smooth(rows: Rows | None) -> None:
-                relight.smooth_edges(config, *camera, scene, lights, desk, seen, added, rows=rows)
+                relight.smooth_edges(config, *camera, scene, lights, desk, seen, added, edge_lists=lists, rows=rows)
 
-            relight.make_smooth_edges_kernel(config)
+            relight.make_smooth_edges_kernel(config, left=lists is not None)
+            if lists is not None:
+                relight.make_sample_edges_kernel(config)
             last.append(Pass(smooth, rows=height, extent=light_rows))
         if not (config.share or config.bounced):
             return last

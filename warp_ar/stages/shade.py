@@ -8,16 +8,12 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.reflect import RoomConfig
-from warp_ar.kernels.shade import EdgeLists, ShadeConfig, shade
+from warp_ar.kernels.shade import ShadeConfig, shade
 from warp_ar.ray_scene import has_sized_lights, light_kind
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
 from warp_ar.stages.visibility import GrowingRows
-
-LISTED_SHARE = 16
-"""Edges that can be listed: one pixel in so many."""
-LISTED_LEAST = 1 << 12
-"""The same at least, if there are as many pixels: in a small picture most pixels may be edges."""
 
 
 def shade_config(request: Request) -> ShadeConfig:
@@ -72,21 +68,16 @@ class Shade(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
         width, height = self.request.size
-        edges = min(width * height, max(width * height // LISTED_SHARE, LISTED_LEAST))
         return {
             "virtual": ArraySpec((height, width), wp.vec4),
-            "shade_edge_count": ArraySpec((1,), wp.int32),
-            "shade_edges": ArraySpec((edges,), wp.vec2i),
-            "shade_edge_samples": ArraySpec((edges * self.request.quality.edge_samples,), wp.vec4),
+            **edge_arrays(self.request, self.name),
             **room_arrays(room_config(self.request), self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
         config = shade_config(self.request)
-        lists = None
-        if not device.is_cpu:
-            lists = EdgeLists(*(arrays[f"shade_{name}"] for name in ("edge_count", "edges", "edge_samples")))
+        lists = make_edge_lists(arrays, device, self.name)
         inputs = (
             arrays["params"],
             arrays["rays"],
