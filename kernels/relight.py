@@ -106,9 +106,9 @@ _HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has n
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _NOTHING = wp.constant(-1)
 _BALL = wp.constant(-2)
-_LIT = wp.constant(1 << 24)
 _MASKED = 24
-"""Lights whose shadows are told apart."""
+"""Lights whose shadows are told apart: one bit each."""
+_LIT = wp.constant(1 << _MASKED)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +233,7 @@ class Lit:
     """What virtual light does at a point of the desk."""
 
     added: wp.vec3  # radiance
-    hidden: wp.int32  # bits of lights without penumbra that something stands before
+    seen: wp.int32  # whether any light arrives, whatever the desk makes of it, and which do not: see ``is_edge``
 
 
 @wp.struct
@@ -419,16 +419,17 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
                 visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
                 if visible <= 0.0:
                     if not has_penumbra(lights[index], light):
-                        result.hidden |= bit
+                        result.seen |= bit
                     continue
             else:
                 if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
-                    result.hidden |= bit
+                    result.seen |= bit
                     continue
             if wp.static(config.probes):
                 if meets_probe(desk.probes, hit.point, light.wi, light.distance):
-                    result.hidden |= bit
+                    result.seen |= bit
                     continue
+            result.seen |= _LIT
             response = n_dot_l
             if wp.static(rung != "flat"):
                 if not known:
@@ -450,6 +451,7 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
                 stride = cells.bounced_stride
                 bounced = look_up_cells(cells.bounced, cells.bounced_surface, stride, key, size, row, col)
                 if bounced[0] + bounced[1] + bounced[2] > 0.0:
+                    result.seen |= _LIT
                     if not known:
                         matter = find_matter(scene, desk, hit, row, col, mirror)
                     added += wp.vec3(bounced[0], bounced[1], bounced[2])
@@ -507,7 +509,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         physical_added_out[i, j] = lit.added
         if wp.static(config.edge_samples > 1):
             surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-            seen_out[i, j] = wp.vec2i(surface, lit.hidden + wp.where(wp.max(lit.added) > 0.0, _LIT, 0))
+            seen_out[i, j] = wp.vec2i(surface, lit.seen)
 
     return relight_kernel
 
@@ -516,7 +518,8 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
 def is_edge(seen: wp.array2d[wp.vec2i], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
     """Whether virtual light may change within a pixel, or between it and the next one.
 
-    Balls have light of their own, which ``mirror_ball`` adds.
+    That is where something stands before a light without penumbra for one of them alone, or where they see different
+    surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.
     """
     here = seen[row, column]
     if here[0] == _BALL:
@@ -527,7 +530,6 @@ def is_edge(seen: wp.array2d[wp.vec2i], rect: wp.vec4i, row: wp.int32, column: w
         if inside_rect(i, j, rect):
             there = seen[i, j]
             if there[0] != _BALL:
-                # Bits of lights that only one of them sees, and whether anything is seen at all.
                 if ((here[1] ^ there[1]) & (_LIT - 1)) != 0:
                     return True
                 if here[0] != there[0] and ((here[1] | there[1]) & _LIT) != 0:
