@@ -1,4 +1,4 @@
-"""Virtual light on a desk of one plane and one box, 640x480, every rung, light on the whole frame; and its cells."""
+"""Virtual light on a desk of one plane and one box, 640x480, every rung, light on the whole frame; its cells; edges."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import color, desk_cells, relight, room_samples, summed_area
+from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.kernels.room_shadow import count_parts
 from warp_ar.kernels.structs import BOX, PLANE, POINT, SPHERE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
@@ -91,6 +92,47 @@ def _cells(
     return passes
 
 
+def _edges(
+    device: str,
+    params: wp.array,
+    rays: wp.array,
+    frame: wp.array,
+    decode: wp.array,
+    table: wp.array,
+    scene: RayScene,
+    probes: wp.array,
+    lights: wp.array,
+    keys: wp.array,
+    room: wp.array,
+) -> dict[str, Callable[[], None]]:
+    """Edges at 4 and 16 samples: each pixel's one after another, or listed and side by side."""
+    contenders: dict[str, Callable[[], None]] = {}
+    for samples in (4, 16):
+        trace = TraceConfig((SPHERE,), (PLANE, BOX))
+        config = relight.RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
+        seen, out = wp.zeros((H, W), wp.vec2i, device=device), wp.zeros((H, W), wp.vec3, device=device)
+        desk = relight.make_desk(config, frame, decode, table, probes, keys, room)
+        count = wp.zeros(1, wp.int32, device=device)
+        edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
+        lists = EdgeLists(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
+        relight.relight(config, params, rays, frame, decode, table, scene, probes, lights, keys, room, out, seen)
+        for name, own in (("in place", None), ("listed", lists)):
+
+            def call(
+                config: relight.RelightConfig = config,
+                desk: relight.Desk = desk,
+                seen: wp.array = seen,
+                out: wp.array = out,
+                own: EdgeLists | None = own,
+            ) -> None:
+                relight.smooth_edges(config, params, rays, scene, lights, desk, seen, out, edge_lists=own)
+
+            call()
+            contenders[f"edges, {samples} samples, {name}"] = call
+        assert 100 < int(count.numpy()[0]) < len(edges)
+    return contenders
+
+
 def main(device: str) -> None:
     columns, rows = np.meshgrid((np.arange(W) - W / 2) / 600, (np.arange(H) - H / 2) / 600)
     rays = wp.array(np.stack([columns, rows], -1), dtype=wp.vec2, device=device)
@@ -132,5 +174,6 @@ def main(device: str) -> None:
         assert ((centre > 0.0) & (centre <= bright * 1.01)).all(), (rung, centre)
         contenders[rung] = call
     contenders |= _cells(device, params, rays, frame, decode, table, scene, probes, lights, keys, room, out)
+    contenders |= _edges(device, params, rays, frame, decode, table, scene, probes, lights, keys, room)
     for rung, times in measure(contenders, device).items():
         report(f"relight {W}x{H} {rung}", times, device)

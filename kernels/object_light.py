@@ -338,7 +338,6 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                             hit.shape,
                             ray,
                         )
-                        leaving = 1.0
                 if wp.static(lobes > 0):
                     if alpha >= SHARP:
                         basis = frame_from_normal(normal)
