@@ -110,7 +110,7 @@ def _edges(
     for samples in (4, 16):
         trace = TraceConfig((SPHERE,), (PLANE, BOX))
         config = relight.RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
-        seen, out = wp.zeros((H, W), wp.vec2i, device=device), wp.zeros((H, W), wp.vec3, device=device)
+        seen, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
         desk = relight.make_desk(config, frame, decode, table, probes, keys, room)
         count = wp.zeros(1, wp.int32, device=device)
         edges = wp.zeros(H * W // 16, wp.vec2i, device=device)

@@ -104,11 +104,13 @@ SURROUNDINGS = 1.0 / 8.0
 """Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a lamp's falloff."""
 _HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
-_NOTHING = wp.constant(-1)
-_BALL = wp.constant(-2)
-_MASKED = 24
-"""Lights whose shadows are told apart: one bit each."""
+_MASKED = 8
+"""Lights whose shadows are told apart: one bit each, of what ``relight`` writes for ``smooth_edges``."""
 _LIT = wp.constant(1 << _MASKED)
+"""The bit that tells whether any light arrives; the number of the surface stands above it."""
+_SURFACE = wp.constant(_MASKED + 1)
+_NOTHING = wp.constant(-1 << (_MASKED + 1))
+_BALL = wp.constant(-2 << (_MASKED + 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -478,7 +480,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         desk: Desk,
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
-        seen_out: wp.array2d[wp.vec2i],
+        seen_out: wp.array2d[wp.int32],
     ):
         i, j = wp.tid()
         i += row_start
@@ -487,7 +489,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         if not inside_rect(i, j, params[0].light_rect):
             return
         if wp.static(config.edge_samples > 1):
-            seen_out[i, j] = wp.vec2i(_NOTHING, 0)
+            seen_out[i, j] = _NOTHING
         if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
                 cells = desk.cells
@@ -503,36 +505,37 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         if wp.static(config.probes):
             if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
                 if wp.static(config.edge_samples > 1):
-                    seen_out[i, j] = wp.vec2i(_BALL, 0)
+                    seen_out[i, j] = _BALL
                 return
         lit = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
         physical_added_out[i, j] = lit.added
         if wp.static(config.edge_samples > 1):
             surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-            seen_out[i, j] = wp.vec2i(surface, lit.seen)
+            seen_out[i, j] = (surface << _SURFACE) | lit.seen
 
     return relight_kernel
 
 
 @wp.func
-def is_edge(seen: wp.array2d[wp.vec2i], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
+def is_edge(seen: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
     """Whether virtual light may change within a pixel, or between it and the next one.
 
     That is where something stands before a light without penumbra for one of them alone, or where they see different
     surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.
     """
     here = seen[row, column]
-    if here[0] == _BALL:
+    if here == _BALL:
         return False
     for k in range(4):
         i = row + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
         j = column + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
         if inside_rect(i, j, rect):
             there = seen[i, j]
-            if there[0] != _BALL:
-                if ((here[1] ^ there[1]) & (_LIT - 1)) != 0:
+            if there != here and there != _BALL:
+                differs = here ^ there
+                if (differs & (_LIT - 1)) != 0:
                     return True
-                if here[0] != there[0] and ((here[1] | there[1]) & _LIT) != 0:
+                if (differs >> _SURFACE) != 0 and ((here | there) & _LIT) != 0:
                     return True
     return False
 
@@ -585,7 +588,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         scene: RayScene,
         lights: wp.array[Light],
         desk: Desk,
-        seen: wp.array2d[wp.vec2i],
+        seen: wp.array2d[wp.int32],
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
         # Out:
@@ -614,7 +617,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
 def list_edges_kernel(
     # In:
     params: wp.array[FrameParams],
-    seen: wp.array2d[wp.vec2i],
+    seen: wp.array2d[wp.int32],
     # Out:
     edge_count_out: wp.array[wp.int32],
     edges_out: wp.array[wp.vec2i],
@@ -746,7 +749,7 @@ def relight(
         irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
             ``reflectance``.
         physical_added_out: (H, W) vec3, linear radiance in camera values.
-        seen_out: (H, W) vec2i, which surface a pixel sees and which lights do not; needed if ``config.edge_samples``
+        seen_out: (H, W) int32, which surface a pixel sees and which lights do not; needed if ``config.edge_samples``
             is more than 1. Only what lies in ``light_rect`` is written.
         lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
         cells: From ``desk_cells``; needed if ``config.share`` or ``config.bounced``.
@@ -785,7 +788,7 @@ def smooth_edges(
         scene: Likewise.
         lights: Likewise.
         desk: Of ``make_desk``.
-        seen: (H, W) vec2i as ``relight`` writes.
+        seen: (H, W) int32 as ``relight`` writes.
         physical_added_out: (H, W) vec3 as ``relight`` writes; changed along edges.
         edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
         rows: Band of rows; None means all.

@@ -160,7 +160,7 @@ def run_edges(
     known = frame, tables()[0], table
     balls, lamps = records(Probe, *probes), records(Light, *lights)
     room = wp.array(constant_room((1, 1, 1)), dtype=wp.vec3)
-    out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.vec2i)
+    out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
     relight.relight(config, params, rays, *known, scene, balls, lamps, keys, room, out, seen)
     if samples > 1:
         desk, lists = relight.make_desk(config, *known, balls, keys, room), None

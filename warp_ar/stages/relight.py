@@ -77,7 +77,7 @@ class Relight(Stage):
         width, height = self.request.size
         specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
-            specs["relight_seen"] = ArraySpec((height, width), wp.vec2i)
+            specs["relight_seen"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
         if shares_room(self.request):
             cells = _cells(self.request, _grain(self.request).share)
