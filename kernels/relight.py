@@ -605,7 +605,8 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         if not is_edge(seen, rect, i, j):
             return
         total = wp.vec4()
-        for sample in range(wp.static(config.edge_samples)):
+        count = wp.int32(wp.static(config.edge_samples))  # a variable: the loop must not be unrolled
+        for sample in range(count):
             total += sample_lit(params, rays, scene, lights, desk, i, j, sample)
         if total[3] > 0.0:
             physical_added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
