@@ -166,7 +166,8 @@ def test_parts_of_a_window_turn_as_one(device):
         assert (np.diff(along) > 0.0).all(), "folded"
         chord = parts[b] - parts[a]
         off = np.cross(turned - parts[a], chord / np.linalg.norm(chord))
-        assert np.linalg.norm(off, axis=1).max() < 0.15 * np.linalg.norm(chord)
+        # An arc rises over its chord by 0.02 of it; that distances differ by a tenth bends the way by 0.06 more.
+        assert np.linalg.norm(off, axis=1).max() < 0.1 * np.linalg.norm(chord)
 
 
 def test_distant_lamps_and_none_turn_nothing(device):
