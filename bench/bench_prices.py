@@ -1,7 +1,7 @@
 """What every rung costs: the times of the price list, on ``desk`` at its own size, all else on ``medium``.
 
 ``python -m bench prices --device cpu > bench/results/cpu_prices.jsonl``, then ``python -m bench.write_prices`` puts
-these lines and the errors of ``warp_ar/price_list.json`` into ``docs/prices.md`` and the README.
+these lines and the errors of ``warp_ar/accuracy/price_list.json`` into ``docs/prices.md`` and the README.
 
 Rows: ``rung KNOB RUNG``, the stages that a knob turns, at each of its rungs; ``preset SCENE NAME``, whole frames of the
 presets in turn. On CUDA a frame is the sum of its stages, each alone: stages that run side by side take less.
@@ -16,10 +16,10 @@ from typing import Any
 import warp as wp
 
 from bench.common import report
-from warp_ar.costs import BASE, NOW_AND_THEN, WORK
-from warp_ar.ladder import Knob, light_only, relevant_knobs, setting, turn
-from warp_ar.quality import PRESETS
+from warp_ar.accuracy.cost_table import Knob, light_only, relevant_knobs, setting, turn
+from warp_ar.accuracy.costs import BASE, NOW_AND_THEN, WORK
 from warp_ar.scene import bundled_scenes
+from warp_ar.stages.quality import PRESETS
 from warp_ar.tradeoff import Case, count_work, open_scene, run, run_in_turn, sized_lamp
 
 FRAMES = 12

@@ -11,11 +11,11 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar import recovery
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
-from warp_ar.ray_scene import HostScene, trace_config
+from warp_ar.light import recovery
 from warp_ar.scene import load_scene
+from warp_ar.scene.ray_scene import HostScene, trace_config
 
 HEIGHTS = (64, 128)
 

@@ -8,10 +8,10 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
-from warp_ar.sources import open_source
+from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.room_shadow import RUNGS
 
 CASES = tuple((scene, rung) for scene in ("torus", "mirror") for rung in RUNGS if rung != "brute_force")

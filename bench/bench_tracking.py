@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from bench.common import measure, report
-from warp_ar.scene import Camera, CharucoBoard, Marker
-from warp_ar.tracking import MarkerDetector, Pose, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.input.tracking import MarkerDetector, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
 
 SINGLE = Marker()
 BOARD = Marker("DICT_5X5_100", board=CharucoBoard(5, 7, 0.03, 0.022))

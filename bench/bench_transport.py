@@ -26,8 +26,8 @@ import numpy as np
 from aiohttp import web
 
 from bench.common import report
+from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
-from warp_ar.sources import open_source
 from warp_ar.viewer.server import encode_jpeg
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))

@@ -1,9 +1,9 @@
 """``python -m bench.write_prices``: the measured price list into ``docs/prices.md`` and the README.
 
 It reads ``bench/results/*_prices.jsonl``, which ``python -m bench prices`` prints, and the errors of
-``warp_ar/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and replaces
-what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what the rule of
-``quality.BUDGETS`` would choose.
+``warp_ar/accuracy/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
+replaces what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what
+the rule of ``quality.BUDGETS`` would choose.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from warp_ar.costs import BASE
-from warp_ar.ladder import KNOBS, WORDS, Choice, Price, choose, frontier, load_errors, setting
-from warp_ar.quality import BUDGETS, PRESETS, SHARE
+from warp_ar.accuracy.cost_table import KNOBS, WORDS, Choice, Price, choose, frontier, load_errors, setting
+from warp_ar.accuracy.costs import BASE
+from warp_ar.stages.quality import BUDGETS, PRESETS, SHARE
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "bench" / "results"

@@ -7,7 +7,7 @@ radiance L receives
     E(x) = pi L / rho = sum over the room's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle visibility.
 
 The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps``
-the same for lamps at finite distances. ``warp_ar.recovery`` solves for what is missing in the clipped cells,
+the same for lamps at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
 ``add_excess`` puts it into the map.
 
 **Rims.** Half a pixel around a lamp clips as well: ``weigh_rims``.

@@ -972,7 +972,7 @@ def bundle_truth(name: str, options: argparse.Namespace) -> None:
     plain = encode(camera)
     if scale == 1.0:
         truth = encode(Renderer(clip, options.spp, virtual).frame(moment, 5000 + index))
-        # As warp_ar.metrics.changed_region, but finer and wider: faint shadows and light end softly.
+        # As warp_ar.accuracy.metrics.changed_region, but finer and wider: faint shadows and light end softly.
         difference = np.abs(truth.astype(np.float32) - plain).max(-1) / 255
         region, reach = cv2.GaussianBlur(difference, (0, 0), 3.0) > 0.01, 15
     else:

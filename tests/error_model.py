@@ -1,4 +1,4 @@
-"""Checks kernels against the error model: where a twin in float64 exists, ``warp_ar.numerics`` must hold.
+"""Checks kernels against the error model: where a twin in float64 exists, ``warp_ar.stages.numerics`` must hold.
 
 Twin tests call ``check_error`` with what the kernel and what the twin found; ``tests.hard_cases.measure_errors`` reads
 the worst errors from ``worst``.
@@ -11,7 +11,7 @@ import collections
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.numerics import NUMERICS
+from warp_ar.stages.numerics import NUMERICS
 
 worst: dict[str, float] = collections.defaultdict(float)
 """Largest error of every stage that was compared in this process."""

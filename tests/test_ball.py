@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from warp_ar.ball import fit_ball
-from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene, load_scene
+from warp_ar.input.ball import fit_ball
+from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene, load_scene
 from warp_ar.session import Session
-from warp_ar.tracking import Pose
 
 FOUND_MM = 0.4
 """Blurred look-ups against area-sampled reflections, codes of 8 bits; measured 0.13."""

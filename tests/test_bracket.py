@@ -15,17 +15,18 @@ from tests.error_model import check_error
 from tests.reference import bracket as reference
 from tests.reference import latlong as latlong_reference
 from tests.reference import probe as probe_reference
-from warp_ar.bracket import bracket_ratios, brightened, find_exposure
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
+from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.input.sources import Synthetic
 from warp_ar.kernels import bracket
 from warp_ar.kernels.color import decode_table
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
 from warp_ar.scene import (
     Camera,
     Marker,
     MirrorMaterial,
     Object,
+    Pose,
     Probe,
     Proxy,
     Scene,
@@ -34,8 +35,7 @@ from warp_ar.scene import (
     loads_scene,
 )
 from warp_ar.session import Session
-from warp_ar.sources import Synthetic
-from warp_ar.tracking import Pose
+from warp_ar.stages.quality import PRESETS
 
 TWIN = 2e-6
 """Float32 weights and means: a dozen roundings."""

@@ -14,9 +14,10 @@ import pytest
 from tests.test_tracking import look, make_camera, render
 from warp_ar import calibrate
 from warp_ar.errors import UsageError
+from warp_ar.input import ball_outline, camera_calibration, card, response
+from warp_ar.input.tracking import Tracker
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, Marker, Probe, load_scene
-from warp_ar.tracking import Pose, Tracker
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_scene
 
 BOARD = Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.035, 0.026))
 FOCAL = 0.003
@@ -54,10 +55,10 @@ def test_card_prints_at_exact_size(tmp_path):
 def test_card_shows_what_is_tracked(marker):
     """The card seen straight on, a pixel per half millimetre, gives the pose at which a page of its size would look
     so."""
-    card = calibrate.draw_card(marker, 2000.0)
-    h, w = card.shape
+    drawn = card.draw_card(marker, 2000.0)
+    h, w = drawn.shape
     camera = Camera(w, h, 1000.0, 1000.0, (w - 1) / 2, (h - 1) / 2)
-    track = Tracker(marker, camera).track(np.repeat(card[..., None], 3, 2), 0.0)
+    track = Tracker(marker, camera).track(np.repeat(drawn[..., None], 3, 2), 0.0)
     assert np.allclose(track.pose.translation, (0, 0, 0.5), atol=1e-3)
     assert np.allclose(track.pose.rotation, np.diag([1, -1, -1]), atol=0.02)
 
@@ -99,7 +100,7 @@ def test_camera_is_found_and_read_back(tmp_path, capsys):
     output = tmp_path / "camera.yml"
     text = str(BOARD.board)
     assert calibrate.main(["camera", str(tmp_path), "--board", text, "--output", str(output)]) == 0
-    found = Camera.load_calibration(output)
+    found = load_calibration(output)
     assert (found.width, found.height) == (640, 480)
     assert abs(found.fx / 700 - 1) < FOCAL
     assert abs(found.fy / 700 - 1) < FOCAL
@@ -117,7 +118,7 @@ def test_camera_warns_of_poor_views():
     images = [
         render((BOARD, look(3 + k, distance=0.9, at=(0.05 * k - 0.12, 0.0))), camera=camera, seed=k) for k in range(6)
     ]
-    report = calibrate.calibrate_camera(images, BOARD)
+    report = camera_calibration.calibrate_camera(images, BOARD)
     said = " ".join(report.warnings)
     assert "views" in said
     assert "never reached" in said
@@ -127,11 +128,11 @@ def test_camera_warns_of_poor_views():
 def test_camera_needs_views():
     image = render((BOARD, look(20)))
     with pytest.raises(UsageError, match="1 different views"):
-        calibrate.calibrate_camera([image, image, image], BOARD)  # the same again does not count
+        camera_calibration.calibrate_camera([image, image, image], BOARD)  # the same again does not count
     with pytest.raises(UsageError, match="0 different views"):
-        calibrate.calibrate_camera([], BOARD)
+        camera_calibration.calibrate_camera([], BOARD)
     with pytest.raises(UsageError, match="ChArUco"):
-        calibrate.calibrate_camera([image], Marker())
+        camera_calibration.calibrate_camera([image], Marker())
 
 
 def test_response_is_recovered(tmp_path, capsys):
@@ -155,20 +156,20 @@ def test_response_is_recovered(tmp_path, capsys):
 @pytest.mark.parametrize("exposures", [[1.0, 2.0], [1.0, 1.1, 1.2], [1.0, 2.0, -4.0], [1.0, 2.0, float("nan")]])
 def test_response_needs_a_bracket(exposures):
     with pytest.raises(UsageError, match="expected"):
-        calibrate.measure_response([np.zeros((8, 8, 3), np.uint8)] * len(exposures), exposures)
+        response.measure_response([np.zeros((8, 8, 3), np.uint8)] * len(exposures), exposures)
 
 
 def test_outline_of_a_ball():
     """Tangent rays: every point of the outline is seen exactly one radius from the centre."""
     camera, pose, center = make_camera(), look(50, 20), np.array([0.06, 0.05, 0.035])
-    pixels, normals, above = calibrate.outline_ball(camera, pose, center, 0.035)
+    pixels, normals, above = ball_outline.outline_ball(camera, pose, center, 0.035)
     rays = np.column_stack([(pixels - (319.5, 239.5)) / 640.0, np.ones(len(pixels))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     c = pose.apply(center)
     assert np.allclose(np.linalg.norm(np.cross(rays, c), axis=1), 0.035, atol=1e-12)
     assert (((pixels - pixels.mean(0)) * normals).sum(1) > 0).all()
     assert above.sum() == pytest.approx(len(above) / 2, abs=2)
-    assert len(calibrate.outline_ball(camera, pose, np.array([0, 0, 5.0]), 0.035)[0]) == 0  # behind the camera
+    assert len(ball_outline.outline_ball(camera, pose, np.array([0, 0, 5.0]), 0.035)[0]) == 0  # behind the camera
 
 
 def test_ball_stands_where_it_was_drawn():
@@ -185,7 +186,7 @@ def test_ball_stands_where_it_was_drawn():
         image = np.round(120 + hit[..., None] * (80, 70, 60)).astype(np.uint8)
         frames.append((image, pose))
     probe = Probe(tuple(center + np.array([0.006, -0.004, 0])), 0.035)
-    report = calibrate.locate_ball(frames, camera, probe)
+    report = ball_outline.locate_ball(frames, camera, probe)
     assert report.deviation is None  # it mirrors nothing
     assert np.linalg.norm(np.subtract(report.center, center)) < BALL_DRAWN_MM / 1e3
     assert report.contrast > 0.6
@@ -207,7 +208,7 @@ def test_ball_on_truth_by_its_outline(shared):
         scene, frames = truth_frames(path, 3)
         truth = np.array(scene.probes[0].center)
         rough = truth + np.array([0.004, -0.003, 0])
-        report = calibrate.outline_search(frames, scene.camera, rough, scene.probes[0].radius)
+        report = ball_outline.outline_search(frames, scene.camera, rough, scene.probes[0].radius)
         hard = path.parent.name in ("night_desk_lamp", "plastic_bunny_sunset")
         bound = BALL_OUTLINE_HARD_MM if hard else BALL_OUTLINE_MM
         assert np.linalg.norm(report.center - truth) * 1e3 < bound, path
@@ -218,7 +219,7 @@ def test_ball_on_truth_by_the_desk_in_it(shared):
         scene, frames = truth_frames(path, 4)
         truth = np.array(scene.probes[0].center)
         probe = dataclasses.replace(scene.probes[0], center=tuple(truth + np.array([0.004, -0.003, 0.0])))
-        report = calibrate.locate_ball(frames, scene.camera, probe, scene.proxies)
+        report = ball_outline.locate_ball(frames, scene.camera, probe, scene.proxies)
         assert report.deviation is not None, path
         assert np.linalg.norm(report.center - truth) * 1e3 < BALL_MM, path
 

@@ -8,11 +8,11 @@ import time
 import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
-from warp_ar import costs as costs_module
-from warp_ar.costs import BASE, Costs, measure_costs, read_costs, show_again, time_alone, write_costs
-from warp_ar.ladder import KNOBS, relevant_knobs, setting, turn
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
+from warp_ar.accuracy import costs as costs_module
+from warp_ar.accuracy.cost_table import KNOBS, relevant_knobs, setting, turn
+from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_again, time_alone, write_costs
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.stages.quality import PRESETS
 
 KNOB = next(knob for knob in KNOBS if knob.name == "diffuse")
 KEPT = Costs(12.5, {"diffuse": {"sh2": 0.0, "sh4": 1.25}}, {"diffuse": {"sh4": {"specular": 2.0}}}, 2.5, 20.0)

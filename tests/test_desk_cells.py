@@ -17,14 +17,14 @@ from tests.reference.room_shadow import sphere_form_factor
 from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_room, point, records, shape
 from tests.test_room_shadow import draw, lamp_at, list_texels, sky, with_sun
-from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels import desk_cells, relight, room_samples, summed_area
 from warp_ar.kernels.desk_cells import Patch
 from warp_ar.kernels.room_samples import RoomSample
 from warp_ar.kernels.structs import BOX, DIRECTIONAL, MESH, PLANE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
-from warp_ar.ray_scene import HostScene, proxies_face
 from warp_ar.scene import Camera, Proxy, Scene
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.ray_scene import HostScene, proxies_face
 
 SIZE_OF_FRAME = (48, 64)
 FOCAL = 60.0

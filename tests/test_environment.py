@@ -7,11 +7,11 @@ from tests.reference import environment as reference
 from tests.reference import latlong
 from warp_ar.kernels import environment
 from warp_ar.kernels.structs import FrameParams, KeyLight
-from warp_ar.quality import PRESETS
 from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Arrays, LeftOut, Request, Wiring
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
+from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.unwrap import Unwrap
 
 # Float32 sums and exponentials, a few roundings each.

@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from warp_ar.errors import SceneError
-from warp_ar.geometry import (
+from warp_ar.scene.geometry import (
     Mesh,
     box_mesh,
     load_mesh,

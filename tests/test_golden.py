@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS, Quality
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.sources import open_source
 from warp_ar.scene import bundled_scenes, load_scene
-from warp_ar.sources import open_source
+from warp_ar.stages.quality import PRESETS, Quality
 
 GOLDEN = Path(__file__).parent / "golden"
 SCENES = ("darken", "desk", "mirror", "torus", "wire_coincident", "wire_opposing")

@@ -9,10 +9,10 @@ from tests.reference import irradiance as reference
 from tests.reference import latlong
 from warp_ar.kernels import irradiance, pyramid
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.quality import PRESETS
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays, LeftOut, Request
 from warp_ar.stages.diffuse import Diffuse, diffuse_output
+from warp_ar.stages.quality import PRESETS
 
 # The best public renderer keeps a white furnace within this.
 FURNACE = 5e-4

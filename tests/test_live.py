@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from warp_ar import explain, live
-from warp_ar.sinks import read_environment
-from warp_ar.sources import Synthetic
+from warp_ar.input.sources import Synthetic
+from warp_ar.output.sinks import read_environment
 
 FRAMES = 4
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_ar.metrics import array_error, changed_region, clipped_region, flip_map, latlong_weights
+from warp_ar.accuracy.metrics import array_error, changed_region, clipped_region, flip_map, latlong_weights
 
 # Sums in float64.
 EXACT = 1e-12

@@ -17,7 +17,8 @@ from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
 from tests.test_composite import tables
 from tests.test_relight import constant_room, records
-from warp_ar.graph import make_plan
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.relight import RUNGS as RELIGHT_RUNGS
@@ -44,11 +45,10 @@ from warp_ar.kernels.structs import (
     Shape,
 )
 from warp_ar.kernels.visibility import TraceConfig
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
 from warp_ar.scene import load_scene
 from warp_ar.stages.base import Request
 from warp_ar.stages.mirror_ball import SAMPLES, mirror_config
+from warp_ar.stages.quality import PRESETS
 
 H, W, FOCAL = 48, 64, 150.0
 # Positions on what is mirrored carry 1e-7 of a metre, times the ball's curvature; lights are decimetres away.

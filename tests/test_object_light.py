@@ -10,15 +10,15 @@ from tests.reference import object_light as reference
 from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
 from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
-from warp_ar.graph import make_plan
+from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import object_light, shade
 from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
-from warp_ar.quality import PRESETS
 from warp_ar.scene import load_scene
 from warp_ar.stages.base import Request
+from warp_ar.stages.quality import PRESETS
 
 # Sampling error of one set of 64 for a cosine lobe of any direction.
 FURNACE_ERROR = 0.15

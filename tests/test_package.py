@@ -44,7 +44,7 @@ def test_all_is_pinned_and_resolves() -> None:
 def test_import_does_not_initialise_warp() -> None:
     code = (
         "import warp_ar, sys; assert 'warp' not in sys.modules, 'importing the package loads Warp';"
-        "import warp_ar.pipeline, warp_ar.live, warp_ar.explain, warp as wp;"
+        "import warp_ar.engine.pipeline, warp_ar.live, warp_ar.explain, warp as wp;"
         "assert wp._src.context.runtime is None, 'importing the modules initialises Warp'"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -10,10 +10,10 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
+from warp_ar.engine.pipeline import Pipeline, Result, resample_light
 from warp_ar.errors import UsageError
-from warp_ar.pipeline import Pipeline, Result, resample_light
-from warp_ar.quality import PRESETS
-from warp_ar.ray_scene import HostScene
+from warp_ar.input.sources import Synthetic
+from warp_ar.input.tracking import TrackState
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -26,8 +26,8 @@ from warp_ar.scene import (
     Proxy,
     Scene,
 )
-from warp_ar.sources import Synthetic
-from warp_ar.tracking import TrackState
+from warp_ar.scene.ray_scene import HostScene
+from warp_ar.stages.quality import PRESETS
 
 SIZE = (320, 240)
 # Codes by which a picture may lag where its light moved too little for readers to run again; when that is, differs.

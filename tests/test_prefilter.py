@@ -10,9 +10,9 @@ from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
 from warp_ar.kernels import prefilter, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.quality import PRESETS
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays, LeftOut, Request
+from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.specular import Specular, scene_lobe
 
 # The best public prefilter keeps a white furnace within this.

@@ -13,9 +13,10 @@ import warp as wp
 from tests.reference import visibility as reference
 from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
-from warp_ar.geometry import rotation_matrix
 from warp_ar.kernels import structs
-from warp_ar.ray_scene import (
+from warp_ar.scene import Pose
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.ray_scene import (
     EMPTY,
     HostScene,
     Outline,
@@ -26,7 +27,6 @@ from warp_ar.ray_scene import (
     screen_rects,
     trace_config,
 )
-from warp_ar.tracking import Pose
 
 CAMERA = scenes.Camera(width=64, height=48, fx=60.0, fy=62.0, cx=30.5, cy=24.0)
 BENT = dataclasses.replace(CAMERA, distortion=(-0.25, 0.08, 0.003, -0.002, 0.0))

@@ -5,13 +5,13 @@ import dataclasses
 import pytest
 import warp as wp
 
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.scheduler import Scheduler
 from warp_ar.kernels.wide_bvh import build_wide_bvh_kernel
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
 from warp_ar.scene import bundled_scenes, load_scene
-from warp_ar.scheduler import Scheduler
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Arrays
+from warp_ar.stages.quality import PRESETS
 
 INPUT_ARRAYS = {"frame": "frame", "light_array": "lights"}
 """Arrays of the pipeline that stand for a resource whose changes make stages run."""

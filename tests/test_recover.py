@@ -17,18 +17,17 @@ from scipy.optimize import nnls
 
 from tests.error_model import check_error
 from tests.reference import recover as reference
-from warp_ar import recovery
-from warp_ar.geometry import rotation_matrix
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS
-from warp_ar.ray_scene import HostScene, trace_config
-from warp_ar.scene import load_scene, loads_scene
+from warp_ar.light import recovery
+from warp_ar.scene import Pose, load_scene, loads_scene
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.ray_scene import HostScene, trace_config
 from warp_ar.session import Session
+from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover
-from warp_ar.tracking import Pose
 
 ROWS, COLUMNS = kernels.CELL_ROWS, kernels.CELL_COLUMNS
 QUADRATURE = 0.003
@@ -594,7 +593,7 @@ def test_errors_are_shared_by_what_is_near():
 
 TWO_SOLVERS = """
 from threadpoolctl import threadpool_info, threadpool_limits
-from warp_ar import recovery
+from warp_ar.light import recovery
 
 def threads():
     return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]

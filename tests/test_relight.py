@@ -545,9 +545,9 @@ def test_nearer_to_the_truth_rung_by_rung(device, shared):
 
     import cv2
 
-    from warp_ar.pipeline import pixel_rays
-    from warp_ar.ray_scene import HostScene, trace_config
     from warp_ar.scene import load_scene
+    from warp_ar.scene.pixel_rays import pixel_rays
+    from warp_ar.scene.ray_scene import HostScene, trace_config
 
     case = shared / "truth" / "gold_torus_interior"
     scene = load_scene(case / "scene_light.toml")

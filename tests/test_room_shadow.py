@@ -8,7 +8,7 @@ from tests.error_model import check_error
 from tests.reference import room_shadow as reference
 from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records, shape
-from warp_ar.graph import make_plan
+from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import room_samples, room_shadow
 from warp_ar.kernels.reflect import Room, RoomConfig
 from warp_ar.kernels.room_samples import RoomSample
@@ -25,9 +25,9 @@ from warp_ar.kernels.structs import (
     Shape,
 )
 from warp_ar.kernels.visibility import TraceConfig
-from warp_ar.quality import PRESETS
 from warp_ar.scene import load_scene
 from warp_ar.stages.base import Request
+from warp_ar.stages.quality import PRESETS
 
 COUNT, SIDE = 64, 4
 ORIGIN = (0.0, 0.0, 0.035)

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from warp_ar import scene as sc
 from warp_ar.errors import SceneError, WarpArError
-from warp_ar.geometry import rotation_matrix
 from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene, loads_scene
+from warp_ar.scene.geometry import rotation_matrix
 
 CAMERA = """
 schema = 1
@@ -235,7 +235,7 @@ def test_another_aspect_cannot_be_scaled(size: tuple[int, int]) -> None:
 
 
 def test_calibration_of_the_real_clip(shared: pathlib.Path) -> None:
-    camera = Camera.load_calibration(shared / "real/aruco_clip/intrinsics.yml")
+    camera = load_calibration(shared / "real/aruco_clip/intrinsics.yml")
     distortion = (0.0995485, -0.206384, 0.00754589, 0.00336531, 0.0)
     assert camera == Camera(640, 480, 628.158, 628.156, 324.099, 260.908, distortion)
 
@@ -264,14 +264,14 @@ def test_calibration_as_ros_and_scripts_write_it(folder: pathlib.Path) -> None:
         "camera_matrix:\n  rows: 3\n  cols: 3\n  data: [600, 0, 320, 0, 601.5, 240, 0, 0, 1]\n"
         "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, 0, 0, 0, 0]\n"
     )
-    assert Camera.load_calibration(ros) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.1, 0.0, 0.0, 0.0, 0.0))
+    assert load_calibration(ros) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.1, 0.0, 0.0, 0.0, 0.0))
     script = folder / "script.json"
     script.write_text(
         json.dumps(
             {"mtx": [[600, 0, 320], [0, 601.5, 240], [0, 0, 1]], "dist": [[0, 0, 0, 0]], "image_size": [640, 480]}
         )
     )
-    assert Camera.load_calibration(script) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.0,) * 4)
+    assert load_calibration(script) == Camera(640, 480, 600.0, 601.5, 320.0, 240.0, (0.0,) * 4)
 
 
 GOOD_CALIBRATION: dict[str, Any] = {
@@ -301,7 +301,7 @@ def test_calibration_errors(folder: pathlib.Path, change: dict[str, Any], messag
     data = {key: value for key, value in (GOOD_CALIBRATION | change).items() if value is not None}
     path.write_text(json.dumps(data))
     with pytest.raises(SceneError, match=message) as caught:
-        Camera.load_calibration(path)
+        load_calibration(path)
     assert_helpful(caught.value, path)
 
 
@@ -313,7 +313,7 @@ def test_calibration_that_is_none(folder: pathlib.Path, text: str, suffix: str) 
     path = folder / f"camera{suffix}"
     path.write_text(text)
     with pytest.raises(SceneError) as caught:
-        Camera.load_calibration(path)
+        load_calibration(path)
     assert_helpful(caught.value, path)
 
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar import graph
-from warp_ar.graph import Plan, make_plan
+from warp_ar.engine import graph
+from warp_ar.engine.graph import Plan, make_plan
+from warp_ar.engine.scheduler import Scheduler, _giving_way
 from warp_ar.kernels.launch import launch_rows
-from warp_ar.quality import PRESETS
-from warp_ar.scheduler import Scheduler, _giving_way
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.quality import PRESETS
 
 SIZE = 37
 

@@ -16,7 +16,8 @@ import OpenEXR
 import pytest
 
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.sinks import (
+from warp_ar.input.sources import open_source
+from warp_ar.output.sinks import (
     FRAMES_WAITING,
     EnvironmentSink,
     NullSink,
@@ -26,7 +27,6 @@ from warp_ar.sinks import (
     read_environment,
     write_environment,
 )
-from warp_ar.sources import open_source
 
 # 4:2:0 at limited range keeps 219 of 255 levels; at this quality the codec adds its own rounding.
 VIDEO_LEVELS = 3
@@ -236,7 +236,7 @@ def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> No
 def test_killed_process_leaves_a_video(tmp_path: pathlib.Path) -> None:
     script = (
         "import os, sys, numpy as np\n"
-        "from warp_ar.sinks import open_sink\n"
+        "from warp_ar.output.sinks import open_sink\n"
         "sink = open_sink(sys.argv[1], fps=24)\n"
         "for index in range(120):\n"
         "    sink.write(np.full((48, 64, 3), index, np.uint8))\n"

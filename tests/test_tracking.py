@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker
-from warp_ar.tracking import MarkerDetector, Pose, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.input.tracking import MarkerDetector, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
 
 RENDERED_DEGREES, RENDERED_MM = 0.15, 0.4
 """Edge refinement on 8-bit renderings with noise of one grey level, markers of 60 pixels or more at about 0.6 m;

@@ -14,13 +14,14 @@ import pytest
 from rich.console import Console
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
-from warp_ar import tradeoff, tradeoff_page
-from warp_ar.ladder import KNOBS, read_errors
-from warp_ar.live import EXIT_DONE, EXIT_USAGE
-from warp_ar.metrics import ArrayError
-from warp_ar.quality import PRESETS
-from warp_ar.sources import Frame
-from warp_ar.tracking import Tracker
+from warp_ar import tradeoff
+from warp_ar.accuracy import tradeoff_page
+from warp_ar.accuracy.cost_table import KNOBS, read_errors
+from warp_ar.accuracy.metrics import ArrayError
+from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
+from warp_ar.input.sources import Frame
+from warp_ar.input.tracking import Tracker
+from warp_ar.stages.quality import PRESETS
 
 pytest.importorskip("flip_evaluator")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.transfer import COPY_BYTES, COPY_THREADS, KEPT, Transfers, split_rows
+from warp_ar.engine.transfer import COPY_BYTES, COPY_THREADS, KEPT, Transfers, split_rows
 
 
 @pytest.mark.parametrize(("height", "width", "parts"), [(480, 640, 1), (1080, 1920, 2), (2160, 3840, COPY_THREADS)])

@@ -22,16 +22,17 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_auto_quality import even_costs
+from tests.test_budget import even_costs
 from tests.test_pipeline import make_scene
 from warp_ar import live
-from warp_ar.auto_quality import AIM
-from warp_ar.calibrate import card_size, draw_card
-from warp_ar.costs import Costs
+from warp_ar.accuracy.budget import AIM
+from warp_ar.accuracy.cost_table import KNOBS
+from warp_ar.accuracy.costs import Costs
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError, WarpArError
-from warp_ar.ladder import KNOBS
-from warp_ar.pipeline import Pipeline, pixel_rays
-from warp_ar.quality import PRESETS
+from warp_ar.input.card import card_size, draw_card
+from warp_ar.input.sources import Synthetic, open_source
+from warp_ar.output.sinks import read_environment
 from warp_ar.scene import (
     Animation,
     Camera,
@@ -46,8 +47,8 @@ from warp_ar.scene import (
     load_scene,
     loads_scene,
 )
-from warp_ar.sinks import read_environment
-from warp_ar.sources import Synthetic, open_source
+from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import dial, edits, protocol
 from warp_ar.viewer.dial import Dial
 from warp_ar.viewer.edits import Wanted
@@ -717,7 +718,7 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
         report = running.host.calibration_message()["report"]
         assert report["focal"] == pytest.approx(truth.fx, rel=CALIBRATED_ERROR)
         (tmp_path / "camera.yml").write_bytes(running.host.camera_file())
-        camera = Camera.load_calibration(tmp_path / "camera.yml")
+        camera = load_calibration(tmp_path / "camera.yml")
         assert camera.fx == pytest.approx(report["focal"])
 
         def lit_so() -> Lit | None:

@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_auto_quality import even_costs
-from warp_ar.costs import cost_key, write_costs
-from warp_ar.ladder import relevant_knobs
-from warp_ar.pipeline import Pipeline
+from tests.test_budget import even_costs
+from warp_ar.accuracy.cost_table import relevant_knobs
+from warp_ar.accuracy.costs import cost_key, write_costs
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.sources import open_source
 from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
-from warp_ar.sources import open_source
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -47,7 +47,7 @@ LIVE = """
 import faulthandler
 import sys
 faulthandler.enable()
-from warp_ar import ladder
+from warp_ar.accuracy import cost_table as ladder
 errors = {knob.name: {rung: 0.1 / (1 + i) for i, rung in enumerate(knob.rungs)} for knob in ladder.KNOBS}
 ladder.load_errors = lambda: errors
 from warp_ar.live import main

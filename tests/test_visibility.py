@@ -10,10 +10,10 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.reference import visibility as reference
-from warp_ar.geometry import Mesh, rotation_matrix, smooth_normals, sphere_mesh, torus_mesh
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, make_trace, offset_origin, trace_pixels
-from warp_ar.ray_scene import make_ray_mesh
+from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals, sphere_mesh, torus_mesh
+from warp_ar.scene.ray_scene import make_ray_mesh
 
 EVERY = (structs.PLANE, structs.BOX, structs.MESH, structs.SPHERE)
 GENERAL = TraceConfig(EVERY, EVERY)

@@ -11,26 +11,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from warp_ar.engine.graph import Plan, make_plan
+    from warp_ar.engine.pipeline import Pipeline, Result
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
-    from warp_ar.graph import Plan, make_plan
-    from warp_ar.pipeline import Pipeline, Result
-    from warp_ar.quality import PRESETS, Quality
-    from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
+    from warp_ar.input.sources import Frame, open_source
+    from warp_ar.input.tracking import Tracker, TrackState
+    from warp_ar.output.sinks import open_sink, read_environment, write_environment
+    from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
     from warp_ar.session import Session
-    from warp_ar.sinks import open_sink, read_environment, write_environment
-    from warp_ar.sources import Frame, open_source
-    from warp_ar.tracking import Pose, Tracker, TrackState
+    from warp_ar.stages.quality import PRESETS, Quality
 
 _HOMES = {
     "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),
-    "graph": ("Plan", "make_plan"),
-    "pipeline": ("Pipeline", "Result"),
-    "quality": ("PRESETS", "Quality"),
-    "scene": ("Scene", "bundled_scenes", "dumps_scene", "load_scene"),
+    "engine.graph": ("Plan", "make_plan"),
+    "engine.pipeline": ("Pipeline", "Result"),
+    "stages.quality": ("PRESETS", "Quality"),
+    "scene": ("Pose", "Scene", "bundled_scenes", "dumps_scene", "load_scene"),
     "session": ("Session",),
-    "sinks": ("open_sink", "read_environment", "write_environment"),
-    "sources": ("Frame", "open_source"),
-    "tracking": ("Pose", "TrackState", "Tracker"),
+    "output.sinks": ("open_sink", "read_environment", "write_environment"),
+    "input.sources": ("Frame", "open_source"),
+    "input.tracking": ("TrackState", "Tracker"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
+from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Parser
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import WarpArError
-from warp_ar.graph import make_plan
-from warp_ar.live import EXIT_DONE, EXIT_USAGE, Parser
-from warp_ar.numerics import NUMERICS
-from warp_ar.pipeline import resolve_quality
-from warp_ar.quality import DEFAULT_PRESET, PRESETS
-from warp_ar.run_log import print_plan
+from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Request
+from warp_ar.stages.numerics import NUMERICS
+from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

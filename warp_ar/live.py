@@ -17,23 +17,19 @@ import time
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, Parser
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.quality import DEFAULT_PRESET, PRESETS
-from warp_ar.run_log import RunLog, print_plan
-from warp_ar.scene import Camera, Scene, bundled_scenes, load_scene
+from warp_ar.output.report import RunLog, print_plan
+from warp_ar.output.sinks import NullSink, open_sink, write_environment
+from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
 from warp_ar.session import Session
-from warp_ar.sinks import NullSink, open_sink, write_environment
-
-EXIT_DONE = 0
-EXIT_FAILED = 1
-EXIT_USAGE = 2
-EXIT_INTERRUPTED = 130
+from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -44,14 +40,6 @@ MARKER_PATIENCE = 100
 
 class RunError(WarpArError):
     """Something failed after frames had begun to flow."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Argument parser whose errors are one line, as all errors here are."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise the message as an error of usage."""
-        raise UsageError(f"{message}; see {self.prog} --help")
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -203,7 +191,7 @@ def serve_page(options: argparse.Namespace) -> int:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     scene = load_scene(options.scene)
     if options.calibration is not None:
-        scene = dataclasses.replace(scene, camera=Camera.load_calibration(options.calibration, scene.camera.transfer))
+        scene = dataclasses.replace(scene, camera=load_calibration(options.calibration, scene.camera.transfer))
     local = options.host in LOOPBACK
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
-from warp_ar.ball import BallFit, refine_balls
+from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.pipeline import Pipeline, Result
-from warp_ar.quality import DEFAULT_PRESET, Quality
-from warp_ar.scene import Camera, Scene, SourceSpec, load_scene
-from warp_ar.sources import Frame, Source, open_source
+from warp_ar.input.ball import BallFit, refine_balls
+from warp_ar.input.sources import Frame, Source, open_source
+from warp_ar.scene import Scene, SourceSpec, load_calibration, load_scene
+from warp_ar.stages.quality import DEFAULT_PRESET, Quality
 
 
 def _where(spec: SourceSpec) -> str | int | Path:
@@ -64,7 +64,7 @@ class Session:
         """
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         if calibration is not None:
-            camera = Camera.load_calibration(calibration, self.scene.camera.transfer)
+            camera = load_calibration(calibration, self.scene.camera.transfer)
             self.scene = dataclasses.replace(self.scene, camera=camera)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")

@@ -45,13 +45,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from warp_ar import tradeoff_page
-from warp_ar.costs import BASE as COST_BASE
-from warp_ar.costs import NOW_AND_THEN, WORK, make_prices, measure_costs, open_profiled, worked_ms
-from warp_ar.errors import UsageError, WarpArError
-from warp_ar.graph import make_plan
-from warp_ar.kernels.color import decode_table
-from warp_ar.ladder import (
+from warp_ar.accuracy import tradeoff_page
+from warp_ar.accuracy.cost_table import (
     KNOBS,
     Choice,
     Knob,
@@ -63,14 +58,19 @@ from warp_ar.ladder import (
     setting,
     turn,
 )
-from warp_ar.live import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
-from warp_ar.metrics import ArrayError, array_error, changed_region, clipped_region, flip_map, latlong_weights
-from warp_ar.pipeline import TRACK, Pipeline, Result
-from warp_ar.quality import PRESETS, Quality
-from warp_ar.scene import Scene, bundled_scenes, load_scene
-from warp_ar.sources import Frame, open_source
+from warp_ar.accuracy.costs import BASE as COST_BASE
+from warp_ar.accuracy.costs import NOW_AND_THEN, WORK, make_prices, measure_costs, open_profiled, worked_ms
+from warp_ar.accuracy.metrics import ArrayError, array_error, changed_region, clipped_region, flip_map, latlong_weights
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import TRACK, Pipeline, Result
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.input.sources import Frame, open_source
+from warp_ar.input.tracking import Tracker
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.stages.base import Request
-from warp_ar.tracking import Pose, Tracker
+from warp_ar.stages.quality import PRESETS, Quality
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from warp_ar.geometry import Mesh
+from warp_ar.scene.geometry import Mesh
 
 TINY = float(np.float32(1e-40))
 """A denormal float32."""

@@ -274,7 +274,7 @@ MUTATIONS = (
     Mutation(
         13,
         "the BVH's boxes are not enlarged: rays slip through shared edges",
-        "warp_ar/ray_scene.py",
+        "warp_ar/scene/ray_scene.py",
         "2.0**-18",
         "0.0",
         f"{HARD}test_rows13_14_rays.py::test_the_20480_triangle_sphere_never_leaks",
@@ -331,7 +331,7 @@ MUTATIONS = (
     Mutation(
         15,
         "a lost marker is taken to be where it was",
-        "warp_ar/pipeline.py",
+        "warp_ar/engine/pipeline.py",
         "lost = self._tracker is not None and pose is None",
         "lost = False",
         f"{HARD}test_rows15_16_input.py::test_lost_and_found_every_frame",
@@ -339,7 +339,7 @@ MUTATIONS = (
     Mutation(
         15,
         "of a plane's two poses the one that fits this frame better",
-        "warp_ar/tracking.py",
+        "warp_ar/input/tracking.py",
         "        if guess is None or len(fits) < 2:\n",
         "        if True:\n",
         "tests/test_tracking.py::test_pose_does_not_flip",
@@ -347,7 +347,7 @@ MUTATIONS = (
     Mutation(
         15,
         "of two markers with one number the first in the list",
-        "warp_ar/tracking.py",
+        "warp_ar/input/tracking.py",
         "for d in sorted(found, key=rank):",
         "for d in found:",
         "tests/test_tracking.py::test_two_with_one_id",
@@ -355,7 +355,7 @@ MUTATIONS = (
     Mutation(
         16,
         "any array is a frame",
-        "warp_ar/pipeline.py",
+        "warp_ar/engine/pipeline.py",
         "image.shape != (height, width, 3) or image.dtype != np.uint8",
         "image.ndim != 3",
         f"{HARD}test_rows15_16_input.py::test_what_is_no_frame_is_refused_and_the_next_one_works",
@@ -363,7 +363,7 @@ MUTATIONS = (
     Mutation(
         16,
         "frames of a folder may have any size",
-        "warp_ar/sources.py",
+        "warp_ar/input/sources.py",
         "            _check_size(image, self.size, str(path), index)\n",
         "",
         "tests/test_sources.py::test_size_that_changes_is_named",
@@ -371,7 +371,7 @@ MUTATIONS = (
     Mutation(
         16,
         "of 16 bits the upper 8",
-        "warp_ar/sources.py",
+        "warp_ar/input/sources.py",
         "((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)",
         "(picture >> 8).astype(np.uint8)",
         "tests/test_sources.py::test_grey_alpha_and_16_bit_become_rgb",
@@ -387,7 +387,7 @@ MUTATIONS = (
     Mutation(
         17,
         "the last band ends a row early",
-        "warp_ar/scheduler.py",
+        "warp_ar/engine/scheduler.py",
         "start + (stop - start) * band // bands for band",
         "start + (stop - start - (bands > 1)) * band // bands for band",
         f"{HARD}test_row17_same_answer.py::test_bands_of_threads",

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_ar.graph import Plan, make_plan
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS, Quality
+from warp_ar.engine.graph import Plan, make_plan
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.tracking import Track, TrackState
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -29,14 +29,15 @@ from warp_ar.scene import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Pose,
     Probe,
     Proxy,
     Scene,
 )
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Arrays, ArraySpec, Pass, Request, Stage, Wiring
+from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
-from warp_ar.tracking import Pose, Track, TrackState
 
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""

@@ -12,10 +12,10 @@ import sys
 from tests.hard_cases import atlas, measure_errors, mutations, table
 from tests.hard_cases.rig import RUNGS, SIZE, make_quality, make_scene
 from warp_ar import explain
-from warp_ar.graph import make_plan
-from warp_ar.numerics import NUMERICS
+from warp_ar.engine.graph import make_plan
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Request
+from warp_ar.stages.numerics import NUMERICS
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 

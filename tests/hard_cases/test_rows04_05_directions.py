@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests.hard_cases.generators import directions, frames
 from tests.hard_cases.rig import RUNGS, SIZE, LoneStage, assert_finite, solid_angles
 from warp_ar.kernels import irradiance, latlong, materials, prefilter, sampling, visibility
-from warp_ar.tracking import Pose
+from warp_ar.scene import Pose
 
 FURNACE = 5e-4
 LIGHT_STAGES = [

@@ -30,11 +30,10 @@ from tests.hard_cases.rig import (
 from tests.test_recover import cells_of, points_of, probes_of, seen, transfer_of
 from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
-from warp_ar.geometry import Mesh, load_mesh, rotation_matrix
 from warp_ar.kernels import recover
-from warp_ar.ray_scene import HostScene, trace_config
-from warp_ar.scene import Object, PhongMaterial, Proxy
-from warp_ar.tracking import Pose
+from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
+from warp_ar.scene.geometry import Mesh, load_mesh, rotation_matrix
+from warp_ar.scene.ray_scene import HostScene, trace_config
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "room_shadow", "object_light", "mirror_ball", "declip")

@@ -12,8 +12,8 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
-from warp_ar.quality import Quality
 from warp_ar.scene import Scene
+from warp_ar.stages.quality import Quality
 
 Rows = tuple[int, int]
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import declip
-from warp_ar.ray_scene import trace_config
+from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import exposes
 from warp_ar.stages.recover import recovers

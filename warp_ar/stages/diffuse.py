@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import irradiance, pyramid
-from warp_ar.quality import Quality
-from warp_ar.ray_scene import reflects_diffusely
+from warp_ar.scene.ray_scene import reflects_diffusely
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.quality import Quality
 
 TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak

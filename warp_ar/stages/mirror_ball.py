@@ -11,7 +11,7 @@ import warp as wp
 from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import Room
 from warp_ar.kernels.relight import RelightConfig, make_desk
-from warp_ar.ray_scene import trace_config
+from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names, mirrors_virtual
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import object_light
-from warp_ar.ray_scene import reflects_glossily
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
+from warp_ar.scene.ray_scene import reflects_glossily
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads

@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar import recovery
-from warp_ar.host_copies import HostCopies
 from warp_ar.kernels import environment
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.structs import RoomLamp
-from warp_ar.ray_scene import trace_config
+from warp_ar.light import recovery
+from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.host_copies import HostCopies
 from warp_ar.stages.unwrap import NO_PROBE
 
 EVERY_FRAME = 3

@@ -9,7 +9,7 @@ import warp as wp
 from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.reflect import Room, RoomConfig, RoomDiffuse
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS
-from warp_ar.ray_scene import has_textures, material_model, reflects_diffusely, reflects_glossily, trace_config
+from warp_ar.scene.ray_scene import has_textures, material_model, reflects_diffusely, reflects_glossily, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, Request
 from warp_ar.stages.recover import knows_lamps
 

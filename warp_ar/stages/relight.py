@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_ar.kernels import desk_cells, relight
 from warp_ar.kernels.room_shadow import count_parts
-from warp_ar.ray_scene import proxies_face, trace_config
+from warp_ar.scene.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shares_room
 from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels.reflect import RoomConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
-from warp_ar.ray_scene import has_sized_lights, light_kind
+from warp_ar.scene.ray_scene import has_sized_lights, light_kind
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads

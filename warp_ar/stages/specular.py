@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels import prefilter, pyramid
-from warp_ar.ray_scene import reflects_glossily
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
+from warp_ar.scene.ray_scene import reflects_glossily
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 from warp_ar.stages.room_shadow import bounces_light
 

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
-from warp_ar.ray_scene import trace_config
+from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 
 

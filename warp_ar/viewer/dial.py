@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.auto_quality import AUTO, DEFAULT_BUDGET_MS, Controller
-from warp_ar.costs import BASE, Costs, cache_folder, cost_key, measure_steps, read_costs, write_costs
+from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, Controller
+from warp_ar.accuracy.cost_table import Knob, load_errors, relevant_knobs, setting, turn
+from warp_ar.accuracy.costs import BASE, Costs, cache_folder, cost_key, measure_steps, read_costs, write_costs
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import WarpArError
-from warp_ar.graph import make_plan
-from warp_ar.ladder import Knob, load_errors, relevant_knobs, setting, turn
-from warp_ar.pipeline import Pipeline
-from warp_ar.quality import PRESETS, Quality
-from warp_ar.tracking import Pose
+from warp_ar.scene import Pose
+from warp_ar.stages.quality import PRESETS, Quality
 
 
 class Dial:

@@ -11,8 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from warp_ar.errors import UsageError
-from warp_ar.geometry import load_mesh
-from warp_ar.quality import Quality
 from warp_ar.scene import (
     Exposure,
     LambertMaterial,
@@ -26,7 +24,9 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
+from warp_ar.scene.geometry import load_mesh
 from warp_ar.stages import STAGES
+from warp_ar.stages.quality import Quality
 from warp_ar.viewer.protocol import EFFECTS
 
 MOST_THINGS: Final = 16

@@ -19,19 +19,20 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.auto_quality import AUTO
-from warp_ar.bracket import bracket_ratios
-from warp_ar.calibrate import GOOD_VIEWS, BoardViews, CameraReport, write_camera, write_card
+from warp_ar.accuracy.budget import AUTO
 from warp_ar.device import exclusive
+from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.pipeline import Pipeline, Result, resolve_quality
-from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.run_log import left_out, stage_names
-from warp_ar.scene import Camera, CharucoBoard, Marker, Scene, SourceSpec, bundled_scenes, dumps_scene, load_scene
-from warp_ar.sinks import VideoSink, write_environment
-from warp_ar.sources import Frame, QueueSource, Source, open_source
+from warp_ar.input.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
+from warp_ar.input.card import write_card
+from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.sources import Frame, QueueSource, Source, open_source
+from warp_ar.input.tracking import TrackState
+from warp_ar.output.report import left_out, stage_names
+from warp_ar.output.sinks import VideoSink, write_environment
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages import STAGES
-from warp_ar.tracking import Pose, TrackState
+from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.dial import Dial
 from warp_ar.viewer.edits import Wanted

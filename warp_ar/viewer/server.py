@@ -26,8 +26,8 @@ import numpy.typing as npt
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.quality import PRESETS
 from warp_ar.scene import bundled_scenes
+from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.host import Host, Lit
 

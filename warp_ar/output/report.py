@@ -10,11 +10,11 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.auto_quality import AUTO, AutoPipeline
-from warp_ar.graph import Plan
-from warp_ar.pipeline import TRACK, Pipeline, Result
+from warp_ar.accuracy.budget import AUTO, AutoPipeline
+from warp_ar.engine.graph import Plan
+from warp_ar.engine.pipeline import TRACK, Pipeline, Result
+from warp_ar.scene import Pose
 from warp_ar.stages import STAGES
-from warp_ar.tracking import Pose
 
 # Frames left out of medians: caches fill and modules load.
 WARM_UP = 3

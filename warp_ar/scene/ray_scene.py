@@ -20,11 +20,11 @@ import warp as wp
 
 from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
-from warp_ar.geometry import Mesh, load_mesh, load_texture, rotation_matrix, silhouette_tolerance, torus_mesh
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
-from warp_ar.tracking import Pose
+from warp_ar.scene import Pose
+from warp_ar.scene.geometry import Mesh, load_mesh, load_texture, rotation_matrix, silhouette_tolerance, torus_mesh
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -616,7 +616,7 @@ def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
         y = (np.arange(camera.height) - camera.cy) / camera.fy
         bounds = (x, x, y, y)
     else:
-        from warp_ar.pipeline import pixel_rays  # here: the pipeline is built on this module
+        from warp_ar.scene.pixel_rays import pixel_rays
 
         rays = pixel_rays(camera).astype(np.float64)
         bounds = (rays[..., 0].min(0), rays[..., 0].max(0), rays[..., 1].min(1), rays[..., 1].max(1))

@@ -1,7 +1,7 @@
 """``--quality auto``: the rungs that err least within a time budget, and a change of them when the load changes.
 
 **Prices.** Errors come from the price list that is part of the package. Costs depend on the device and on the scene,
-so they are measured here (``warp_ar.costs``), on the first frame that shows the marker.
+so they are measured here (``warp_ar.accuracy.costs``), on the first frame that shows the marker.
 
 **Load.** A frame should take what its settings cost times a load, which is what frames took over what they should have
 taken. Costs and load are told apart by when they change: what differs just after other settings are shown is theirs,
@@ -38,7 +38,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import warp as wp
 
-from warp_ar.costs import (
+from warp_ar.accuracy.cost_table import Choice, frontier, load_errors, relevant_knobs, setting, turn, undominated
+from warp_ar.accuracy.costs import (
     BASE,
     Costs,
     cache_folder,
@@ -49,12 +50,10 @@ from warp_ar.costs import (
     time_alone,
     write_costs,
 )
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError
-from warp_ar.ladder import Choice, frontier, load_errors, relevant_knobs, setting, turn, undominated
-from warp_ar.pipeline import Pipeline, Result
-from warp_ar.quality import Quality
-from warp_ar.scene import Scene
-from warp_ar.tracking import Pose
+from warp_ar.scene import Pose, Scene
+from warp_ar.stages.quality import Quality
 
 AUTO = "auto"
 """Name of the quality that this file is about."""

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.ladder import KNOBS, WORDS
-from warp_ar.metrics import flip_map
+from warp_ar.accuracy.cost_table import KNOBS, WORDS
+from warp_ar.accuracy.metrics import flip_map
 
 if TYPE_CHECKING:
     from warp_ar.tradeoff import CaseReport, Figure, Row, Whole

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker
+from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -82,24 +82,6 @@ _SETTLE = 9.0
 """Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
 _FORGET = 0.4
 """Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """A rigid motion; as a tracked pose, ``camera_from_world``: X to R X + t."""
-
-    rotation: Array
-    """Rotation matrix R, float64 (3, 3)."""
-    translation: Array
-    """Translation t, float64 (3,), metres."""
-
-    def inverse(self) -> Pose:
-        """The motion back: from ``camera_from_world`` to ``world_from_camera``."""
-        return Pose(self.rotation.T.copy(), -self.rotation.T @ self.translation)
-
-    def apply(self, points: Array) -> Array:
-        """Points (..., 3) mapped by the motion."""
-        return points @ self.rotation.T + self.translation
 
 
 class TrackState(enum.Enum):

@@ -6,8 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from warp_ar.errors import UsageError
-from warp_ar.ladder import (
+from warp_ar.accuracy.cost_table import (
     KNOBS,
     Price,
     choose,
@@ -19,8 +18,9 @@ from warp_ar.ladder import (
     turn,
     undominated,
 )
-from warp_ar.quality import PRESETS
+from warp_ar.errors import UsageError
 from warp_ar.scene import load_scene
+from warp_ar.stages.quality import PRESETS
 
 # Sums of a handful of float64.
 EXACT = 1e-12

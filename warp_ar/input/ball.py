@@ -31,11 +31,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.geometry import rotation_matrix
+from warp_ar.input.sources import Source
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, Marker, Probe, Proxy, Scene
-from warp_ar.sources import Source
-from warp_ar.tracking import Pose, Tracker, TrackState
+from warp_ar.scene import Camera, Marker, Pose, Probe, Proxy, Scene
+from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

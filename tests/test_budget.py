@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
-from warp_ar import auto_quality
-from warp_ar.auto_quality import AIM, GAIN, KNOB_SECONDS, MEMORY, RAISE, WINDOW, AutoPipeline, Controller
-from warp_ar.costs import Costs
+from warp_ar.accuracy import budget as auto_quality
+from warp_ar.accuracy.budget import AIM, GAIN, KNOB_SECONDS, MEMORY, RAISE, WINDOW, AutoPipeline, Controller
+from warp_ar.accuracy.cost_table import Knob, load_errors, relevant_knobs, setting
+from warp_ar.accuracy.costs import Costs
 from warp_ar.errors import UsageError
-from warp_ar.ladder import Knob, load_errors, relevant_knobs, setting
-from warp_ar.quality import PRESETS
+from warp_ar.stages.quality import PRESETS
 
 FPS = 30.0
 COSTS = Costs(

@@ -20,12 +20,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from warp_ar.engine.graph import make_plan
 from warp_ar.errors import UsageError
-from warp_ar.graph import make_plan
-from warp_ar.quality import PRESETS, Quality
 from warp_ar.scene import Scene
 from warp_ar.stages import STAGES
 from warp_ar.stages.base import Request
+from warp_ar.stages.quality import PRESETS, Quality
 
 PRICE_LIST = "price_list.json"
 """The committed errors, beside this file."""
@@ -297,7 +297,7 @@ def choose_for_error(front: Sequence[Choice], error: float) -> Choice:
 
 def load_errors() -> dict[str, dict[str, float]]:
     """Error of every rung of every knob, from the price list that comes with the package."""
-    text = importlib.resources.files("warp_ar").joinpath(PRICE_LIST).read_text(encoding="utf-8")
+    text = importlib.resources.files("warp_ar.accuracy").joinpath(PRICE_LIST).read_text(encoding="utf-8")
     return read_errors(json.loads(text))
 
 

@@ -24,7 +24,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating
-from warp_ar.graph import INPUTS, Plan
+from warp_ar.engine.graph import INPUTS, Plan
 from warp_ar.stages.base import Arrays, Pass, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]

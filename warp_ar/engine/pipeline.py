@@ -16,20 +16,22 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.bracket import ShortFrames, bracket_ratios, brightened, find_exposure
 from warp_ar.device import exclusive, resolve_device
+from warp_ar.engine.frame_block import FrameBlock
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.scheduler import Scheduler, StageTiming
+from warp_ar.engine.short_frames import ShortFrames
+from warp_ar.engine.transfer import Image, Picture, Slot, Transfers
 from warp_ar.errors import UsageError
-from warp_ar.frame_block import FrameBlock
-from warp_ar.graph import make_plan
+from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
-from warp_ar.quality import DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.ray_scene import HostScene, Outline, Rect, screen_rects, skeleton
-from warp_ar.scene import Camera, Scene
-from warp_ar.scheduler import Scheduler, StageTiming
+from warp_ar.scene import Pose, Scene
+from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.scene.ray_scene import HostScene, Outline, Rect, screen_rects, skeleton
 from warp_ar.stages.base import Arrays, Request, Rows
-from warp_ar.tracking import Pose, Tracker, TrackState
-from warp_ar.transfer import Image, Picture, Slot, Transfers
+from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the room's light from frame to frame."""
@@ -604,13 +606,3 @@ def resample_light(
     known = resize(confidence)
     weight = np.where(known > 0.0, known, 1.0)[..., None]
     return resize(radiance * confidence[..., None]) / weight, known, resize(clipped * confidence[..., None]) / weight
-
-
-def pixel_rays(camera: Camera) -> npt.NDArray[np.float32]:
-    """Normalised coordinates (x / z, y / z) of every pixel centre, lens distortion undone, (height, width, 2)."""
-    columns, rows = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
-    pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-9)
-    distortion = np.asarray(camera.distortion, np.float64)
-    points = cv2.undistortPoints(pixels, camera.matrix(), distortion, criteria=stop)
-    return np.asarray(points, np.float32).reshape(camera.height, camera.width, 2)

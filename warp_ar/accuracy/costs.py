@@ -22,13 +22,13 @@ from typing import Any, cast
 
 import warp as wp
 
-from warp_ar.graph import Plan
-from warp_ar.ladder import Knob, Price, Scales, light_only, setting, turn
-from warp_ar.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
-from warp_ar.quality import PRESETS, Quality
-from warp_ar.scene import Scene
+from warp_ar.accuracy.cost_table import Knob, Price, Scales, light_only, setting, turn
+from warp_ar.engine.graph import Plan
+from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
+from warp_ar.input.tracking import Tracker
+from warp_ar.scene import Pose, Scene
+from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import EVERY_FRAME
-from warp_ar.tracking import Pose, Tracker
 
 BASE = PRESETS["medium"]
 """What costs are measured from, and what runs until something is chosen."""

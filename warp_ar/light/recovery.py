@@ -53,10 +53,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from warp_ar.geometry import rotation_matrix
+from warp_ar.input.tracking import printed_cells
 from warp_ar.kernels.recover import LOST, SurfacePoint
 from warp_ar.scene import Scene
-from warp_ar.tracking import printed_cells
+from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""From a request to lit frames: graph, scheduler, pipeline, transfers."""

@@ -1,0 +1,228 @@
+"""Pinhole and distortion of a camera from views of a ChArUco board.
+
+References:
+    [Z00] Z. Zhang. A flexible new technique for camera calibration. PAMI 2000.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import SinkError, UsageError
+from warp_ar.input.tracking import make_board
+from warp_ar.scene import Camera, CharucoBoard, Marker
+
+Image = NDArray[np.uint8]
+
+_MOVED = 0.03
+"""Share of the picture's diagonal that a board's corners must have moved for another view of it to be taken."""
+_MOST_VIEWS = 60
+"""Views that are used at most: more cost time and add nothing."""
+_FEWEST_VIEWS = 4
+"""Views without which the focal length is not determined with any certainty."""
+GOOD_VIEWS = 12
+"""Views below which a warning is due."""
+_COVERAGE_CELLS = (4, 6)
+"""Rows and columns into which the picture is cut to see where the board has been."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraReport:
+    """A calibrated camera and how far to trust it."""
+
+    camera: Camera
+    """The camera; its transfer is not measured here."""
+    error: float
+    """Root mean square reprojection error, pixels."""
+    view_errors: tuple[float, ...]
+    """The same for each view that was used."""
+    focal_deviation: float
+    """Standard deviation of the focal length, pixels."""
+    coverage: float
+    """Share of the picture's cells where the board has been."""
+    warnings: tuple[str, ...]
+    """What would make it better, one line each."""
+
+
+class BoardViews:
+    """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
+
+    def __init__(self, marker: Marker) -> None:
+        """Collect nothing yet.
+
+        Args:
+            marker: the board that was printed.
+
+        Raises:
+            UsageError: if it is no ChArUco board.
+        """
+        if not isinstance(marker.board, CharucoBoard):
+            raise UsageError('--board: the camera is calibrated with a ChArUco board, such as "charuco 7x5 0.03 0.022"')
+        self._marker = marker
+        self._board = make_board(marker)
+        self._detector = cv2.aruco.CharucoDetector(self._board)
+        self._size: tuple[int, int] | None = None
+        self._seen = 0
+        self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
+        """Corners in pixels, their numbers, and where they are on the board."""
+
+    def add(self, image: Image) -> bool:
+        """Take a picture, RGB or grey uint8; True if it shows the board as none before.
+
+        Raises:
+            UsageError: if its size is not the first one's.
+        """
+        size = (image.shape[1], image.shape[0])
+        self._size = self._size or size
+        if size != self._size:
+            first = f"{self._size[0]}x{self._size[1]}"
+            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}")
+        self._seen += 1
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        corners, ids, _, _ = self._detector.detectBoard(gray)
+        # Corners on one line, or fewer than six, leave a view's pose open.
+        if ids is None or len(ids) < 6 or self._board.checkCharucoCornersCollinear(ids):
+            return False
+        corners, ids = np.asarray(corners).reshape(-1, 2), np.ravel(ids)
+        least = _MOVED * math.hypot(*size)
+        if len(self.views) >= _MOST_VIEWS or any(_moved(corners, ids, *view[:2]) <= least for view in self.views):
+            return False
+        self.views.append((corners, ids, np.asarray(self._board.getChessboardCorners())[ids]))
+        return True
+
+    def covered(self) -> NDArray[np.bool_]:
+        """Where in the picture the board has been, by rows and columns."""
+        return _covered(self.views, self._size or (1, 1))
+
+    def solve(self) -> CameraReport:
+        """Pinhole and distortion.
+
+        Raises:
+            UsageError: if too few views show the board.
+        """
+        size = self._size
+        if size is None or len(self.views) < _FEWEST_VIEWS:
+            raise UsageError(
+                f"{len(self.views)} different views of {self._marker.board} ({self._marker.dictionary}) in "
+                f"{self._seen} pictures; expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
+            )
+        result = _calibrate(self.views, size)
+        errors = np.ravel(result[-1])
+        # A blurred or bent view must not spoil the others.
+        kept = [view for view, error in zip(self.views, errors, strict=True) if error <= 3 * np.median(errors)]
+        if len(kept) < len(self.views) and len(kept) >= _FEWEST_VIEWS:
+            result = _calibrate(kept, size)
+            errors = np.ravel(result[-1])
+        error, matrix, distortion, rotations, _, deviations, _, _ = result
+        camera = Camera(
+            *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
+        )
+        covered = _covered(kept, size)
+        tilts = [math.degrees(math.acos(min(1.0, abs(cv2.Rodrigues(r)[0][2, 2])))) for r in rotations]
+        warnings = []
+        if len(kept) < GOOD_VIEWS:
+            warnings.append(f"only {len(kept)} views: take {GOOD_VIEWS} or more, from different sides and distances")
+        if covered.mean() < 0.8:
+            empty = [_place(row, column) for row, column in np.argwhere(~covered)]
+            warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
+        if max(tilts) - min(tilts) < 15:
+            warnings.append(
+                f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: "
+                "the focal length is uncertain"
+            )
+        if error > 1.0:
+            warnings.append(
+                f"reprojection error {error:.2f} pixels: is the print flat, the picture sharp, the board's text right?"
+            )
+        return CameraReport(
+            camera,
+            float(error),
+            tuple(map(float, errors)),
+            float(np.ravel(deviations)[:2].max()),
+            float(covered.mean()),
+            tuple(warnings),
+        )
+
+
+def calibrate_camera(images: Iterable[Image], marker: Marker) -> CameraReport:
+    """Pinhole and distortion from views of a ChArUco board.
+
+    Args:
+        images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
+        marker: the board that was printed.
+
+    Raises:
+        UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
+    """
+    views = BoardViews(marker)
+    for image in images:
+        views.add(image)
+    return views.solve()
+
+
+def _covered(
+    views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]
+) -> NDArray[np.bool_]:
+    rows, columns = _COVERAGE_CELLS
+    covered = np.zeros((rows, columns), bool)
+    for corners, _, _ in views:
+        cells = np.floor(corners / size * (columns, rows)).astype(int).clip(0, (columns - 1, rows - 1))
+        covered[cells[:, 1], cells[:, 0]] = True
+    return covered
+
+
+def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other_ids: NDArray[Any]) -> float:
+    """Mean distance in pixels between the corners that two views share; infinite if none."""
+    _, here, there = np.intersect1d(ids, other_ids, return_indices=True)
+    return float(np.linalg.norm(corners[here] - others[there], axis=1).mean()) if len(here) else math.inf
+
+
+def _calibrate(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> Any:
+    pixels = [corners.astype(np.float32) for corners, _, _ in views]
+    points = [points.astype(np.float32) for _, _, points in views]
+    plain, full = (
+        cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+        for flags in (cv2.CALIB_FIX_K3, 0)
+    )
+    # The sixth-order term bends the corners of the picture wildly where it only fits noise.
+    return full if full[0] < 0.9 * plain[0] else plain
+
+
+def _place(row: int, column: int) -> str:
+    rows, columns = _COVERAGE_CELLS
+    vertical = "top" if row == 0 else "bottom" if row == rows - 1 else "middle"
+    return f"the {vertical} {'left' if column < columns / 3 else 'right' if column >= columns * 2 / 3 else 'centre'}"
+
+
+def write_camera(report: CameraReport, path: Path) -> None:
+    """Write OpenCV's YAML (or JSON or XML, by the name's ending).
+
+    Raises:
+        SinkError: if the file cannot be written.
+    """
+    if path.suffix.lower() not in (".yml", ".yaml", ".json", ".xml"):
+        raise UsageError(f"--output {path}: expected a name that ends in .yml, .json or .xml")
+    if not path.parent.is_dir():
+        raise SinkError(f"{path}: cannot be written: no folder {path.parent}")
+    camera = report.camera
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        opened = storage.isOpened()
+    except (cv2.error, SystemError):  # the latter is how OpenCV's constructor reports a file that does not open
+        opened = False
+    if not opened:
+        raise SinkError(f"{path}: cannot be written")
+    storage.write("image_width", camera.width)
+    storage.write("image_height", camera.height)
+    storage.write("camera_matrix", camera.matrix())
+    storage.write("distortion_coefficients", np.array(camera.distortion)[None])
+    storage.write("avg_reprojection_error", report.error)
+    storage.release()

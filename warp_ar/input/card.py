@@ -1,0 +1,110 @@
+"""Markers and boards as pages that print at exact size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import imageio.v3
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import SinkError, UsageError
+from warp_ar.input.tracking import find_dictionary, make_board
+from warp_ar.scene import CharucoBoard, Marker
+
+Image = NDArray[np.uint8]
+
+PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+"""Width and height of paper in millimetres, upright."""
+_MARGIN = 10.0
+"""Millimetres at the paper's edges that printers leave white."""
+
+
+def card_size(marker: Marker) -> tuple[float, float]:
+    """Width and height in metres of a marker or board without its white margin."""
+    return marker.board.size if marker.board is not None else (marker.size, marker.size)
+
+
+def draw_card(marker: Marker, pixels_per_metre: float) -> Image:
+    """The marker or board with a white margin of one cell and more, each edge at its nearest pixel.
+
+    Args:
+        marker: what to draw.
+        pixels_per_metre: resolution.
+
+    Returns:
+        uint8 (h, w), 0 or 255, the marker in its centre.
+    """
+    dictionary = find_dictionary(marker.dictionary)
+    bits = int(dictionary.markerSize) + 2
+    width, height = card_size(marker)
+    side, board = marker.size, marker.board
+    places: list[tuple[int, float, float]] = [(marker.id, 0.0, 0.0)]
+    if board is not None:
+        made, side = make_board(marker), board.marker_length
+        places = [
+            (int(number), float(corners[0][0]), float(corners[0][1]))
+            for number, corners in zip(np.ravel(made.getIds()), made.getObjPoints(), strict=True)
+        ]
+    margin = max(side / bits, 0.005)
+    image = np.full([round((length + 2 * margin) * pixels_per_metre) for length in (height, width)], 255, np.uint8)
+
+    def fill(cells: NDArray[Any], left: float, top: float, size: float) -> None:
+        rows, columns = (
+            np.round((margin + start + size * np.arange(count + 1)) * pixels_per_metre).astype(int)
+            for start, count in zip((top, left), cells.shape, strict=True)
+        )
+        image[rows[0] : rows[-1], columns[0] : columns[-1]] = np.repeat(
+            np.repeat(cells, np.diff(rows), axis=0), np.diff(columns), axis=1
+        )
+
+    if isinstance(board, CharucoBoard):
+        squares = np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2
+        fill((255 * squares).astype(np.uint8), 0.0, 0.0, board.square_length)
+    for number, left, top in places:
+        fill(np.asarray(cv2.aruco.generateImageMarker(dictionary, number, bits, borderBits=1)), left, top, side / bits)
+    return image
+
+
+def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0) -> None:
+    """Write a page with the card, its name and a 100 mm bar to check the printer with.
+
+    Raises:
+        UsageError: if the card does not fit on the paper.
+        SinkError: if the file cannot be written.
+    """
+    if paper not in PAPERS:
+        raise UsageError(f"--paper {paper}: expected {', '.join(PAPERS)}")
+    if not 72 <= dpi <= 2400:
+        raise UsageError(f"--dpi {dpi:g}: expected 72 to 2400 dots per inch")
+    # PNG stores whole pixels per metre: drawn at that resolution, the print is exact.
+    per_metre = round(dpi / 0.0254)
+    width, height = PAPERS[paper]
+    card_mm = [1e3 * length for length in card_size(marker)]
+    foot = 15.0
+    if card_mm[0] > card_mm[1]:
+        width, height = height, width
+    if card_mm[0] > width - 2 * _MARGIN or card_mm[1] > height - 2 * _MARGIN - foot:
+        raise UsageError(
+            f"card of {card_mm[0]:g} x {card_mm[1]:g} mm does not fit on {paper} ({width:g} x {height:g} mm "
+            "with margins); choose smaller lengths or a larger --paper"
+        )
+    mm = per_metre / 1e3
+    page = np.full((round(height * mm), round(width * mm)), 255, np.uint8)
+    card = draw_card(marker, per_metre)
+    h, w = (min(a, b) for a, b in zip(card.shape, page.shape, strict=True))
+    card = card[(card.shape[0] - h) // 2 :, (card.shape[1] - w) // 2 :][:h, :w]
+    y, x = (page.shape[0] - round(foot * mm) - h) // 2, (page.shape[1] - w) // 2
+    page[y : y + h, x : x + w] = card
+    bottom = page.shape[0] - round(_MARGIN * mm)
+    page[bottom - round(mm) : bottom, round(_MARGIN * mm) : round(_MARGIN * mm) + round(100 * mm)] = 0
+    name = str(marker.board) if marker.board is not None else f"id {marker.id}, {marker.size:g} m"
+    text = f"{marker.dictionary}, {name}; print at 100 %: this bar is 100 mm"
+    place = (round(_MARGIN * mm), bottom - round(3 * mm))
+    cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, mm / 9, 0, max(1, round(mm / 5)), cv2.LINE_AA)
+    try:
+        imageio.v3.imwrite(path, page, extension=".png", dpi=(per_metre * 0.0254, per_metre * 0.0254))
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,61 @@
+"""Scene files and what they describe; how rays meet a scene; geometry and materials from files."""
+
+from warp_ar.scene.calibration_file import load_calibration
+from warp_ar.scene.description import (
+    RGB,
+    SCHEMA,
+    Animation,
+    Board,
+    Camera,
+    CharucoBoard,
+    Color,
+    Exposure,
+    GridBoard,
+    LambertMaterial,
+    Light,
+    Marker,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    Object,
+    PhongMaterial,
+    Probe,
+    Proxy,
+    Scene,
+    SourceSpec,
+    Vec3,
+)
+from warp_ar.scene.pose import Pose
+from warp_ar.scene.reader import bundled_scenes, load_scene, loads_scene
+from warp_ar.scene.writer import dumps_scene
+
+__all__ = [
+    "RGB",
+    "SCHEMA",
+    "Animation",
+    "Board",
+    "Camera",
+    "CharucoBoard",
+    "Color",
+    "Exposure",
+    "GridBoard",
+    "LambertMaterial",
+    "Light",
+    "Marker",
+    "Material",
+    "MetallicRoughnessMaterial",
+    "MirrorMaterial",
+    "Object",
+    "PhongMaterial",
+    "Pose",
+    "Probe",
+    "Proxy",
+    "Scene",
+    "SourceSpec",
+    "Vec3",
+    "bundled_scenes",
+    "dumps_scene",
+    "load_calibration",
+    "load_scene",
+    "loads_scene",
+]

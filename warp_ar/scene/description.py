@@ -1,0 +1,391 @@
+"""What a scene is made of: frozen dataclasses, one per section of a scene file.
+
+Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
+the printed page, z out of the page.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SceneError
+from warp_ar.scene.geometry import rotation_matrix
+
+Vec3: TypeAlias = tuple[float, float, float]
+RGB: TypeAlias = tuple[float, float, float]
+Color: TypeAlias = RGB | Path
+"""Linear RGB, or the path of a texture (sRGB-encoded picture)."""
+
+FloatMatrix: TypeAlias = npt.NDArray[np.float64]
+
+SCHEMA: Final = 1
+"""The version of the format that this program reads."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """OpenCV's pinhole camera; pixel centres lie at integers."""
+
+    width: int
+    """Width of the picture in pixels."""
+    height: int
+    """Height of the picture in pixels."""
+    fx: float
+    """Focal length along x in pixels."""
+    fy: float
+    """Focal length along y in pixels."""
+    cx: float
+    """Column of the principal point in pixels."""
+    cy: float
+    """Row of the principal point in pixels."""
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]: 4, 5 or 8 values."""
+    transfer: str | Path = "srgb"
+    """How values were encoded: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
+
+    def matrix(self) -> FloatMatrix:
+        """Camera matrix K, (3, 3), in pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled_to(self, width: int, height: int) -> Camera:
+        """The same camera with its picture resampled to another size.
+
+        A pixel centre at x covers [x, x + 1) after a shift of one half, so cx' = (cx + 0.5) s - 0.5.
+
+        Args:
+            width: New width in pixels.
+            height: New height in pixels.
+
+        Raises:
+            SceneError: The new size has another aspect ratio, so that part of the picture would have been cut away.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        if width < 1 or height < 1 or width * self.height != height * self.width:
+            raise SceneError(
+                f"camera: calibrated for {self.width}x{self.height}, frames are {width}x{height}: another aspect "
+                "ratio, so the intrinsics cannot be scaled; record at the calibrated aspect or calibrate at this size"
+            )
+        s = width / self.width
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * s,
+            fy=self.fy * s,
+            cx=(self.cx + 0.5) * s - 0.5,
+            cy=(self.cy + 0.5) * s - 0.5,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class SourceSpec:
+    """Where frames come from: exactly one of ``path``, ``camera`` and ``synthetic`` is given."""
+
+    path: Path | None = None
+    """A folder of frames in name order, or a video file."""
+    camera: int | None = None
+    """Index of a capture device."""
+    synthetic: str | None = None
+    """Name of a generated source."""
+    fps: float | None = None
+    """Frames per second; the source's own if left out."""
+    exposures: tuple[float, ...] | None = None
+    """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CharucoBoard:
+    """Chessboard with markers in its white squares: ``"charuco 5x7 0.04 0.03"``."""
+
+    columns: int
+    """Squares along x."""
+    rows: int
+    """Squares along y."""
+    square_length: float
+    """Side of a square in metres."""
+    marker_length: float
+    """Side of a marker in metres."""
+
+    @property
+    def marker_count(self) -> int:
+        """Number of markers, with the dictionary's ids from 0."""
+        return self.columns * self.rows // 2
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the whole board in metres; the world's origin is its centre."""
+        return self.columns * self.square_length, self.rows * self.square_length
+
+    def __str__(self) -> str:
+        return f"charuco {self.columns}x{self.rows} {self.square_length!r} {self.marker_length!r}"
+
+
+@dataclasses.dataclass(frozen=True)
+class GridBoard:
+    """Grid of markers with gaps: ``"grid 4x3 0.04 0.01"``."""
+
+    columns: int
+    """Markers along x."""
+    rows: int
+    """Markers along y."""
+    marker_length: float
+    """Side of a marker in metres."""
+    separation: float
+    """Gap between neighbouring markers in metres."""
+
+    @property
+    def marker_count(self) -> int:
+        """Number of markers, with the dictionary's ids from 0."""
+        return self.columns * self.rows
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height from outer edge to outer edge in metres; the world's origin is the centre."""
+        pitch = self.marker_length + self.separation
+        return self.columns * pitch - self.separation, self.rows * pitch - self.separation
+
+    def __str__(self) -> str:
+        return f"grid {self.columns}x{self.rows} {self.marker_length!r} {self.separation!r}"
+
+
+Board: TypeAlias = CharucoBoard | GridBoard
+
+
+@dataclasses.dataclass(frozen=True)
+class Marker:
+    """The printed marker, or board of markers, that the world is fixed to."""
+
+    dictionary: str = "DICT_4X4_50"
+    """OpenCV's name of the dictionary, ArUco or AprilTag."""
+    id: int = 0
+    """Which marker of the dictionary; unused with a board."""
+    size: float = 0.08
+    """Side of the black square in metres; unused with a board."""
+    white: float = 0.85
+    """Diffuse reflectance of the card's white paper."""
+    board: Board | None = None
+    """A board instead of a single marker."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """A mirror ball."""
+
+    center: Vec3
+    """Centre in metres."""
+    radius: float
+    """Radius in metres."""
+    reflectance: RGB = (0.85, 0.85, 0.85)
+    """Share of light that the ball reflects; a silvered ornament if left out. A file may give one number for grey."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Proxy:
+    """Simplified physical geometry: receives virtual light and shadow, and hides what is behind it."""
+
+    shape: Literal["plane", "box", "mesh"]
+    """A plane lies in its own x and y and faces its own +z."""
+    at: Vec3 = (0.0, 0.0, 0.0)
+    """Centre (mesh: origin) in metres."""
+    rotate: Vec3 = (0.0, 0.0, 0.0)
+    """Degrees about the fixed x, then y, then z axis."""
+    size: tuple[float, ...] = ()
+    """Whole lengths in metres: x and y of a plane; x, y and z of a box; empty for a mesh."""
+    file: Path | None = None
+    """Mesh file, in metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Animation:
+    """Motion of an object or a light; nothing moves by default.
+
+    At t seconds a body stands at R(t) (at - pivot) + pivot + sway sin(2 pi t / period), turned by R(t): ``turn`` t
+    degrees about the fixed x, then y, then z axis.
+    """
+
+    turn: Vec3 = (0.0, 0.0, 0.0)
+    """Degrees per second about the fixed axes."""
+    pivot: Vec3 | None = None
+    """Point in metres that ``turn`` leaves in place; the body's own ``at`` if left out, so that it spins in place."""
+    sway: Vec3 = (0.0, 0.0, 0.0)
+    """Furthest excursion of a swing to and fro, in metres."""
+    period: float = 4.0
+    """Duration of one swing in seconds."""
+
+    def rotation_at(self, seconds: float) -> FloatMatrix:
+        """R(t), (3, 3)."""
+        return rotation_matrix([rate * seconds for rate in self.turn])
+
+    def position_at(self, seconds: float, at: Vec3) -> FloatMatrix:
+        """Where a body that starts at ``at`` stands, (3,) in metres."""
+        pivot = np.array(at if self.pivot is None else self.pivot)
+        swing = np.array(self.sway) * math.sin(2.0 * math.pi * (seconds / self.period))
+        position: FloatMatrix = self.rotation_at(seconds) @ (np.array(at) - pivot) + pivot + swing
+        return position
+
+
+@dataclasses.dataclass(frozen=True)
+class PhongMaterial:
+    """Diffuse plus a cosine lobe about the mirror direction."""
+
+    diffuse: Color = (0.8, 0.8, 0.8)
+    """Diffuse reflectance."""
+    specular: Color = (0.2, 0.2, 0.2)
+    """Reflectance of the lobe."""
+    shininess: float = 32.0
+    """Exponent of the lobe, from 0 (widest) on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MetallicRoughnessMaterial:
+    """glTF's BRDF: GGX with alpha = roughness squared, F0 = 0.04 for what is no metal."""
+
+    base_color: Color = (0.8, 0.8, 0.8)
+    """Diffuse reflectance of a non-metal, F0 of a metal."""
+    metallic: float = 0.0
+    """0 (no metal) to 1 (metal)."""
+    roughness: float = 0.5
+    """0 (mirror) to 1 (matt)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LambertMaterial:
+    """Perfectly diffuse."""
+
+    base_color: Color = (0.8, 0.8, 0.8)
+    """Diffuse reflectance."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MirrorMaterial:
+    """Perfect mirror."""
+
+    base_color: Color = (1.0, 1.0, 1.0)
+    """Reflectance, the same at every angle."""
+
+
+Material: TypeAlias = PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial
+
+
+@dataclasses.dataclass(frozen=True)
+class Object:
+    """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
+
+    shape: Literal["mesh", "sphere", "box", "torus"]
+    """Spheres, boxes and tori are centred at their origin; a torus lies around its z axis."""
+    file: Path | None = None
+    """Mesh file; a texture that it brings is multiplied by the material's first colour."""
+    radius: float = 0.0
+    """Radius of a sphere in metres."""
+    size: Vec3 = (0.0, 0.0, 0.0)
+    """Whole lengths of a box in metres."""
+    major_radius: float = 0.0
+    """Distance of a torus's tube from its axis in metres."""
+    minor_radius: float = 0.0
+    """Radius of a torus's tube in metres, below the major radius."""
+    at: Vec3 = (0.0, 0.0, 0.0)
+    """Position in metres."""
+    rotate: Vec3 = (0.0, 0.0, 0.0)
+    """Degrees about the fixed x, then y, then z axis."""
+    scale: float = 1.0
+    """Factor on all lengths of the shape."""
+    material: Material = LambertMaterial()
+    """How it reflects light."""
+    animate: Animation | None = None
+    """How it moves."""
+
+    def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
+        """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""
+        rotation = rotation_matrix(self.rotate)
+        if self.animate is None:
+            return rotation, np.array(self.at)
+        return self.animate.rotation_at(seconds) @ rotation, self.animate.position_at(seconds, self.at)
+
+
+@dataclasses.dataclass(frozen=True)
+class Light:
+    """A virtual light.
+
+    A white Lambertian surface that faces a point light of intensity I at distance d has linear camera value
+    I / (pi (a + b d + c d^2)) with attenuation (a, b, c); one that faces a directional light has I / pi.
+    """
+
+    kind: Literal["point", "spot", "directional"]
+    """Where its light goes."""
+    intensity: float
+    """Radiant intensity (point, spot) or irradiance (directional), in camera values."""
+    color: RGB = (1.0, 1.0, 1.0)
+    """Factor on the intensity per channel."""
+    at: Vec3 = (0.0, 0.0, 0.0)
+    """Position of a point or spot light in metres."""
+    target: Vec3 | None = None
+    """Point in metres that a spot light shines at; it stays when the light moves."""
+    direction: Vec3 | None = None
+    """The way the light travels, of any length; instead of a target. It turns with the light."""
+    inner_angle: float = 0.0
+    """Half angle of a spot in degrees within which it is full."""
+    outer_angle: float = 0.0
+    """Half angle in degrees at which a spot is zero, after a linear fall from the inner angle."""
+    attenuation: Vec3 = (0.0, 0.0, 1.0)
+    """Constant, linear and quadratic term of the fall with distance; (0, 0, 1) is the inverse square."""
+    radius: float = 0.0
+    """Radius in metres of the sphere that emits (point, spot), for soft shadows; 0 is a point."""
+    animate: Animation | None = None
+    """How it moves."""
+
+    def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
+        """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.
+
+        A point light has no direction and gets -z. So does a spot light that passes through its target.
+        """
+        position, direction = np.array(self.at), np.array(self.direction or (0.0, 0.0, -1.0))
+        if self.animate is not None:
+            position = self.animate.position_at(seconds, self.at)
+            direction = self.animate.rotation_at(seconds) @ direction
+        if self.target is not None:
+            direction = np.array(self.target) - position
+        length = np.linalg.norm(direction)
+        return position, direction / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Exposure:
+    """A simulated shorter exposure."""
+
+    scale: float | Literal["auto"] = 1.0
+    """Factor on the frame's light, 1 = off; "auto" keeps highlights below clipping when virtual light is added."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """All that a scene file says."""
+
+    camera: Camera
+    """The camera that the frames come from."""
+    schema: int = SCHEMA
+    """Version of the format."""
+    name: str = "scene"
+    """Name to show; the file's own if left out."""
+    source: SourceSpec | None = None
+    """Where frames come from, if the file says."""
+    marker: Marker = Marker()
+    """What fixes the world."""
+    probes: tuple[Probe, ...] = ()
+    """Mirror balls that show the room's light."""
+    proxies: tuple[Proxy, ...] = ()
+    """The physical things that are modelled."""
+    objects: tuple[Object, ...] = ()
+    """Virtual things."""
+    lights: tuple[Light, ...] = ()
+    """Virtual lights."""
+    exposure: Exposure = Exposure()
+    """Simulated exposure."""
+    path: Path | None = dataclasses.field(default=None, compare=False)
+    """The file that the scene was read from."""

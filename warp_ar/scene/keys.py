@@ -1,0 +1,39 @@
+"""Keys of a scene file's sections that depend on a kind or shape; the others are the fields of the dataclasses."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Final
+
+from warp_ar.scene.description import (
+    LambertMaterial,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    PhongMaterial,
+)
+
+INTRINSICS: Final = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
+PROXY_KEYS: Final = {"plane": ("size",), "box": ("size",), "mesh": ("file",)}
+OBJECT_KEYS: Final = {
+    "mesh": ("file",),
+    "sphere": ("radius",),
+    "box": ("size",),
+    "torus": ("major_radius", "minor_radius"),
+}
+LIGHT_KEYS: Final = {
+    "point": ("at", "attenuation", "radius"),
+    "spot": ("at", "target", "direction", "inner_angle", "outer_angle", "attenuation", "radius"),
+    "directional": ("direction",),
+}
+MATERIALS: Final[dict[str, type[Material]]] = {
+    "phong": PhongMaterial,
+    "metallic_roughness": MetallicRoughnessMaterial,
+    "lambert": LambertMaterial,
+    "mirror": MirrorMaterial,
+}
+
+
+def keys_of(*classes: type[Any]) -> list[str]:
+    """Names of the fields of dataclasses, each once."""
+    return list(dict.fromkeys(field.name for kind in classes for field in dataclasses.fields(kind)))

@@ -1,0 +1,525 @@
+"""Scene files, schema 1: TOML read into frozen dataclasses, with errors that say what would be right.
+
+Metres, degrees, linear RGB. The world is the marker's frame: origin at the marker's (or board's) centre, x right, y up
+the printed page, z out of the page. Paths are relative to the scene file. What a file leaves out has the default of its
+field; sections other than ``[camera]`` are optional, and ``[marker]`` must be there as soon as anything has a place in
+the world.
+
+A scene built or changed in Python is checked by ``loads_scene(dumps_scene(scene))``.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final, NoReturn, TypeVar, cast
+
+import cv2
+
+from warp_ar.errors import SceneError
+from warp_ar.scene.calibration_file import load_calibration
+from warp_ar.scene.description import (
+    RGB,
+    SCHEMA,
+    Animation,
+    Board,
+    Camera,
+    CharucoBoard,
+    Color,
+    Exposure,
+    GridBoard,
+    LambertMaterial,
+    Light,
+    Marker,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    Object,
+    PhongMaterial,
+    Probe,
+    Proxy,
+    Scene,
+    SourceSpec,
+    Vec3,
+)
+from warp_ar.scene.geometry import MESH_SUFFIXES
+from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
+
+_TOP_KEYS: Final = ("schema", "name")
+_SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "exposure")
+_SOURCES: Final = ("path", "camera", "synthetic")
+_TRANSFERS: Final = '"srgb", "linear", "gamma:2.2" or the path of a measured response'
+_BOARDS: Final = (
+    '"charuco COLUMNSxROWS SQUARE MARKER" or "grid COLUMNSxROWS MARKER GAP" with lengths in metres, such as '
+    '"charuco 5x7 0.04 0.03"'
+)
+
+_DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
+
+_T = TypeVar("_T")
+
+
+class _Table:
+    """One table of a scene file: hands out checked values and knows how to complain about them."""
+
+    def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
+        self.label, self.folder, self.section = label, folder, section
+        if not isinstance(data, dict):
+            raise SceneError(f"{label}: {section} = {show_value(data)}: expected a table with {', '.join(keys)}")
+        self.data: dict[str, Any] = data
+        for key in data:
+            if key not in keys:
+                raise SceneError(f"{label}: {self.name(key)}: unknown key; {nearest(key, keys)}")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def name(self, key: str) -> str:
+        return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
+
+    def fail(self, key: str, right: str) -> NoReturn:
+        """Say what is wrong with a key: its value if it has one, and what would be right."""
+        value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
+        raise SceneError(f"{self.label}: {self.name(key)}{value}: {right}")
+
+    def only(self, kind: str, allowed: Iterable[str], others: Iterable[str]) -> None:
+        """Complain about keys that other kinds of this section use, but not the one that ``kind`` names."""
+        unused = sorted(set(others) - set(allowed))
+        for key in self.data:
+            if key in unused:
+                used = ", ".join(sorted(set(allowed)))
+                self.fail(key, f"not used with {kind} = {show_value(self.data.get(kind))}; its own keys are {used}")
+
+    def number(
+        self, key: str, default: float | None = None, *, low: float = -LARGEST, high: float = LARGEST, unit: str = ""
+    ) -> float:
+        if default is not None and key not in self.data:
+            return default
+        return self._number(key, self.data.get(key), low, high, _range("a number", low, high, unit))
+
+    def _number(self, key: str, value: object, low: float, high: float, right: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(key, f"expected {right}")
+        # Compared before it is converted: an integer may be too large for a float.
+        if not low <= value <= high:
+            self.fail(key, f"expected {right}")
+        return float(value)
+
+    def length(self, key: str) -> float:
+        return self.number(key, low=SMALLEST, unit="metres")
+
+    def integer(self, key: str, default: int | None = None, *, low: int, high: int) -> int:
+        if default is not None and key not in self.data:
+            return default
+        value = self.data.get(key)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            self.fail(key, f"expected a whole number from {low} to {high}")
+        return value
+
+    def text(self, key: str, default: str | None = None, *, right: str = "some text") -> str:
+        if default is not None and key not in self.data:
+            return default
+        value = self.data.get(key)
+        if not isinstance(value, str) or not value:
+            self.fail(key, f"expected {right}")
+        return value
+
+    def choice(self, key: str, options: Iterable[str], default: str | None = None) -> str:
+        options = list(options)
+        few = len(options) < 8
+        right = "one of " + ", ".join(f'"{option}"' for option in options) if few else f'a name such as "{options[0]}"'
+        value = self.text(key, default, right=right)
+        if value not in options:
+            self.fail(key, f"expected {right}" if few else f"unknown; {nearest(value, options)}")
+        return value
+
+    def vector(
+        self,
+        key: str,
+        default: tuple[float, ...] | None = None,
+        *,
+        sizes: Sequence[int] = (3,),
+        low: float = -LARGEST,
+        high: float = LARGEST,
+        unit: str = "",
+    ) -> tuple[float, ...]:
+        if default is not None and key not in self.data:
+            return default
+        value = self.data.get(key)
+        right = _range(f"a list of {' or '.join(map(str, sizes))} numbers", low, high, unit)
+        if not isinstance(value, list) or len(value) not in sizes:
+            self.fail(key, f"expected {right}")
+        return tuple(self._number(key, element, low, high, right) for element in value)
+
+    def vec3(self, key: str, default: Vec3 | None = None, *, low: float = -LARGEST, unit: str = "") -> Vec3:
+        return cast(Vec3, self.vector(key, default, low=low, unit=unit))
+
+    def reflectance(self, key: str, default: Color) -> Color:
+        """A colour from 0 to 1, or the path of a texture."""
+        value = self.data.get(key, default)
+        if isinstance(value, str):
+            return self.file(key, "a picture")
+        if not isinstance(value, list | tuple):
+            self.fail(key, "expected a list of 3 numbers from 0 to 1, or the path of a texture")
+        return cast(RGB, self.vector(key, cast(RGB, default), low=0.0, high=1.0))
+
+    def resolve(self, key: str, right: str) -> Path:
+        value = self.text(key, right=f"the path of {right}")
+        try:
+            path = (self.folder / value).resolve()
+            path.exists()
+        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
+            self.fail(key, f"expected the path of {right}; this cannot be one")
+        return path
+
+    def file(self, key: str, right: str) -> Path:
+        path = self.resolve(key, right)
+        if not path.is_file():
+            self.fail(key, f"no such file: {path}")
+        return path
+
+
+def _range(what: str, low: float, high: float, unit: str) -> str:
+    """Words for a range of numbers."""
+    unit = f" ({unit})" if unit else ""
+    if low > -LARGEST and high < LARGEST:
+        return f"{what} from {low:g} to {high:g}{unit}"
+    if low == SMALLEST:
+        return f"{what} above 0{unit}" if what.startswith("a number") else f"{what}, each above 0{unit}"
+    if low > -LARGEST:
+        return f"{what}, {low:g} or more{unit}"
+    return f"{what}, finite{unit}" if what == "a number" else f"{what}, each finite{unit}"
+
+
+def _read_camera(table: _Table) -> Camera:
+    transfer = _read_transfer(table)
+    if "calibration" in table:
+        for key in INTRINSICS:
+            if key in table:
+                table.fail(key, "not used beside calibration; give either the file or the numbers")
+        return load_calibration(table.file("calibration", "a calibration file"), transfer)
+    if not any(key in table for key in INTRINSICS):
+        table.fail("width", f"give {', '.join(INTRINSICS[:6])}, or calibration with the path of OpenCV's YAML or JSON")
+    return Camera(
+        width=table.integer("width", low=1, high=MOST_PIXELS),
+        height=table.integer("height", low=1, high=MOST_PIXELS),
+        fx=table.number("fx", low=SMALLEST, unit="pixels"),
+        fy=table.number("fy", low=SMALLEST, unit="pixels"),
+        cx=table.number("cx", unit="pixels"),
+        cy=table.number("cy", unit="pixels"),
+        distortion=table.vector("distortion", Camera.distortion, sizes=(4, 5, 8)),
+        transfer=transfer,
+    )
+
+
+def _read_transfer(table: _Table) -> str | Path:
+    value = table.text("transfer", "srgb", right=_TRANSFERS)
+    if value in ("srgb", "linear"):
+        return value
+    if value.startswith("gamma:"):
+        try:
+            gamma = float(value.removeprefix("gamma:"))
+        except ValueError:
+            gamma = math.nan
+        if not 0.1 <= gamma <= 10.0:
+            table.fail("transfer", 'expected a gamma from 0.1 to 10, such as "gamma:2.2"')
+        return value
+    path = table.resolve("transfer", _TRANSFERS)
+    if not path.is_file():
+        table.fail("transfer", f"expected {_TRANSFERS}; no such file: {path}")
+    return path
+
+
+def _read_source(table: _Table) -> SourceSpec:
+    given = [key for key in _SOURCES if key in table]
+    if len(given) != 1:
+        key = given[1] if given else "path"
+        also = f"{given[0]} is given too; " if given else ""
+        table.fail(key, f"{also}expected exactly one of path, camera and synthetic")
+    path = table.resolve("path", "a folder of frames or a video") if "path" in table else None
+    # Whether the path is there is asked when the source is opened: another source may stand in for it.
+    return SourceSpec(
+        path=path,
+        camera=table.integer("camera", low=0, high=1023) if "camera" in table else None,
+        synthetic=table.text("synthetic", right="the name of a generated source") if "synthetic" in table else None,
+        fps=table.number("fps", low=1e-3, high=1e5, unit="frames per second") if "fps" in table else None,
+        exposures=table.vector("exposures", sizes=range(2, 9), low=1e-6, high=1e3, unit="seconds")
+        if "exposures" in table
+        else None,
+    )
+
+
+def _read_marker(table: _Table) -> Marker:
+    dictionary = table.choice("dictionary", _DICTIONARIES, Marker.dictionary)
+    count = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[dictionary]).bytesList)
+    white = table.number("white", Marker.white, low=0.01, high=1.0)
+    if "board" not in table:
+        return Marker(dictionary, table.integer("id", Marker.id, low=0, high=count - 1), table.length("size"), white)
+    for key in ("id", "size"):
+        if key in table:
+            table.fail(key, "not used beside board, which says its own sizes; remove one of the two")
+    board = _read_board(table)
+    if board.marker_count > count:
+        table.fail("board", f"needs {board.marker_count} markers; {dictionary} has {count}")
+    return Marker(dictionary, white=white, board=board)
+
+
+def _read_board(table: _Table) -> Board:
+    words = table.text("board", right=_BOARDS).split()
+    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", words[1]) if len(words) == 4 else None
+    if match is None or words[0] not in ("charuco", "grid"):
+        table.fail("board", f"expected {_BOARDS}")
+    columns, rows = int(match[1]), int(match[2])
+    try:
+        first, second = float(words[2]), float(words[3])
+    except ValueError:
+        first = second = math.nan
+    if not (SMALLEST <= first <= LARGEST and SMALLEST <= second <= LARGEST):
+        table.fail("board", f"lengths must be above 0 and finite; expected {_BOARDS}")
+    if words[0] == "grid":
+        if columns < 1 or rows < 1:
+            table.fail("board", "a grid has at least 1x1 markers")
+        return GridBoard(columns, rows, first, second)
+    if columns < 2 or rows < 2:
+        table.fail("board", "a ChArUco board has at least 2x2 squares")
+    if second >= first:
+        table.fail("board", "a marker must be smaller than its square; the square's length comes first")
+    return CharucoBoard(columns, rows, first, second)
+
+
+def _read_probe(table: _Table) -> Probe:
+    reflectance = Probe.reflectance
+    if isinstance(table.data.get("reflectance"), list):
+        reflectance = cast(RGB, table.vector("reflectance", low=0.01, high=1.0))
+    elif "reflectance" in table:
+        reflectance = (table.number("reflectance", low=0.01, high=1.0),) * 3
+    return Probe(table.vec3("center", unit="metres"), table.length("radius"), reflectance)
+
+
+def _read_proxy(table: _Table) -> Proxy:
+    shape = table.choice("shape", PROXY_KEYS)
+    table.only("shape", PROXY_KEYS[shape], ("size", "file"))
+    sides = {"plane": 2, "box": 3}.get(shape)
+    return Proxy(
+        shape=cast(Any, shape),
+        at=table.vec3("at", Proxy.at, unit="metres"),
+        rotate=table.vec3("rotate", Proxy.rotate, unit="degrees"),
+        size=() if sides is None else table.vector("size", sizes=(sides,), low=SMALLEST, unit="metres"),
+        file=_read_mesh_path(table) if shape == "mesh" else None,
+    )
+
+
+def _read_mesh_path(table: _Table) -> Path:
+    path = table.file("file", "a mesh")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        table.fail("file", f"unknown mesh format; use one of {', '.join(MESH_SUFFIXES)}")
+    return path
+
+
+def _read_object(table: _Table) -> Object:
+    shape = table.choice("shape", OBJECT_KEYS)
+    table.only("shape", OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
+    major = table.length("major_radius") if shape == "torus" else Object.major_radius
+    minor = table.length("minor_radius") if shape == "torus" else Object.minor_radius
+    if shape == "torus" and minor >= major:
+        table.fail("minor_radius", f"must be below major_radius ({major:g}), else the torus has no hole")
+    return Object(
+        shape=cast(Any, shape),
+        file=_read_mesh_path(table) if shape == "mesh" else None,
+        radius=table.length("radius") if shape == "sphere" else Object.radius,
+        size=table.vec3("size", low=SMALLEST, unit="metres") if shape == "box" else Object.size,
+        major_radius=major,
+        minor_radius=minor,
+        at=table.vec3("at", Object.at, unit="metres"),
+        rotate=table.vec3("rotate", Object.rotate, unit="degrees"),
+        scale=table.number("scale", Object.scale, low=SMALLEST),
+        material=_read_material(table) if "material" in table else Object.material,
+        animate=_read_animation(table),
+    )
+
+
+def _read_material(parent: _Table) -> Material:
+    known = ["model", *keys_of(*MATERIALS.values())]
+    table = _Table(parent.label, parent.folder, parent.name("material"), parent.data["material"], known)
+    model = table.choice("model", MATERIALS)
+    kind = MATERIALS[model]
+    table.only("model", keys_of(kind), known[1:])
+    if kind is PhongMaterial:
+        return PhongMaterial(
+            diffuse=table.reflectance("diffuse", PhongMaterial.diffuse),
+            specular=table.reflectance("specular", PhongMaterial.specular),
+            shininess=table.number("shininess", PhongMaterial.shininess, low=0.0),
+        )
+    if kind is MetallicRoughnessMaterial:
+        return MetallicRoughnessMaterial(
+            base_color=table.reflectance("base_color", MetallicRoughnessMaterial.base_color),
+            metallic=table.number("metallic", MetallicRoughnessMaterial.metallic, low=0.0, high=1.0),
+            roughness=table.number("roughness", MetallicRoughnessMaterial.roughness, low=0.0, high=1.0),
+        )
+    if kind is LambertMaterial:
+        return LambertMaterial(table.reflectance("base_color", LambertMaterial.base_color))
+    return MirrorMaterial(table.reflectance("base_color", MirrorMaterial.base_color))
+
+
+def _read_animation(parent: _Table) -> Animation | None:
+    if "animate" not in parent:
+        return None
+    section = parent.name("animate")
+    table = _Table(parent.label, parent.folder, section, parent.data["animate"], keys_of(Animation))
+    if "period" in table and "sway" not in table:
+        table.fail("period", "is the duration of a swing; give sway too, its excursion in metres")
+    if "pivot" in table and "turn" not in table:
+        table.fail("pivot", "is the point to turn about; give turn too, in degrees per second")
+    return Animation(
+        turn=table.vec3("turn", Animation.turn, unit="degrees per second"),
+        pivot=table.vec3("pivot", unit="metres") if "pivot" in table else None,
+        sway=table.vec3("sway", Animation.sway, unit="metres"),
+        period=table.number("period", Animation.period, low=1e-3, unit="seconds"),
+    )
+
+
+def _read_light(table: _Table) -> Light:
+    kind = table.choice("kind", LIGHT_KEYS)
+    table.only("kind", LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
+    spot = kind == "spot"
+    at = Light.at if kind == "directional" else table.vec3("at", unit="metres")
+    target = table.vec3("target", unit="metres") if "target" in table else None
+    direction = None
+    if target is not None:
+        if "direction" in table:
+            table.fail("direction", "target is given too; expected exactly one of the two")
+        if target == at:
+            table.fail("target", "is where the light itself is; move one of the two")
+    elif kind != "point":
+        if spot and "direction" not in table:
+            table.fail("target", "a spot light needs a target (a point) or a direction")
+        direction = table.vec3("direction")
+        if not any(abs(component) >= SMALLEST for component in direction):
+            table.fail("direction", "has no length; expected the way the light travels, such as [0, 0, -1]")
+    outer = table.number("outer_angle", low=0.0, high=90.0, unit="degrees") if spot else Light.outer_angle
+    inner = table.number("inner_angle", low=0.0, high=90.0, unit="degrees") if spot else Light.inner_angle
+    if inner > outer:
+        table.fail("inner_angle", f"must not be above outer_angle ({outer:g})")
+    attenuation = table.vec3("attenuation", Light.attenuation, low=0.0)
+    if not any(term >= SMALLEST for term in attenuation):
+        table.fail("attenuation", "is zero everywhere; expected constant, linear and quadratic term, such as [0, 0, 1]")
+    return Light(
+        kind=cast(Any, kind),
+        intensity=table.number("intensity", low=0.0),
+        color=table.vec3("color", Light.color, low=0.0),
+        at=at,
+        target=target,
+        direction=direction,
+        inner_angle=inner,
+        outer_angle=outer,
+        attenuation=attenuation,
+        radius=table.number("radius", Light.radius, low=0.0, unit="metres"),
+        animate=_read_animation(table),
+    )
+
+
+def _read_exposure(table: _Table) -> Exposure:
+    if table.data.get("scale") == "auto":
+        return Exposure("auto")
+    if isinstance(table.data.get("scale"), str):
+        table.fail("scale", 'expected a number, 0 or more, or "auto"')
+    return Exposure(table.number("scale", 1.0, low=0.0))
+
+
+def bundled_scenes() -> dict[str, Path]:
+    """The scenes that come with the program: name to file, in order of name."""
+    folder = Path(str(importlib.resources.files("warp_ar.scenes")))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_scene(path_or_name: str | Path) -> Scene:
+    """Read a scene file.
+
+    Args:
+        path_or_name: A file, or the name of a bundled scene.
+
+    Raises:
+        SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
+    """
+    path = Path(path_or_name)
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # too long, or a zero byte
+        found = False
+    if not found:
+        bundled = bundled_scenes()
+        if str(path_or_name) not in bundled:
+            hint = f"a file, or a bundled scene ({nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
+            raise SceneError(f"{path}: no such scene; expected {hint}")
+        path = bundled[str(path_or_name)]
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not a text file in UTF-8 (byte {error.start}); expected TOML") from error
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
+    return loads_scene(text, path)
+
+
+def loads_scene(text: str, path: str | Path | None = None) -> Scene:
+    """Read a scene from text.
+
+    Args:
+        text: TOML.
+        path: The file that the text stands for: named in errors, and its folder is where relative paths start. Without
+            it they start at the current folder.
+
+    Raises:
+        SceneError: As :func:`load_scene`.
+    """
+    path = None if path is None else Path(path)
+    label = "scene" if path is None else str(path)
+    folder = Path.cwd() if path is None else path.parent.resolve()
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: TOMLDecodeError, and integers of too many digits
+        raise SceneError(f"{label}: not valid TOML: {' '.join(str(error).split())}") from error
+
+    top = _Table(label, folder, "", {key: data[key] for key in data if key not in _SECTIONS}, (*_TOP_KEYS, *_SECTIONS))
+    if "schema" not in top:
+        top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
+    if top.data["schema"] is True or top.data["schema"] != SCHEMA:
+        top.fail("schema", f"this program reads schema {SCHEMA}")
+    if "camera" not in data:
+        raise SceneError(f"{label}: [camera] is missing: give {', '.join(INTRINSICS[:6])}, or calibration")
+
+    def one(section: str, keys: Sequence[str], read: Any) -> Any:
+        return read(_Table(label, folder, section, data[section], keys)) if section in data else None
+
+    def many(section: str, keys: Sequence[str], read: Any, *, single: bool = False) -> tuple[Any, ...]:
+        value = data.get(section, [])
+        if single and isinstance(value, dict):
+            return (read(_Table(label, folder, section, value, keys)),)
+        if not isinstance(value, list):
+            raise SceneError(f"{label}: {section}: there may be several: write [[{section}]] instead of [{section}]")
+        return tuple(read(_Table(label, folder, f"{section}[{i}]", item, keys)) for i, item in enumerate(value))
+
+    scene = Scene(
+        schema=SCHEMA,
+        name=top.text("name", "scene" if path is None else path.stem),
+        camera=one("camera", (*INTRINSICS, "transfer", "calibration"), _read_camera),
+        source=one("source", keys_of(SourceSpec), _read_source),
+        marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
+        probes=many("probe", keys_of(Probe), _read_probe, single=True),
+        proxies=many("proxy", keys_of(Proxy), _read_proxy),
+        objects=many("object", keys_of(Object), _read_object),
+        lights=many("light", keys_of(Light), _read_light),
+        exposure=one("exposure", keys_of(Exposure), _read_exposure) or Exposure(),
+        path=path,
+    )
+    placed = [section for section in ("probe", "proxy", "object", "light") if data.get(section)]
+    if placed and "marker" not in data:
+        raise SceneError(
+            f"{label}: [marker] is missing: [{placed[0]}] has its place in the marker's frame; give its size"
+        )
+    return scene

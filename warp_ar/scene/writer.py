@@ -1,0 +1,75 @@
+"""A scene as the text of a scene file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from warp_ar.scene.description import Animation, Board, Light, Object, Probe, Scene, SourceSpec
+from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+
+
+def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
+    """Write a scene as TOML that :func:`loads_scene` turns into an equal one.
+
+    Args:
+        scene: The scene.
+        folder: Where the text will be saved: paths to things inside it are written relative to it, all others, and
+            without it all paths, in full.
+
+    Returns:
+        The text. A camera read from a calibration file is written as its numbers.
+    """
+    base = None if folder is None else Path(folder).resolve()
+
+    def value(item: Any) -> str:
+        if isinstance(item, Path):
+            item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
+        if isinstance(item, str):
+            return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
+        if isinstance(item, Board):
+            return value(str(item))
+        if isinstance(item, Mapping):
+            return "{ " + ", ".join(f"{key} = {value(entry)}" for key, entry in item.items()) + " }"
+        if isinstance(item, tuple):
+            return "[" + ", ".join(map(value, item)) + "]"
+        return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
+
+    def table(item: Any, keys: Iterable[str]) -> list[str]:
+        """Lines of the keys that have a value."""
+        entries = ((key, getattr(item, key)) for key in keys)
+        return [f"{key} = {value(entry)}" for key, entry in entries if entry is not None]
+
+    def animation(item: Object | Light) -> list[str]:
+        if item.animate is None:
+            return []
+        fields = {key: getattr(item.animate, key) for key in keys_of(Animation)}
+        return [f"animate = {value({key: entry for key, entry in fields.items() if entry is not None})}"]
+
+    lines = [f"schema = {scene.schema}", f"name = {value(scene.name)}"]
+    lines += ["", "[camera]", *table(scene.camera, (*INTRINSICS, "transfer"))]
+    if scene.source is not None:
+        lines += ["", "[source]", *table(scene.source, keys_of(SourceSpec))]
+    keys = ("dictionary", "id", "size", "white") if scene.marker.board is None else ("dictionary", "board", "white")
+    lines += ["", "[marker]", *table(scene.marker, keys)]
+    for probe in scene.probes:
+        lines += ["", "[[probe]]", *table(probe, keys_of(Probe))]
+    for proxy in scene.proxies:
+        lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
+    for thing in scene.objects:
+        model = next(name for name, kind in MATERIALS.items() if isinstance(thing.material, kind))
+        lines += ["", "[[object]]", *table(thing, ("shape", *OBJECT_KEYS[thing.shape], "at", "rotate", "scale"))]
+        lines += animation(thing)
+        lines += [
+            "",
+            "[object.material]",
+            f"model = {value(model)}",
+            *table(thing.material, keys_of(type(thing.material))),
+        ]
+    for light in scene.lights:
+        lines += ["", "[[light]]", *table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
+        lines += animation(light)
+    lines += ["", "[exposure]", *table(scene.exposure, ("scale",))]
+    return "\n".join(lines) + "\n"
