@@ -1,4 +1,4 @@
-"""The room's light: accumulation, filling and key lights, by map size."""
+"""The environment: accumulation, filling and key lights, by map size."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ FILL_BYTES = 16 + 16 * 4 * 4 // 3 + 12
 def run_height(height: int, device: str) -> None:
     shape = (height, 2 * height)
     rng = np.random.default_rng(0)
-    room = np.float32(rng.uniform(0, 1, (*shape, 3)) ** 4)
+    surroundings = np.float32(rng.uniform(0, 1, (*shape, 3)) ** 4)
     mask = np.float32(rng.random(shape) > 0.15)
     params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
     params["time_step"] = 1 / 30
     params = wp.array(params, dtype=FrameParams)
-    radiance, confidence = wp.array(room, dtype=wp.vec3), wp.array(mask, dtype=wp.float32)
+    radiance, confidence = wp.array(surroundings, dtype=wp.vec3), wp.array(mask, dtype=wp.float32)
     clipped, total, share = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
     known = wp.zeros(shape, dtype=wp.float32)
     change = wp.zeros(environment.change_shape(*shape), dtype=wp.vec2)
@@ -47,8 +47,8 @@ def run_height(height: int, device: str) -> None:
     # Right before fast.
     for step in (accumulate, fill, find):
         step()
-    assert (total.numpy()[mask > 0] == room[mask > 0]).all()
-    assert (complete.numpy()[mask > 0] == room[mask > 0]).all()
+    assert (total.numpy()[mask > 0] == surroundings[mask > 0]).all()
+    assert (complete.numpy()[mask > 0] == surroundings[mask > 0]).all()
     assert np.allclose(np.linalg.norm(lights.numpy()["direction"], axis=1), 1, atol=1e-5)
 
     times = measure({"accumulate": accumulate, "fill": fill, "key_lights": find}, device)

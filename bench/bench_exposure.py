@@ -1,4 +1,4 @@
-"""Exposure of a 640x480 frame: the frame alone and with layers, every rung, a tenth of it saturated."""
+"""Exposure of a 640x480 frame: the frame alone and with layers, every method, a tenth of it saturated."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def main(device: str) -> None:
     summed_area.sum_area(frame, table)
     for name, layers in LAYERS:
         contenders = {}
-        for rung in exposure.RUNGS:
+        for method in exposure.METHODS:
 
-            def call(config: exposure.ExposureConfig = exposure.ExposureConfig(rung, layers)) -> None:  # noqa: B008
+            def call(config: exposure.ExposureConfig = exposure.ExposureConfig(method, layers)) -> None:  # noqa: B008
                 exposure.read_scale(params, scale)
                 exposure.expose_codes(decode, encode, scale, codes)
                 inputs = (params, frame, decode, encode, over, table, scale, codes, image)
@@ -35,6 +35,6 @@ def main(device: str) -> None:
             call()
             if not layers.virtual:  # black stays black, nothing that was not clipped brightens
                 assert (image.numpy()[H // 10 :] <= picture[H // 10 :]).all()
-            contenders[rung] = call
-        for rung, times in measure(contenders, device).items():
-            report(f"expose {W}x{H} {name} {rung}", times, device)
+            contenders[method] = call
+        for method, times in measure(contenders, device).items():
+            report(f"expose {W}x{H} {name} {method}", times, device)

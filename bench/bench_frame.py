@@ -50,7 +50,7 @@ SIZES = {"480p": (640, 480), "1080p": (1920, 1080), "4K": (3840, 2160)}
 TRIANGLES = (1_000, 100_000, 1_000_000)
 QUALITIES = {
     "medium": PRESETS["medium"],
-    "medium, light as clipped": PRESETS["medium"].with_rungs(recover="clipped"),
+    "medium, light as clipped": PRESETS["medium"].with_methods(recover="clipped"),
     "high": PRESETS["high"],
 }
 

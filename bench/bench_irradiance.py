@@ -1,7 +1,7 @@
-"""Irradiance: the time of every rung, and its error on a made-up room of a window, a lamp and a sun.
+"""Irradiance: the time of every method, and its error on a made-up environment of a window, a lamp and a sun.
 
-``WARP_AR_SHARED=FOLDER`` adds the real rooms in ``FOLDER/hdri``. The error is the relative RMS over all directions
-against ``brute_force``.
+``WARP_AR_SHARED=FOLDER`` adds the real environments in ``FOLDER/hdri``. The error is the relative RMS over all
+directions against ``brute_force``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from bench.rooms import rooms
+from bench.environments import environments
 from warp_ar.kernels import irradiance, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong, sample_latlong
 from warp_ar.stages.diffuse import CLUSTERS, MAP_SIZE, TOP_MIP_SIZE
@@ -43,8 +43,8 @@ def spread(output: wp.array) -> np.ndarray:
     return out.numpy().astype(np.float64)
 
 
-def rungs(environment: wp.array, device: Any) -> dict[str, tuple[Any, wp.array]]:
-    """Work and output of every rung."""
+def methods(environment: wp.array, device: Any) -> dict[str, tuple[Any, wp.array]]:
+    """Work and output of every method."""
     height, width = environment.shape
     with wp.ScopedDevice(device):
         top, sh = wp.zeros(TOP_MIP_SIZE, dtype=wp.vec3), wp.zeros(9, dtype=wp.vec3)
@@ -84,8 +84,8 @@ def main(device: str) -> None:
     for height in HEIGHTS:
         errors: dict[str, dict[str, float]] = {}
         work: dict[str, tuple[Any, wp.array]] = {}
-        for room, environment in rooms(height, device).items():
-            work = rungs(environment, device)
+        for surroundings, environment in environments(height, device).items():
+            work = methods(environment, device)
             results = {}
             for name, (function, output) in work.items():
                 function()
@@ -93,7 +93,7 @@ def main(device: str) -> None:
             exact = results["brute_force"]
             for name, values in results.items():
                 error = math.sqrt((weight * (values - exact) ** 2).sum() / (weight * exact**2).sum())
-                errors.setdefault(name, {})[room] = round(error, 5)
+                errors.setdefault(name, {})[surroundings] = round(error, 5)
         assert all(error < 0.03 for error in errors["clusters"].values())
         for name, milliseconds in measure({name: function for name, (function, _) in work.items()}, device).items():
             report(f"irradiance {name} {height}x{2 * height}", milliseconds, device, relative_rms=errors[name])

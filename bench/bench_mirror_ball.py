@@ -1,4 +1,4 @@
-"""What the mirror ball shows of virtual things, 640x480, every rung; light, objects and shadows, alone and together."""
+"""What the mirror ball shows of virtual objects, 640x480, every method; light, objects, shadows, alone and together."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import color, mirror_ball
-from warp_ar.kernels.reflect import Room, RoomConfig
-from warp_ar.kernels.relight import RelightConfig, make_desk
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     DIRECTIONAL,
@@ -71,8 +71,8 @@ def main(device: str) -> None:
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479
     irradiance = wp.array(sh, dtype=wp.vec3, device=device)
-    room = Room()
-    room.irradiance_sh = irradiance
+    surroundings = DistantLight()
+    surroundings.irradiance_sh = irradiance
     out = wp.zeros((H, W), wp.vec3, device=device)
     # A pixel on the left, away from the sphere, whose ray goes down to the desk outside the ball's shadow.
     pixel = H // 2, W // 2 - round(0.9 * radius * FOCAL / 0.56)
@@ -81,9 +81,9 @@ def main(device: str) -> None:
     expected = {"light": desk_light, "objects": 0.0, "all": desk_light + seen * (SHADOW - 1.0)}
     for case, (objects, lit, shaded) in CASES.items():
         contenders = {}
-        for rung, samples in SAMPLES.items():
+        for method, samples in SAMPLES.items():
             trace = TraceConfig((SPHERE,), (PLANE,))
-            forms = RoomConfig(trace, (LAMBERT,), False, "sh", False, True)
+            forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", False, True)
             relighting = RelightConfig("reflectance", trace, "sh", True)
             config = mirror_ball.MirrorBallConfig(
                 trace,
@@ -93,20 +93,20 @@ def main(device: str) -> None:
                 shaded,
             )
             probes = _records(Probe, device, {"center": center, "radius": radius, "reflectance": (RHO,) * 3})
-            keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "dominance": 0.5})
+            keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "directionality": 0.5})
             decode = wp.array(decode_table, dtype=wp.vec3, device=device)
-            desk = make_desk(relighting, frame, decode, None, probes, keys, irradiance)
+            desk = make_receiver(relighting, frame, decode, None, probes, keys, irradiance)
 
             def call(config: mirror_ball.MirrorBallConfig = config, desk: object = desk) -> None:
-                inputs = (params, rays, scene, lights, room, desk, ratio)
+                inputs = (params, rays, scene, lights, surroundings, desk, ratio)
                 mirror_ball.mirror_ball(config, *inputs, out)
 
             call()
             found = out.numpy()
-            assert np.isfinite(found).all(), (case, rung)
-            assert abs(found[pixel][0] - expected[case]) < 0.01 * seen, (case, rung, found[pixel], expected[case])
+            assert np.isfinite(found).all(), (case, method)
+            assert abs(found[pixel][0] - expected[case]) < 0.01 * seen, (case, method, found[pixel], expected[case])
             right = found[:, W // 2 + 5 :]
-            assert (abs(right - found[:, W // 2 - 5 : 0 : -1]).max() > 0.1) == objects, (case, rung)
-            contenders[rung] = call
-        for rung, times in measure(contenders, device).items():
-            report(f"mirror_ball {W}x{H} {case} {rung}", times, device)
+            assert (abs(right - found[:, W // 2 - 5 : 0 : -1]).max() > 0.1) == objects, (case, method)
+            contenders[method] = call
+        for method, times in measure(contenders, device).items():
+            report(f"mirror_ball {W}x{H} {case} {method}", times, device)

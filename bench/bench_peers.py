@@ -271,7 +271,7 @@ def bench_unwrap(device: str) -> None:
 
             def ours(corners=corners, radiance=radiance, confidence=confidence, clipped=clipped) -> None:
                 probe.project_corners(params, ball, rays, scene, corners, config=config)
-                probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, rung="bilinear")
+                probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method="bilinear")
 
             def theirs(height=height) -> Any:
                 return envmap.EnvironmentMap(smooth / np.float32(255), "sphere").convertTo("latlong", height).data

@@ -7,8 +7,8 @@ the table made of all such files into ``docs/hard-cases.md``; ``python -m bench.
 Times on CPU are CPU time of one thread, on CUDA those of events around graph replays; contenders run in turn.
 
 Rows: ``sums`` of a frame, ``summed-area tables``, ``accumulations`` (a mean over 1,000 frames), ``ray offsets``,
-``look-ups`` in the levels of a room 128 texels high, and ``layers`` of a frame written and read. The first form of a
-row is the cheap one; the one marked ``*`` is what the program does.
+``look-ups`` in the levels of an environment 128 texels high, and ``layers`` of a frame written and read. The first form
+of a row is the cheap one; the one marked ``*`` is what the program does.
 """
 
 from __future__ import annotations
@@ -344,9 +344,9 @@ def compare_tables(name: str, height: int, width: int) -> list[dict[str, Any]]:
 
 
 def compare_accumulations(name: str, height: int, width: int) -> list[dict[str, Any]]:
-    room = np.random.default_rng(4).random((height, width), np.float32) * np.float32(2.9) + np.float32(0.1)
+    surroundings = np.random.default_rng(4).random((height, width), np.float32) * np.float32(2.9) + np.float32(0.1)
     # The error does not depend on the size: a strip stands for all.
-    strip = np.ascontiguousarray(room[:4, :512])
+    strip = np.ascontiguousarray(surroundings[:4, :512])
     errors, forms = {}, {}
     kinds = {
         "float32, (1 - a) m + a x": (wp.float32, wp.float32, False),
@@ -354,7 +354,7 @@ def compare_accumulations(name: str, height: int, width: int) -> list[dict[str, 
         "float64, (1 - a) m + a x": (wp.float64, wp.float64, False),
         "float16 kept, m + a (x - m)": (wp.float16, wp.float32, True),
     }
-    small, values = wp.array(strip, dtype=wp.float32), wp.array(room, dtype=wp.float32)
+    small, values = wp.array(strip, dtype=wp.float32), wp.array(surroundings, dtype=wp.float32)
     for form, (kept, computed, stable) in kinds.items():
         kernel = make_accumulate_kernel(kept, computed, stable)
         # From nine tenths of the truth: what is kept too coarsely never gets there.
@@ -362,23 +362,25 @@ def compare_accumulations(name: str, height: int, width: int) -> list[dict[str, 
         for frame in range(FRAMES):
             wp.launch(kernel, dim=strip.shape, inputs=[small, 0.01 + 0.001 * (frame % 7)], outputs=[mean])
         errors[form] = float(np.abs(mean.numpy() / strip.astype(np.float64) - 1.0).max())
-        running = wp.array(room, dtype=kept)
-        forms[form] = functools.partial(wp.launch, kernel, dim=room.shape, inputs=[values, 0.01], outputs=[running])
+        running = wp.array(surroundings, dtype=kept)
+        forms[form] = functools.partial(
+            wp.launch, kernel, dim=surroundings.shape, inputs=[values, 0.01], outputs=[running]
+        )
     return make_records("accumulations", name, f"relative, after {FRAMES} frames", errors, forms)
 
 
 def compare_look_ups(name: str, height: int, width: int) -> list[dict[str, Any]]:
     rng = np.random.default_rng(5)
-    room = np.float32(10.0 ** rng.uniform(-4, 1, (LEVEL_HEIGHT, 2 * LEVEL_HEIGHT, 3)))
-    room[LEVEL_HEIGHT // 3, LEVEL_HEIGHT // 2] = 1e6  # a sun
+    surroundings = np.float32(10.0 ** rng.uniform(-4, 1, (LEVEL_HEIGHT, 2 * LEVEL_HEIGHT, 3)))
+    surroundings[LEVEL_HEIGHT // 3, LEVEL_HEIGHT // 2] = 1e6  # a sun
     share = min(1.0, MOST_RAYS / (height * width)) if wp.get_device().is_cpu else 1.0
     out = wp.zeros((round(height * share), width), dtype=wp.vec3)
-    errors, forms, dark = {}, {}, room.max(-1) < 65504
+    errors, forms, dark = {}, {}, surroundings.max(-1) < 65504
     kinds = {"float16, 4 lanes": (wp.vec4h, np.float16), "float32 *": (wp.vec3, np.float32)}
     for form, (lanes, real) in kinds.items():
         with np.errstate(over="ignore"):
-            kept = np.minimum(room, np.finfo(real).max).astype(real)
-        errors[form] = float(np.abs(kept[dark].astype(np.float64) / room[dark] - 1.0).max())
+            kept = np.minimum(surroundings, np.finfo(real).max).astype(real)
+        errors[form] = float(np.abs(kept[dark].astype(np.float64) / surroundings[dark] - 1.0).max())
         if real is np.float16:
             kept = np.concatenate([kept, np.zeros_like(kept[..., :1])], -1)
         levels = wp.array(kept, dtype=lanes)

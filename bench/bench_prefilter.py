@@ -1,7 +1,7 @@
-"""Prefiltered reflections: the time of every rung, and its error on a made-up room of a window, a lamp and a sun.
+"""Prefiltered reflections: the time of every method, and its error on a made-up environment of window, lamp and sun.
 
-``WARP_AR_SHARED=FOLDER`` adds the real rooms in ``FOLDER/hdri``. The error is the relative RMS of each level against
-``brute_force``, averaged over the levels after the mirror.
+``WARP_AR_SHARED=FOLDER`` adds the real environments in ``FOLDER/hdri``. The error is the relative RMS of each level
+against ``brute_force``, averaged over the levels after the mirror.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from bench.rooms import rooms
+from bench.environments import environments
 from warp_ar.kernels import prefilter, pyramid
 
 HEIGHTS = {"cpu": (32, 64), "cuda": (32, 64, 128, 256)}
@@ -23,8 +23,8 @@ FEW_ROWS = 64
 SAMPLES = (8, 32, 128)
 
 
-def rungs(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str, tuple[Any, wp.array]]:
-    """Work and output of every rung."""
+def methods(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str, tuple[Any, wp.array]]:
+    """Work and output of every method."""
     height = environment.shape[0]
 
     def levels() -> wp.array:
@@ -86,14 +86,14 @@ def main(device: str) -> None:
         for lobe in ("ggx", "phong"):
             errors: dict[str, dict[str, float]] = {}
             work: dict[str, tuple[Any, wp.array]] = {}
-            for room, environment in rooms(height, device).items():
-                work = rungs(environment, lobe, device)
+            for surroundings, environment in environments(height, device).items():
+                work = methods(environment, lobe, device)
                 results = {}
                 for name, (function, output) in work.items():
                     function()
                     results[name] = output.numpy().astype(np.float64)
                 for name, values in results.items():
-                    errors.setdefault(name, {})[room] = mean_error(values, results["brute_force"], height)
+                    errors.setdefault(name, {})[surroundings] = mean_error(values, results["brute_force"], height)
             assert all(error < 0.3 for error in errors["fis128"].values())
             contenders = {name: function for name, (function, _) in work.items()}
             if on_cpu or height > FEW_ROWS:

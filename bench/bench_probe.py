@@ -1,4 +1,4 @@
-"""Unwrapping of a mirror ball by map size and rung; beside it ``cv2.remap`` with ready-made coordinates."""
+"""Unwrapping of a mirror ball by map size and method; beside it ``cv2.remap`` with ready-made coordinates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Case:
     """Rows of the map."""
     ball_pixels: int
     """Radius of the ball in the frame."""
-    rung: str
+    method: str
     boxes: int = 0
     """Proxies that could hide it."""
 
@@ -77,7 +77,7 @@ def run_case(case: Case, device: Any) -> None:
         probe.project_corners(params, ball, rays, scene, corners, config=config)
 
     def gather() -> None:
-        probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, rung=case.rung)
+        probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method=case.method)
 
     # Right before fast: the map of a constant frame is constant.
     frame.fill_(wp.vec3ub(100, 100, 100))

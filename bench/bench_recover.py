@@ -1,6 +1,6 @@
 """Recovery of clipped light: the kernels, and the solution on the host.
 
-The answer is checked first: a uniform room gives open surface points the irradiance pi.
+The answer is checked first: a uniform environment gives open surface points the irradiance pi.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ HEIGHTS = (64, 128)
 
 @dataclasses.dataclass
 class Setup:
-    """A uniform room around the bundled desk, with a lamp that clips."""
+    """A uniform environment around the bundled desk, with a lamp that clips."""
 
     height: int
     device: str
@@ -91,7 +91,7 @@ def check(setup: Setup) -> None:
     setup.add()
     total = (setup.transfer.numpy() + setup.mirrored.numpy()).sum(axis=1).max()
     if abs(total / np.pi - 1.0) > 0.02 or not np.isfinite(setup.solve().excess).all():
-        raise AssertionError(f"the largest irradiance of a uniform room is {total}, not pi")
+        raise AssertionError(f"the largest irradiance of a uniform environment is {total}, not pi")
 
 
 def main(device: str) -> None:

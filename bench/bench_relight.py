@@ -1,4 +1,4 @@
-"""Virtual light on a desk of one plane and one box, 640x480, every rung, light on the whole frame; its cells; edges."""
+"""Virtual light on a desk of one plane and one box, 640x480, every method, light on the whole frame; cells; edges."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, report
-from warp_ar.kernels import color, desk_cells, relight, room_samples, summed_area
+from warp_ar.kernels import color, environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.kernels.room_samples import RoomSample
-from warp_ar.kernels.room_shadow import count_parts
+from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.environment_shadow import count_parts
 from warp_ar.kernels.structs import BOX, PLANE, POINT, SPHERE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
 
@@ -41,43 +41,43 @@ def _cells(
     probes: wp.array,
     lights: wp.array,
     keys: wp.array,
-    room: wp.array,
+    surroundings: wp.array,
     out: wp.array,
 ) -> dict[str, Callable[[], None]]:
-    """Passes of the rung ``bounce``, in their order, in a white room."""
+    """Passes of the method ``bounce``, in their order, in a white environment."""
     trace = TraceConfig((SPHERE,), (PLANE, BOX))
     config = relight.RelightConfig("reflectance", trace, "sh", True, share=True, bounced=True)
-    place, share_stride, stride, patch_stride = desk_cells.CellConfig(config), 4, 8, 16
+    place, share_stride, stride, patch_stride = receiver_cells.CellConfig(config), 4, 8, 16
     environment = wp.full((64, 128), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     cumulative = wp.zeros((64, 128), wp.float32, device=device)
-    sums, samples = wp.zeros(64, wp.vec2, device=device), wp.zeros(1024, RoomSample, device=device)
+    sums, samples = wp.zeros(64, wp.vec2, device=device), wp.zeros(1024, EnvironmentSample, device=device)
     unused = [wp.zeros(1024, wp.vec3, device=device) for _ in range(2)]
-    room_samples.sum_environment(environment, cumulative, sums)
-    room_samples.draw_samples(environment, cumulative, sums, wp.vec3(-0.1, 0.0, 0.04), *unused, samples)
+    environment_samples.sum_environment(environment, cumulative, sums)
+    environment_samples.draw_samples(environment, cumulative, sums, wp.vec3(-0.1, 0.0, 0.04), *unused, samples)
 
     def grid(size: int, dtype: type) -> wp.array:
         return wp.zeros((-(-H // size), -(-W // size)), dtype, device=device)
 
-    cells = relight.DeskCells()
+    cells = relight.ReceiverCells()
     cells.share, cells.share_surface = grid(share_stride, wp.vec3), grid(share_stride, wp.int32)
     cells.bounced, cells.bounced_surface = grid(stride, wp.vec3), grid(stride, wp.int32)
     cells.share_stride, cells.bounced_stride = share_stride, stride
-    patches, listed = grid(patch_stride, desk_cells.Patch), grid(patch_stride, desk_cells.Patch)
+    patches, listed = grid(patch_stride, receiver_cells.Patch), grid(patch_stride, receiver_cells.Patch)
     count = wp.zeros(patches.shape[0], wp.int32, device=device)
-    desk = relight.make_desk(config, frame, decode, table, probes, keys, room, cells=cells)
+    desk = relight.make_receiver(config, frame, decode, table, probes, keys, surroundings, cells=cells)
     seen = params, rays, scene
     shares = desk, samples, 128, share_stride, cells.share, cells.share_surface
-    parts = count_parts(*cells.share.shape, desk_cells.SHARE_PARTS) if wp.get_device(device).is_cuda else 1
+    parts = count_parts(*cells.share.shape, receiver_cells.SHARE_PARTS) if wp.get_device(device).is_cuda else 1
     scratch = None
     if parts > 1:
-        scratch = wp.zeros(desk_cells.share_sums_shape(parts, *cells.share.shape), wp.vec3, device=device)
+        scratch = wp.zeros(receiver_cells.share_sums_shape(parts, *cells.share.shape), wp.vec3, device=device)
     sums_out = cells.bounced, cells.bounced_surface
-    known = frame, decode, table, scene, probes, lights, keys, room, out
+    known = frame, decode, table, scene, probes, lights, keys, surroundings, out
     passes: dict[str, Callable[[], None]] = {
-        "share_room": lambda: desk_cells.share_room(place, *seen, lights, *shares, sums_out=scratch),
-        "send_light": lambda: desk_cells.send_light(place, *seen, lights, desk, patch_stride, patches),
-        "list_patches": lambda: desk_cells.list_patches(patches, listed, count),
-        "gather_light": lambda: desk_cells.gather_light(
+        "share_environment": lambda: receiver_cells.share_environment(place, *seen, lights, *shares, sums_out=scratch),
+        "send_light": lambda: receiver_cells.send_light(place, *seen, lights, desk, patch_stride, patches),
+        "list_patches": lambda: receiver_cells.list_patches(patches, listed, count),
+        "gather_light": lambda: receiver_cells.gather_light(
             place, *seen, desk, listed, count, patch_stride, stride, *sums_out
         ),
         "bounce, with cells": lambda: relight.relight(config, params, rays, *known, cells=cells),
@@ -87,7 +87,7 @@ def _cells(
     on_desk, share = cells.share_surface.numpy() == 0, cells.share.numpy()
     assert on_desk.any()
     assert ((share[on_desk] > 0.4) & (share[on_desk] <= 1.0)).all(), "half is what grey paper leaves at least"
-    assert share[on_desk].min() < 0.95, "the ball and the box hide some of the room"
+    assert share[on_desk].min() < 0.95, "the ball and the box hide some of the environment"
     assert 0.0 < cells.bounced.numpy()[cells.bounced_surface.numpy() >= 0].max() < 0.3 / 0.02
     return passes
 
@@ -103,7 +103,7 @@ def _edges(
     probes: wp.array,
     lights: wp.array,
     keys: wp.array,
-    room: wp.array,
+    surroundings: wp.array,
 ) -> dict[str, Callable[[], None]]:
     """Edges at 4 and 16 samples: each pixel's one after another, or listed and side by side."""
     contenders: dict[str, Callable[[], None]] = {}
@@ -111,16 +111,18 @@ def _edges(
         trace = TraceConfig((SPHERE,), (PLANE, BOX))
         config = relight.RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
         seen, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
-        desk = relight.make_desk(config, frame, decode, table, probes, keys, room)
+        desk = relight.make_receiver(config, frame, decode, table, probes, keys, surroundings)
         count = wp.zeros(1, wp.int32, device=device)
         edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
         lists = EdgeLists(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
-        relight.relight(config, params, rays, frame, decode, table, scene, probes, lights, keys, room, out, seen)
+        relight.relight(
+            config, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out, seen
+        )
         for name, own in (("in place", None), ("listed", lists)):
 
             def call(
                 config: relight.RelightConfig = config,
-                desk: relight.Desk = desk,
+                desk: relight.Receiver = desk,
                 seen: wp.array = seen,
                 out: wp.array = out,
                 own: EdgeLists | None = own,
@@ -149,7 +151,7 @@ def main(device: str) -> None:
     params = _records(FrameParams, device, {**camera, "focal": (600, 600)})
     light = {"kind": POINT, "position": (0.1, 0.1, 0.3), "intensity": (0.3,) * 3, "attenuation": (0, 0, 1)}
     lights = _records(Light, device, light)
-    keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "dominance": 0.5})
+    keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "directionality": 0.5})
     probes = _records(Probe, device, {"center": (-0.1, 0, 0.04), "radius": 0.035})
     scene = RayScene()
     scene.objects = _records(Shape, device, _shape(SPHERE, (0.05, 0, 0.05), (0.03, 0, 0)))
@@ -158,22 +160,22 @@ def main(device: str) -> None:
     )
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi / 0.28209479
-    room = wp.array(sh, dtype=wp.vec3, device=device)
+    surroundings = wp.array(sh, dtype=wp.vec3, device=device)
     decode = wp.array(color.decode_table("srgb"), dtype=wp.vec3, device=device)
     out = wp.zeros((H, W), wp.vec3, device=device)
     contenders = {}
-    for rung in relight.RUNGS:
-        config = relight.RelightConfig(rung, TraceConfig((SPHERE,), (PLANE, BOX)), "sh", True)
+    for method in relight.METHODS:
+        config = relight.RelightConfig(method, TraceConfig((SPHERE,), (PLANE, BOX)), "sh", True)
 
         def call(config: relight.RelightConfig = config) -> None:
-            relight.relight(config, params, rays, frame, decode, table, scene, probes, lights, keys, room, out)
+            relight.relight(config, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out)
 
         call()
         bright = 0.3 * 0.3 / (np.pi * (0.02 + 0.09) ** 1.5)  # a white desk at the frame's centre
         centre = out.numpy()[H // 2, W // 2]
-        assert ((centre > 0.0) & (centre <= bright * 1.01)).all(), (rung, centre)
-        contenders[rung] = call
-    contenders |= _cells(device, params, rays, frame, decode, table, scene, probes, lights, keys, room, out)
-    contenders |= _edges(device, params, rays, frame, decode, table, scene, probes, lights, keys, room)
-    for rung, times in measure(contenders, device).items():
-        report(f"relight {W}x{H} {rung}", times, device)
+        assert ((centre > 0.0) & (centre <= bright * 1.01)).all(), (method, centre)
+        contenders[method] = call
+    contenders |= _cells(device, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out)
+    contenders |= _edges(device, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings)
+    for method, times in measure(contenders, device).items():
+        report(f"relight {W}x{H} {method}", times, device)

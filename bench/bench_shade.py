@@ -1,4 +1,4 @@
-"""Shading of a 640x480 frame: one thing that covers a twentieth or a quarter of it, in several materials and lights."""
+"""Shading of a 640x480 frame: one object that covers a twentieth or a quarter of it, several materials, lights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.bench_visibility import Frame, H, W
 from bench.common import measure, report
 from warp_ar.kernels import structs
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
-from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
 
 LEVEL_HEIGHT = 64
@@ -44,10 +44,10 @@ def main(device: str) -> None:
     sh[0] = math.pi / 0.28209479
     dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
     integrate_dfg(dfg)
-    room = Room()
-    room.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
-    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0), dtype=wp.vec3, device=device)
-    room.level_height, room.dfg = LEVEL_HEIGHT, dfg
+    surroundings = DistantLight()
+    surroundings.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
+    surroundings.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(1.0), dtype=wp.vec3, device=device)
+    surroundings.level_height, surroundings.dfg = LEVEL_HEIGHT, dfg
     for case in CASES:
         frame = Frame(case.shape, case.share, device)
         material = np.zeros(1, np.dtype(structs.Material.numpy_dtype()))
@@ -63,7 +63,7 @@ def main(device: str) -> None:
         light["kind"], light["direction"], light["attenuation"] = structs.SPOT, (0, 0.6, 0.8), (0, 0, 1)
         light["position"], light["inner_angle"], light["outer_angle"] = (0, -0.6, 0.2), 0.4, 0.6
         glossy = case.model != structs.LAMBERT
-        forms = RoomConfig(
+        forms = DistantLightConfig(
             trace=frame.config,
             models=(case.model,),
             textures=False,
@@ -74,7 +74,7 @@ def main(device: str) -> None:
         config = ShadeConfig(forms, case.lights, case.edge_samples)
         light_array = wp.array(light, dtype=structs.Light, device=device)
         virtual = wp.zeros((H, W), dtype=wp.vec4, device=device)
-        inputs = (frame.params, frame.rays, frame.scene, light_array, room)
+        inputs = (frame.params, frame.rays, frame.scene, light_array, surroundings)
 
         def call(config=config, inputs=inputs, frame=frame, virtual=virtual):
             shade(config, *inputs, frame.found, frame.hits, virtual, rows=frame.launch_rows)

@@ -1,4 +1,4 @@
-"""Primary rays of a 640x480 frame in which one thing covers a twentieth or a quarter of the picture."""
+"""Primary rays of a 640x480 frame in which one object covers a twentieth or a quarter of the picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CASES = (("sphere", 0.05), ("mesh", 0.05), ("mesh", 0.25))
 
 
 class Frame:
-    """A thing at depth 1 that covers a share of the picture, and the arrays of a frame."""
+    """A object at depth 1 that covers a share of the picture, and the arrays of a frame."""
 
     def __init__(self, kind: str, share: float, device: str) -> None:
         # A ball covers pi (f tan)^2 pixels; a torus with a tube of half its radius, seen along its axis, 8/9 of that.

@@ -1,4 +1,4 @@
-"""One map of the room's light from unwrapped frames of several exposures.
+"""One map of the environment from unwrapped frames of several exposures.
 
 Frame k is exposed t_k / t_0 = r_k as long as the reference, whose camera values everything else is in. What it says of
 a texel, x_k, therefore means the radiance x_k / r_k. Where nothing clips, the estimate of least variance weights each

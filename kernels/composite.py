@@ -1,6 +1,6 @@
 """The picture: the camera's frame, what virtual light adds to it, and the virtual objects over it.
 
-    radiance = (1 - alpha) (frame * physical_ratio + physical_added + mirrored) + virtual
+    radiance = (1 - alpha) (frame * shadow_ratio + physical_added + mirrored) + virtual
 
 in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
 the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
@@ -39,9 +39,9 @@ class CompositeConfig:
     virtual: bool = False
     """Virtual objects."""
     added: bool = False
-    """Virtual light on the desk."""
+    """Virtual light on the receiver."""
     ratio: bool = False
-    """Shadows of the room's light, a factor on the frame."""
+    """Shadows of the environment, a factor on the frame."""
     mirrored: bool = False
     """What mirror balls show of what is virtual, a change of the frame."""
 
@@ -157,12 +157,12 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
 def make_layers(
     virtual: wp.array | None = None,
     physical_added: wp.array | None = None,
-    physical_ratio: wp.array | None = None,
+    shadow_ratio: wp.array | None = None,
     mirrored: wp.array | None = None,
 ) -> Layers:
     """Layers as kernels read them; None leaves one empty."""
     layers = Layers()
-    given = {"objects": virtual, "added": physical_added, "ratio": physical_ratio, "mirrored": mirrored}
+    given = {"objects": virtual, "added": physical_added, "ratio": shadow_ratio, "mirrored": mirrored}
     for name, array in given.items():
         if array is not None:
             setattr(layers, name, array)

@@ -1,6 +1,6 @@
 """How bright clipped pixels really were: the frame's linear radiance with an estimate wherever a channel clips.
 
-A camera's clipped channel says only "at least 1". Three things say more, each where it can:
+A camera's clipped channel says only "at least 1". Three objects say more, each where it can:
 
 **Hue.** Where some channels clip and others do not, the brightness is known from those that do not, and the missing
 channel follows from the hue c of what is around: with u the channels that did not clip,

@@ -30,7 +30,7 @@ class EdgeLists:
 
 @wp.func
 def list_edge(i: wp.int32, j: wp.int32, edge_count: wp.array[wp.int32], edges: wp.array[wp.vec2i]):
-    """Put a pixel on the list, if there is room; it is counted in any case."""
+    """Put a pixel on the list, if there is environment; it is counted in any case."""
     place = wp.atomic_add(edge_count, 0, 1)
     if place < edges.shape[0]:
         edges[place] = wp.vec2i(i, j)

@@ -1,4 +1,4 @@
-"""The room's light over time, whole, and its dominant directions.
+"""The environment over time, whole, and its dominant directions.
 
 **Accumulation.** Every texel keeps a radiance m and a confidence k and is drawn toward what the current frame says, x
 with confidence c:
@@ -11,19 +11,20 @@ drifts. k is drawn toward c in the same way and fades with ``FORGET_TIME``, so t
 gives way to what is.
 
 tau is ``FOLLOW_TIME`` and drops toward ``FOLLOW_TIME / HASTE`` where the light really changes. Noise and the jitter of
-the tracked pose make large differences of both signs in single texels; a change of the room moves a whole neighbourhood
-one way, and stays. So the signed mean of x - m is taken over cells of ``CELL_SIZE`` texels squared, and what counts is
-its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is forgotten as fast as
-it came.
+the tracked pose make large differences of both signs in single texels; a change of the environment moves a whole
+neighbourhood one way, and stays. So the signed mean of x - m is taken over cells of ``CELL_SIZE`` texels squared, and
+what counts is its smaller value in two successive frames of one sign: one corrupt frame is worth no haste, and is
+forgotten as fast as it came.
 
 **Filling.** What no ball shows is taken from its confident neighbours by push and pull [GGSC96]: down a pyramid go
 means of radiance weighted by confidence and solid angle, up again each texel is completed from its coarser level, as
-far as it lacks confidence. Both are normalised, and in forms that are exact for equal values: a constant room stays
-constant under any mask. Texels of a coarser level cover shares of finer ones by exact overlap, so every size works.
-Without any confidence there is no light: the map is zero.
+far as it lacks confidence. Both are normalised, and in forms that are exact for equal values: a constant environment
+stays constant under any mask. Texels of a coarser level cover shares of finer ones by exact overlap, so every size
+works. Without any confidence there is no light: the map is zero.
 
 **Key lights.** With the mean radiance L0 of the map, a texel's excess max(lum L - lum L0, 0) is what makes it a light;
-a uniform room has none. Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have left
+a uniform environment has none. Light k is where a surface would receive most of the excess that lights 0 .. k - 1 have
+left
 over: the best of the 8 x 16 cells' directions, moved to the centre of its lobe by mean shifts with ever narrower
 kernels: all that faces it (whose fixed point is the maximum of that irradiance), cos^2, cos^8, the texels within
 ``LOBE_OUTER``; and at last to the centroid of what rises above ``CORE`` of the lobe's peak, where glow and scratches of
@@ -32,10 +33,10 @@ the ball do not pull at it. Starting broad keeps the centre of a window half a s
 A direction s dominates as far as the light's flow goes its way and no rival stands elsewhere. With V = integral of L d
 and the scalar irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first
 order (the cosine lobe's first two bands, pi and 2 pi / 3), so facets toward and away from s differ by (E(s) - E(-s)) /
-(E(s) + E(-s)) = 2 V . s / phi: the contrast that relief shows. It is 0 in a uniform room and between two equal opposite
-lights, 1 (held there) for a sun and still for a window that is half a black sky; a lamp that gives a share q of the
-light of an otherwise uniform room has 2 q. Where two lights are of one strength, which is the brighter is an accident
-of noise, and a picture that follows it would flicker; the dominance
+(E(s) + E(-s)) = 2 V . s / phi: the contrast that relief shows. It is 0 in a uniform environment and between two equal
+opposite lights, 1 (held there) for a sun and still for a window that is half a black sky; a lamp that gives a share q
+of the light of an otherwise uniform environment has 2 q. Where two lights are of one strength, which is the brighter is
+an accident of noise, and a picture that follows it would flicker; the directionality
 
     D_k = clamp(2 V . s_k / phi, 0, 1) * min over j of (1 - min(1, E_j / E_k) min(1, 2 (1 - s_j . s_k)) valley_jk)
 
@@ -1189,7 +1190,7 @@ def find_key_lights_kernel(
                             highest = wp.max(highest, share * excess)
                             sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
                         else:
-                            # Light above the room's mean, in the texel's own colour.
+                            # Light above the environment's mean, in the texel's own colour.
                             given = (weight / luminance(value) * cosine) * value
                             sum += wp.vec4(given[0], given[1], given[2], 0.0)
                     at = rotated(at, cos_step, sin_step)
@@ -1268,22 +1269,22 @@ def find_key_lights_kernel(
         light = KeyLight()
         light.direction = wp.vec3(lights[k, 0], lights[k, 1], lights[k, 2])
         light.irradiance = wp.vec3(reds[k], greens[k], blues[k])
-        light.dominance = 0.0
+        light.directionality = 0.0
         if strength[k] > 0.0:
-            light.dominance = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
+            light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
         key_lights_out[place] = light
         k += threads
 
 
 def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.array, key_lights_out: wp.array) -> None:
-    """Find the dominant directions of the room's light, brightest first.
+    """Find the dominant directions of the environment, brightest first.
 
     Args:
         environment: ``wp.vec3`` (h, w), finite and not negative.
         sums_out: Scratch, ``wp.vec4`` (h).
         cells_out: Scratch, ``wp.vec4`` (``CELL_SUMS``).
-        key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance, dominance 0
-            and looks toward +z.
+        key_lights_out: ``KeyLight`` (1 to ``MAX_KEY_LIGHTS``). A place without a light has no irradiance,
+            directionality 0 and looks toward +z.
 
     Raises:
         ValueError: More lights were asked for than can be found.

@@ -3,8 +3,8 @@
 A shorter exposure scales linear light by s < 1. Where the camera clipped, the frame does not say how bright the scene
 was, and scaling the clipped value gives flat grey patches. A pixel counts as clipped when all its channels are: one
 that still has a hue is not far above clipping, and lifting it would leave a bright island in a surface that fades.
-Rungs:
 
+Methods:
 ``plain``: scaling alone; a clipped pixel is taken to be just clipped.
 
 ``box``: [DH04] section 4.3. Clipped pixels are scaled by a factor that depends on the mean intensity a of a box
@@ -21,9 +21,9 @@ than ``MAX_GAIN`` above s,
 
 So s = 1 is the identity; a region smaller than half the box fades like the rest; s = 0 is black everywhere, as no
 light is. In other words factor / s is a guess of the clipped pixel's radiance; the bound of one stop keeps the guess
-near the likeliest values: in renderings and photographs of rooms most clipped pixels lie less than one stop above
-clipping. It enters gradually from code ``KNEE`` up, so noise around clipping does not show, and the light is guessed
-before virtual light is added to it: that is known and needs no guess.
+near the likeliest values: in renderings and photographs of environments most clipped pixels lie less than one stop
+above clipping. It enters gradually from code ``KNEE`` up, so noise around clipping does not show, and the light is
+guessed before virtual light is added to it: that is known and needs no guess.
 
 A longer exposure, s > 1, is scaled and clipped: what a camera does.
 
@@ -32,9 +32,9 @@ shows; s = 1 is the identity.
 
 Pixels that no layer and no guess touches go through a table of 256 codes, made anew for every s.
 
-``auto`` keeps highlights of virtual light on the desk below clipping. Over a grid of pixels that virtual light falls
-on, and whose own code is not clipped (those cannot be helped), the level P is found that all but ``CLIPPED_SHARE`` of
-them stay below; the scale aims at
+``auto`` keeps highlights of virtual light on the receiver below clipping. Over a grid of pixels that virtual light
+falls on, and whose own code is not clipped (those cannot be helped), the level P is found that all but
+``CLIPPED_SHARE`` of them stay below; the scale aims at
 
     s* = min(1, max(1 / P, MIN_AUTO_SCALE)),
 
@@ -72,7 +72,7 @@ from warp_ar.kernels.summed_area import box_mean
 
 wp.set_module_options({"enable_backward": False})
 
-RUNGS = ("plain", "box", "declipped")
+METHODS = ("plain", "box", "declipped")
 """Cheapest first."""
 
 MAX_BOX = 1.0 / 8.0
@@ -104,14 +104,14 @@ NO_LAYERS = CompositeConfig()
 class ExposureConfig:
     """What is compiled into the kernel."""
 
-    rung: Literal["plain", "box", "declipped"] = "plain"
+    method: Literal["plain", "box", "declipped"] = "plain"
     """How clipped pixels darken."""
     layers: CompositeConfig = NO_LAYERS
     """What is composed before it is exposed."""
 
     def __post_init__(self) -> None:
-        if self.rung not in RUNGS:
-            raise ValueError(f"rung: {self.rung!r} is none of {', '.join(RUNGS)}")
+        if self.method not in METHODS:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(RUNGS)}")
 
 
 @wp.func
@@ -255,19 +255,19 @@ def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
         codes: wp.array[wp.vec3ub],
     ) -> wp.vec3ub:
         gain = float(1.0)
-        if wp.static(config.rung == "box"):
+        if wp.static(config.method == "box"):
             least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
             if least > KNEE and s < 1.0:
                 clipped = (least - KNEE) / (255.0 - KNEE)
                 gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
         guessed = bool(gain != 1.0)
-        if wp.static(config.rung == "declipped"):
+        if wp.static(config.method == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
         at = read_layers(params, layers, i, j)
         if not guessed and not is_changed(at):
             return wp.vec3ub(codes[wp.int32(code[0])][0], codes[wp.int32(code[1])][1], codes[wp.int32(code[2])][2])
         radiance = gain * decode(decode_table, code)
-        if wp.static(config.rung == "declipped"):
+        if wp.static(config.method == "declipped"):
             if guessed:
                 radiance = declipped[i, j]
         return encode(encode_table, s * compose(radiance, at))
@@ -353,10 +353,10 @@ def count_levels(
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Count how bright the desk is under virtual light, for ``auto``.
+    """Count how bright the receiver is under virtual light, for ``auto``.
 
     Args:
-        config: Which layers there are; virtual light on the desk must be among them.
+        config: Which layers there are; virtual light on the receiver must be among them.
         params: (1,) FrameParams.
         frame: (H, W) vec3ub, RGB.
         decode_table: (256,) vec3 of ``color.decode_table``.
@@ -402,7 +402,7 @@ def expose(
     """Write the picture at another exposure, layers composed.
 
     Args:
-        config: Rung, and which layers there are.
+        config: Method, and which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
         frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
         decode_table: (256,) vec3 of ``color.decode_table``.

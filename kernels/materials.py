@@ -1,7 +1,7 @@
-"""What surfaces do with light: textures, and four reflection models under virtual lights and under the room's light.
+"""What surfaces do with light: textures, and four reflection models under virtual lights and under the environment.
 
 Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. Every
-model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the room's light that is
+model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the environment that is
 
     diffuse E(normal) / pi + reflectance L(mirror direction, width of the lobe),
 
@@ -13,9 +13,9 @@ cos^n around the mirror direction. The weight integrates to 1 at any exponent, s
 whether it is part of the environment or a virtual light.
 
 Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, Schlick's Fresnel with
-F0 = 0.04 for what is no metal. Two things that glTF leaves open are settled by energy: light that scatters more than
+F0 = 0.04 for what is no metal. Two objects that glTF leaves open are settled by energy: light that scatters more than
 once between the facets is put back [Tur19], and the diffuse part gets what the facets let pass, 1 - (their directional
-albedo), rather than 1 - F of one facet. A white surface in a white room is white, at any roughness.
+albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
 
 References:
     [LW94] Lafortune, Willems, "Using the Modified Phong Reflectance Model for Physically Based Rendering", CW 197,

@@ -1,10 +1,10 @@
-"""What mirror balls show of what is virtual: objects, light on the desk, shadows.
+"""What mirror balls show of what is virtual: objects, light on the receiver, shadows.
 
-The camera's picture of a ball holds the real room. Were the virtual things there, the ball would mirror them too. A
-pixel's ray is reflected at the ball, of reflectance rho, and followed to what it meets first:
+The camera's picture of a ball holds the real environment. Were the virtual objects there, the ball would mirror them
+too. A pixel's ray is reflected at the ball, of reflectance rho, and followed to what it meets first:
 
 - a virtual object: the ball shows rho times the object's radiance instead of what the camera saw;
-- a proxy: what the camera saw times the shadows that virtual objects cast there under the room's light, which are
+- a proxy: what the camera saw times the shadows that virtual objects cast there under the environment, which are
   looked up where the picture shows the same point, plus rho times the virtual light that the proxy sends back. What the
   proxy is made of, the ball's own pixel says: it shows rho times the proxy's radiance;
 - another ball, or nothing: no change. Light is mirrored once.
@@ -23,8 +23,8 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
-from warp_ar.kernels.reflect import Room, look_up_layer, make_find_in_frame
-from warp_ar.kernels.relight import Desk, RelightConfig, make_lit_by
+from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
+from warp_ar.kernels.relight import Receiver, RelightConfig, make_lit_by
 from warp_ar.kernels.shade import Nearby, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
@@ -56,9 +56,9 @@ class MirrorBallConfig:
     shade: ShadeConfig | None = None
     """How virtual objects look; None: there are none."""
     relight: RelightConfig | None = None
-    """How the desk responds to virtual light; None: there is no virtual light, or no proxy for it."""
+    """How the receiver responds to virtual light; None: there is no virtual light, or no proxy for it."""
     ratio: bool = False
-    """Whether virtual objects shade the desk under the room's light."""
+    """Whether virtual objects shade the receiver under the environment."""
 
     def __post_init__(self) -> None:
         if self.samples < 1 or math.isqrt(self.samples) ** 2 != self.samples:
@@ -97,9 +97,9 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        room: Room,
-        desk: Desk,
-        physical_ratio: wp.array2d[wp.vec3],
+        distant: DistantLight,
+        desk: Receiver,
+        shadow_ratio: wp.array2d[wp.vec3],
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
     ):
@@ -133,14 +133,14 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             surface = closest_proxy(scene, start, outward, FAR)
             reach = surface.t
             if wp.static(config.shade is not None):
-                thing = closest_object(scene, start, outward, reach)
-                reach = thing.t
+                item = closest_object(scene, start, outward, reach)
+                reach = item.t
             if nearest_ball(desk.probes, start, outward, reach) >= 0:
                 continue
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
             if wp.static(config.shade is not None):
-                if thing.shape >= 0:
-                    radiance = shade_hit(scene, lights, room, thing, outward, Nearby(), tile_turn(i, j))
+                if item.shape >= 0:
+                    radiance = shade_hit(scene, lights, distant, item, outward, Nearby(), tile_turn(i, j))
                     change += wp.cw_mul(rho, radiance) - seen
                     continue
             if surface.shape < 0 or wp.dot(surface.geometric_normal, outward) >= 0.0:
@@ -156,7 +156,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
                     surface.geometric_normal,
                 )
                 if at[0] >= 0.0:
-                    change += wp.cw_mul(seen, look_up_layer(physical_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
+                    change += wp.cw_mul(seen, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
             if wp.static(config.relight is not None):
                 lit = lit_by(scene, lights, desk, surface, i, j, rho, tile_turn(i, j))
                 change += wp.cw_mul(rho, lit.added)
@@ -171,14 +171,14 @@ def mirror_ball(
     rays: wp.array,
     scene: RayScene,
     lights: wp.array | None,
-    room: Room,
-    desk: Desk,
-    physical_ratio: wp.array | None,
+    distant: DistantLight,
+    desk: Receiver,
+    shadow_ratio: wp.array | None,
     mirrored_out: wp.array,
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Write what virtual things change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
+    """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
 
     Args:
         config: What the scene calls for; what it leaves out may be None.
@@ -186,16 +186,16 @@ def mirror_ball(
         rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         scene: Objects and proxies.
         lights: (n,) Light.
-        room: The room's light, as ``shade`` reads it; empty if ``config.shade`` is None.
-        desk: From ``make_desk``; frame, decode table and probes are always needed.
-        physical_ratio: (H, W) vec3 of ``room_shadow``; needed if ``config.ratio``.
+        distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
+        desk: From ``make_receiver``; frame, decode table and probes are always needed.
+        shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
         rows: Band of rows; None means all.
     """
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [params, rays, scene, lights, room, desk, physical_ratio],
+        [params, rays, scene, lights, distant, desk, shadow_ratio],
         [mirrored_out],
         rows=rows,
         device=rays.device,

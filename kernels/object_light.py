@@ -1,17 +1,18 @@
-"""What surrounds a virtual object at close range: the desk that it stands on, other objects, itself.
+"""What surrounds a virtual object at close range: the receiver that it stands on, other objects, itself.
 
-Per pixel of an object, two things replace what the distant environment alone would give ``shade``:
+Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
 
-*Irradiance*, the sum over one set of the room's samples, each traced: a proxy in the way shows the camera's picture of
-it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the way shows
-what the distant room makes of it. So an object's underside sees the shadow that it stands in, not an empty desk.
+*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
+picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
+way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
+empty desk.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
 read the environment as well, and the share is 1. A glossy lobe sends a few, another few from each pixel of a tile. What
-is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a desk
-cuts off, half of the rays meet the desk and hardly any of the light is gone. So every ray reads the environment as
-well. With the means over the rays
+is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a
+receiver cuts off, half of the rays meet the receiver and hardly any of the light is gone. So every ray reads the
+environment as well. With the means over the rays
 
     s  share of the rays that meet something near,      N  their radiance, 0 for the others,
     B  the environment along all rays,                  M  the environment along those that meet nothing,
@@ -30,8 +31,8 @@ angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has t
 
 With one width for all, the few rays in the long tails of GGX would show lamps as squares of a tile's size.
 
-Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``room_shadow`` does;
-mirrors are not.
+Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
+does; mirrors are not.
 """
 
 from __future__ import annotations
@@ -42,19 +43,19 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.lamps import turn_to_lamps
+from warp_ar.kernels.emitters import correct_parallax
+from warp_ar.kernels.environment_samples import EnvironmentSample, brightness, sample_toward, sobol_second
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import Surface, make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
-    Room,
-    RoomConfig,
+    DistantLight,
+    DistantLightConfig,
     look_up,
     make_find_in_frame,
     make_mirrored,
     make_shade_unoccluded,
 )
-from warp_ar.kernels.room_samples import RoomSample, brightness, sample_toward, sobol_second
 from warp_ar.kernels.sampling import (
     frame_from_normal,
     radical_inverse,
@@ -89,10 +90,10 @@ SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 class ObjectLightConfig:
     """What is compiled into the kernel."""
 
-    room: RoomConfig
+    distant: DistantLightConfig
     """Kinds of shape and forms of light."""
     count: int
-    """Samples of the room per pixel, of each set."""
+    """Samples of the environment per pixel, of each set."""
     lobe_count: int
     """Rays per pixel into a glossy lobe; 0 if no object has one."""
     mirror_samples: int
@@ -100,9 +101,9 @@ class ObjectLightConfig:
     side: int
     """Pixels along a tile."""
     ratio: bool
-    """Whether objects shade the desk."""
+    """Whether objects shade the receiver."""
     added: bool
-    """Whether virtual lights light the desk."""
+    """Whether virtual lights light the receiver."""
 
 
 @wp.func
@@ -130,24 +131,24 @@ def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float
 
 @functools.cache
 def make_look_near(config: ObjectLightConfig) -> wp.Function:
-    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the room is.
+    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
 
-    The desk's radiance is that of the picture so far: its shadows and its virtual light included.
+    The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
     """
-    trace = make_trace(config.room.trace)
+    trace = make_trace(config.distant.trace)
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
-    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes)
-    shade_unoccluded = make_shade_unoccluded(config.room)
+    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes)
+    shade_unoccluded = make_shade_unoccluded(config.distant)
 
     @wp.func(module="unique")
     def look_near(
         params: FrameParams,
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
         physical_added: wp.array2d[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         origin: wp.vec3,
         direction: wp.vec3,
         t_max: wp.float32,
@@ -157,20 +158,20 @@ def make_look_near(config: ObjectLightConfig) -> wp.Function:
         if proxy.shape >= 0:
             height = frame.shape[0]
             width = frame.shape[1]
-            at = find_in_frame(params, height, width, scene, room.probes, proxy.point, proxy.geometric_normal)
+            at = find_in_frame(params, height, width, scene, distant.probes, proxy.point, proxy.geometric_normal)
             if at[0] < 0.0:
                 return wp.vec4(0.0)
             radiance = look_up(frame, decode_table, at[0], at[1])
             row = wp.int32(at[1] + 0.5)
             column = wp.int32(at[0] + 0.5)
             if wp.static(config.ratio):
-                radiance = wp.cw_mul(radiance, physical_ratio[row, column])
+                radiance = wp.cw_mul(radiance, shadow_ratio[row, column])
             if wp.static(config.added):
                 if inside_rect(row, column, params.light_rect):
                     radiance += physical_added[row, column]
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         if other.shape >= 0:
-            radiance = shade_unoccluded(scene, room, other, direction)
+            radiance = shade_unoccluded(scene, distant, other, direction)
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         return wp.vec4(0.0)
 
@@ -184,8 +185,8 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
     Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
     """
     look_near = make_look_near(config)
-    distant_mirrored = make_mirrored(config.room)
-    closest_visible = make_primary(config.room.trace)
+    distant_mirrored = make_mirrored(config.distant)
+    closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
     @wp.func(module="unique")
@@ -193,10 +194,10 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
         params: wp.array[FrameParams],
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
         physical_added: wp.array2d[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         surface: Surface,
         shape: wp.int32,
         ray: wp.vec2,
@@ -216,17 +217,17 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
                         params[0],
                         frame,
                         decode_table,
-                        physical_ratio,
+                        shadow_ratio,
                         physical_added,
                         scene,
-                        room,
+                        distant,
                         origin,
                         outward,
                         FAR,
                     )
                     if shown[3] <= 0.0:
                         distant = distant_mirrored(
-                            room, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
+                            distant, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
                         )
                         shown = wp.vec4(distant[0], distant[1], distant[2], 1.0)
                     total += shown
@@ -239,7 +240,7 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
 def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     look_near = make_look_near(config)
-    surface_at = make_surface(config.room.models, config.room.textures)
+    surface_at = make_surface(config.distant.models, config.distant.textures)
     mirror_pixel = make_mirror_pixel(config) if config.mirror_samples > 0 else None
     side = config.side
     lobes = config.lobe_count
@@ -252,11 +253,11 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
-        physical_ratio: wp.array2d[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
         physical_added: wp.array2d[wp.vec3],
         scene: RayScene,
-        room: Room,
-        samples: wp.array[RoomSample],
+        distant: DistantLight,
+        samples: wp.array[EnvironmentSample],
         stride: wp.int32,
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
@@ -281,10 +282,10 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
             normal = -normal
             geometric = -geometric
         cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
-        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
         set_index = (i % side) * side + j % side
 
-        if wp.static(config.room.diffuse != "none"):
+        if wp.static(config.distant.diffuse != "none"):
             total = wp.vec3(0.0)
             if surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2] > 0.0:
                 first = set_index * stride
@@ -305,10 +306,10 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                 params[0],
                                 frame,
                                 decode_table,
-                                physical_ratio,
+                                shadow_ratio,
                                 physical_added,
                                 scene,
-                                room,
+                                distant,
                                 origin,
                                 toward.direction,
                                 toward.distance,
@@ -318,7 +319,7 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                         total += share * cosine * toward.measure * radiance
             irradiance_out[i, j] = total
 
-        if wp.static(config.room.specular):
+        if wp.static(config.distant.specular):
             mirrored = wp.vec4(0.0)
             passed = wp.vec4(0.0)
             leaving = float(0.0)  # rays; those into the surface are part of its reflectance
@@ -330,10 +331,10 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                             params,
                             frame,
                             decode_table,
-                            physical_ratio,
+                            shadow_ratio,
                             physical_added,
                             scene,
-                            room,
+                            distant,
                             surface,
                             hit.shape,
                             ray,
@@ -359,10 +360,10 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                     params[0],
                                     frame,
                                     decode_table,
-                                    physical_ratio,
+                                    shadow_ratio,
                                     physical_added,
                                     scene,
-                                    room,
+                                    distant,
                                     origin,
                                     outward,
                                     FAR,
@@ -370,12 +371,13 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                 leaving += 1.0
                                 mirrored += near
                                 level = level_from_alpha(
-                                    wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width, room.level_height
+                                    wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width,
+                                    distant.level_height,
                                 )
                                 turned = outward
-                                if wp.static(config.room.lamps):
-                                    turned = turn_to_lamps(room.lamps, hit.point, outward)
-                                distant = sample_levels(room.levels, turned, level, room.level_height)
+                                if wp.static(config.distant.lamps):
+                                    turned = correct_parallax(distant.lamps, hit.point, outward)
+                                distant = sample_levels(distant.levels, turned, level, distant.level_height)
                                 missed = (1.0 - near[3]) * distant
                                 passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
                 mirrored = mirrored / wp.max(leaving, 1.0)
@@ -429,14 +431,14 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
                         weight = wp.where(a == reach or a == -reach, 0.5, 1.0)
                         weight *= wp.where(b == reach or b == -reach, 0.5, 1.0)
                         weights += weight
-                        if wp.static(config.room.diffuse != "none"):
+                        if wp.static(config.distant.diffuse != "none"):
                             light += weight * irradiance[i + a, j + b]
-                        if wp.static(config.room.specular):
+                        if wp.static(config.distant.specular):
                             glossy += weight * mirrored[i + a, j + b]
                             distant += weight * passed[i + a, j + b]
-        if wp.static(config.room.diffuse != "none"):
+        if wp.static(config.distant.diffuse != "none"):
             irradiance_out[i, j] = light / weights
-        if wp.static(config.room.specular):
+        if wp.static(config.distant.specular):
             if sharp:
                 mirrored_out[i, j] = mirrored[i, j]
                 return
@@ -460,11 +462,11 @@ def light_objects(
     rays: wp.array2d[wp.vec2],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
-    physical_ratio: wp.array2d[wp.vec3] | None,
+    shadow_ratio: wp.array2d[wp.vec3] | None,
     physical_added: wp.array2d[wp.vec3] | None,
     scene: RayScene,
-    room: Room,
-    samples: wp.array[RoomSample] | None,
+    distant: DistantLight,
+    samples: wp.array[EnvironmentSample] | None,
     hit_object: wp.array2d[wp.int32],
     hits: wp.array2d[Hit],
     irradiance_out: wp.array2d[wp.vec3] | None,
@@ -481,11 +483,11 @@ def light_objects(
         rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
         frame: (H, W) the camera's frame, RGB.
         decode_table: (256,) of ``color.decode_table``.
-        physical_ratio: (H, W) factor on the frame.
-        physical_added: (H, W) virtual light on the desk.
+        shadow_ratio: (H, W) factor on the frame.
+        physical_added: (H, W) virtual light on the receiver.
         scene: Objects and proxies.
-        room: The room's light.
-        samples: Samples of the room, set after set.
+        distant: The environment.
+        samples: Samples of the environment, set after set.
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         irradiance_out: (H, W) irradiance; written only where an object is seen.
@@ -503,10 +505,10 @@ def light_objects(
             rays,
             frame,
             decode_table,
-            physical_ratio,
+            shadow_ratio,
             physical_added,
             scene,
-            room,
+            distant,
             samples,
             stride,
             hit_object,

@@ -625,7 +625,7 @@ def energy_compensation(dfg: wp.vec2, f0: wp.vec3) -> wp.vec3:
     """Factor on the specular part that adds what scatters more than once [Turquin19]: 1 + F0 (1 / E - 1).
 
     E = scale + bias is what a surface with F0 = 1 reflects after one scattering. Times this factor it reflects
-    exactly 1: a white furnace stays white. The factor holds for room light and virtual lights alike.
+    exactly 1: a white furnace stays white. The factor holds for environment light and virtual lights alike.
     """
     return wp.vec3(1.0, 1.0, 1.0) + f0 * (1.0 / wp.max(dfg[0] + dfg[1], 1.0e-3) - 1.0)
 

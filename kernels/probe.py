@@ -1,9 +1,9 @@
 """The mirror ball unwrapped: which light arrives at it from every direction.
 
-The room is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the ball's
-centre, with the axis a toward the camera and D = distance / radius, the ball's point with normal n at angle theta from
-a (in the plane of a and d) looks at the camera along v = (D a - n) / |D a - n|, at angle beta = atan2(sin theta, D -
-cos theta) on the other side of the axis, and so reflects light that arrives from the angle
+The environment is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the
+ball's centre, with the axis a toward the camera and D = distance / radius, the ball's point with normal n at angle
+theta from a (in the plane of a and d) looks at the camera along v = (D a - n) / |D a - n|, at angle beta = atan2(sin
+theta, D - cos theta) on the other side of the axis, and so reflects light that arrives from the angle
 
     f(theta) = 2 theta + beta(theta),    f'(theta) = 2 + (D cos theta - 1) / |D a - n|^2,
 
@@ -38,7 +38,7 @@ from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meet
 
 wp.set_module_options({"enable_backward": False})
 
-RUNGS = ("bilinear", "area")
+METHODS = ("bilinear", "area")
 
 RIM_START = 2.5
 """Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
@@ -320,10 +320,10 @@ def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
 
 
 @functools.cache
-def make_gather_probe_kernel(rung: str) -> wp.Kernel:
-    """Kernel of one rung; raises ValueError for an unknown one."""
-    if rung not in RUNGS:
-        raise ValueError(f"unwrap: no rung {rung!r}; expected {', '.join(RUNGS)}")
+def make_gather_probe_kernel(method: str) -> wp.Kernel:
+    """Kernel of one method; raises ValueError for an unknown one."""
+    if method not in METHODS:
+        raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_probe_kernel(
@@ -362,7 +362,7 @@ def make_gather_probe_kernel(rung: str) -> wp.Kernel:
             if seen and closest > rim_start:
                 count_y = 1
                 count_x = 1
-                if wp.static(rung == "area"):
+                if wp.static(method == "area"):
                     count_y = footprint_samples(c00, c10, c01, c11)
                     count_x = footprint_samples(c00, c01, c10, c11)
                 # Running means, m += (x - m) w / W: exact where all x are equal, so a constant frame gives a constant
@@ -465,7 +465,7 @@ def gather_probe(
     confidence_out: wp.array,
     clipped_out: wp.array,
     *,
-    rung: str = "area",
+    method: str = "area",
     rim_start: float = RIM_START,
     rim_width: float = RIM_WIDTH,
     rows: Rows | None = None,
@@ -480,21 +480,21 @@ def gather_probe(
         radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
         confidence_out: ``wp.float32`` (h, w) in 0..1.
         clipped_out: ``wp.vec3`` (h, w): share of the footprint that is at clipping, per channel.
-        rung: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
+        method: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
             up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
         rim_width: Pixels over which confidence then rises.
         rows: Band of texel rows, None for all.
 
     Raises:
-        ValueError: There is no such rung.
+        ValueError: There is no such method.
     """
-    # A texel has one sample but at the rung that averages. Many texels keep a device busy by themselves.
+    # A texel has one sample but at the method that averages. Many texels keep a device busy by themselves.
     lanes = 1
-    if rung == "area" and radiance_out.device.is_cuda:
+    if method == "area" and radiance_out.device.is_cuda:
         lanes = GATHER_LANES if radiance_out.size <= FEW_TEXELS else 2
     launch_rows(
-        make_gather_probe_kernel(rung),
+        make_gather_probe_kernel(method),
         (*radiance_out.shape, lanes),
         [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
         [radiance_out, confidence_out, clipped_out],

@@ -1,10 +1,11 @@
-"""What else the frame says about the room's light: how bright surfaces are, and which part of the room lights them.
+"""What else the frame says about the environment: how bright surfaces are, and which part of it lights them.
 
 The ball clips where lamps and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
 not there, and are lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the
 radiance L receives
 
-    E(x) = pi L / rho = sum over the room's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle visibility.
+    E(x) = pi L / rho = sum over the environment's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle
+    visibility.
 
 The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps``
 the same for lamps at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
@@ -12,8 +13,8 @@ the same for lamps at finite distances. ``warp_ar.light.recovery`` solves for wh
 
 **Rims.** Half a pixel around a lamp clips as well: ``weigh_rims``.
 
-**Cells.** The room is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each with
-its mean radiance, its share at clipping, and the direction in which that share lies.
+**Cells.** The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each
+with its mean radiance, its share at clipping, and the direction in which that share lies.
 
 **Visibility.** From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own
 size, the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex
@@ -96,13 +97,13 @@ class Observation:
 
 @wp.struct
 class Cell:
-    """A part of the room."""
+    """A part of the environment."""
 
     radiance: wp.vec3  # mean, as captured
     clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
     lacking: wp.vec3  # the same, rims of what clips counting less
     hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
-    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the room beyond
+    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
     middle: wp.vec3  # unit
     direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
     solid_angle: wp.float32
@@ -689,7 +690,7 @@ def trace_transfer(
     proxies: tuple[int, ...],
     rows: Rows | None = None,
 ) -> None:
-    """Irradiance that a surface point receives from each cell of the room, per unit of the cell's radiance.
+    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
 
     Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
 
@@ -697,8 +698,8 @@ def trace_transfer(
         points: ``SurfacePoint`` (n).
         observations: ``Observation`` (n): points that the camera does not see are left out.
         cells: ``Cell`` (rows, columns): middles and solid angles.
-        probes: ``Probe`` (P), at least one; the room is the one that the first sees.
-        scene: Its proxies hide the room.
+        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
+        scene: Its proxies hide the environment.
         traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
         transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
         mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).

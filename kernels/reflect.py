@@ -1,10 +1,10 @@
-"""What a ray that leaves a surface sees: the desk in the camera's picture, virtual objects, the distant room.
+"""What a ray that leaves a surface sees: the receiver in the picture, virtual objects, the environment.
 
 The real desk is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
-Lamps of the room that are known by their places are seen, and light objects, from there (see ``lamps``).
+Lamps of the environment that are known by their places are seen, and light objects, from there (see ``lamps``).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Literal
 import warp as wp
 
 from warp_ar.kernels.color import decode
+from warp_ar.kernels.emitters import add_nearness, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.lamps import add_nearness, turn_to_lamps
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.probe import project
 from warp_ar.kernels.relight import meets_probe
-from warp_ar.kernels.structs import MIRROR, PHONG, FrameParams, Probe, RayScene, RoomLamp
+from warp_ar.kernels.structs import MIRROR, PHONG, Emitter, FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -31,12 +31,12 @@ wp.set_module_options({"enable_backward": False})
 HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
 """Share of the camera's distance within which a proxy is the point itself and does not hide it."""
 
-RoomDiffuse = Literal["none", "sh", "map"]
+DiffuseForm = Literal["none", "sh", "map"]
 
 
 @dataclasses.dataclass(frozen=True)
-class RoomConfig:
-    """Forms of the room's light that exist, and what the objects make of it."""
+class DistantLightConfig:
+    """Forms of the environment that exist, and what the objects make of it."""
 
     trace: TraceConfig
     """Kinds of shape."""
@@ -44,19 +44,19 @@ class RoomConfig:
     """Sorted material models of the objects."""
     textures: bool
     """Whether any material has a texture."""
-    diffuse: RoomDiffuse
-    """Where the room's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
+    diffuse: DiffuseForm
+    """Where the environment's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
     specular: bool
     """Whether the prefiltered environment is read."""
     probes: bool
-    """Whether there are mirror balls, which hide the desk."""
+    """Whether there are mirror balls, which hide the receiver."""
     lamps: bool = False
-    """Whether lamps of the room are known by their places."""
+    """Whether lamps of the environment are known by their places."""
 
 
 @wp.struct
-class Room:
-    """The room's light in all its forms; what a ``RoomConfig`` leaves out, or a kernel does not read, may be empty."""
+class DistantLight:
+    """The environment in all its forms; what a ``DistantLightConfig`` leaves out may be empty."""
 
     environment: wp.array2d[wp.vec3]
     irradiance_sh: wp.array[wp.vec3]  # nine coefficients
@@ -65,7 +65,7 @@ class Room:
     level_height: wp.int32  # rows of level 0
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
-    lamps: wp.array[RoomLamp]
+    lamps: wp.array[Emitter]
 
 
 @wp.func
@@ -127,25 +127,25 @@ def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
 
 
 @functools.cache
-def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
-    """``shade_unoccluded(scene, room, hit, direction) -> vec3``: an object's radiance under the distant room alone."""
+def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
+    """``shade_unoccluded(scene, environment, hit, direction) -> vec3``: radiance under the environment alone."""
     surface_at = make_surface(config.models, config.textures)
     glossy = make_mirrored(config)
-    room_irradiance = make_room_irradiance(config)
+    distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
-    def shade_unoccluded(scene: RayScene, room: Room, hit: Hit, direction: wp.vec3) -> wp.vec3:
+    def shade_unoccluded(scene: RayScene, distant: DistantLight, hit: Hit, direction: wp.vec3) -> wp.vec3:
         wo = -wp.normalize(direction)
         normal = hit.normal
         if wp.dot(hit.geometric_normal, wo) < 0.0:
             normal = -normal
         surface = surface_at(
-            scene, room.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
+            scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
         )
-        radiance = wp.cw_mul(surface.diffuse, room_irradiance(room, hit.point, normal)) / wp.pi
+        radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
         if wp.static(config.specular):
             outward = reflect(wo, normal)
-            mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
+            mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
             radiance += wp.cw_mul(surface.reflectance, mirrored)
         return radiance
 
@@ -153,26 +153,26 @@ def make_shade_unoccluded(config: RoomConfig) -> wp.Function:
 
 
 @functools.cache
-def make_room_irradiance(config: RoomConfig) -> wp.Function:
-    """``room_irradiance(room, point, normal) -> vec3``: of a surface under the room's light; 0 where none is known."""
+def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
+    """``distant_irradiance(environment, point, normal) -> vec3``: under the environment; 0 if none is known."""
 
     @wp.func(module="unique")
-    def room_irradiance(room: Room, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+    def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
         irradiance = wp.vec3(0.0)
         if wp.static(config.diffuse == "sh"):
-            irradiance = sh_irradiance(room.irradiance_sh, normal)
+            irradiance = sh_irradiance(distant.irradiance_sh, normal)
         if wp.static(config.diffuse == "map"):
-            irradiance = sample_latlong(room.irradiance_map, normal)
+            irradiance = sample_latlong(distant.irradiance_map, normal)
         if wp.static(config.lamps and config.diffuse != "none"):
-            irradiance = add_nearness(irradiance, room.lamps, point, normal)
+            irradiance = add_nearness(irradiance, distant.lamps, point, normal)
         return irradiance
 
-    return room_irradiance
+    return distant_irradiance
 
 
 @functools.cache
-def make_mirrored(config: RoomConfig) -> wp.Function:
-    """``mirrored(room, model, roughness, shininess, point, direction, floor) -> vec3``: the room as a lobe sees it.
+def make_mirrored(config: DistantLightConfig) -> wp.Function:
+    """``mirrored(environment, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
 
     The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
     what is looked at, more for what is only one ray of many.
@@ -180,7 +180,7 @@ def make_mirrored(config: RoomConfig) -> wp.Function:
 
     @wp.func(module="unique")
     def mirrored(
-        room: Room,
+        distant: DistantLight,
         model: wp.int32,
         roughness: wp.float32,
         shininess: wp.float32,
@@ -190,14 +190,14 @@ def make_mirrored(config: RoomConfig) -> wp.Function:
     ) -> wp.vec3:
         toward = direction
         if wp.static(config.lamps):
-            toward = turn_to_lamps(room.lamps, point, direction)
-        level = level_from_roughness(roughness, room.level_height)
+            toward = correct_parallax(distant.lamps, point, direction)
+        level = level_from_roughness(roughness, distant.level_height)
         if wp.static(PHONG in config.models):
             if model == PHONG:
-                level = level_from_shininess(shininess, room.level_height)
+                level = level_from_shininess(shininess, distant.level_height)
         if wp.static(MIRROR in config.models):
             if model == MIRROR:
                 level = 0.0
-        return sample_levels(room.levels, toward, wp.max(level, floor), room.level_height)
+        return sample_levels(distant.levels, toward, wp.max(level, floor), distant.level_height)
 
     return mirrored

@@ -5,7 +5,7 @@ irradiance E_v (facing it) arrives there along wi, unless a virtual object or a 
 
     added = sum over lights of  Kd / pi * E_v * visible * response.
 
-What Kd and the response are makes the rungs, with N.L = max(normal . wi, 0):
+What Kd and the response are makes the methods, with N.L = max(normal . wi, 0):
 
 ``flat``: what plain alpha blending of a lit proxy does. Kd is a grey constant, response = N.L.
 
@@ -27,31 +27,31 @@ first order, which also keeps the mean over the surroundings. With it (1) is
     response = N.L (1 + alpha (m - 1)),                                                                            (2)
 
 linear in alpha, so nothing jumps where alpha changes sign. Kd is the surroundings' luminance in the pixel's hue: the
-desk's reflectance if white paper were just below clipping.
+receiver's reflectance if white paper were just below clipping.
 
-``reflectance``: Kd is the desk's own reflectance, from what the camera sees and what the room sends there,
+``reflectance``: Kd is the receiver's own reflectance, from what the camera sees and what the environment sends there,
 
-    rho = pi L / E_room(normal),                                                                                    (3)
+    rho = pi L / E_environment(normal),                                                                        (3)
 
 which is (exactly) right for a Lambertian desk, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane where
-the room is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower bound. Shading by
-relief is in rho as well, as if it were paint. Moderate deviations e from the surroundings are taken for relief
-(beyond ``RELIEF_LIMIT`` they are paint: print, other things), as far as the room's light has a direction, and are
-turned to the virtual light:
+the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower bound.
+Shading by relief is in rho as well, as if it were paint. Moderate deviations e from the surroundings are taken for
+relief (beyond ``RELIEF_LIMIT`` they are paint: print, other objects), as far as the environment has a direction, and
+are turned to the virtual light:
 
-    response = N.L (1 + alpha e) / (1 + e),   e = dominance * biweight(m - 1) * (m - 1).                           (4)
+    response = N.L (1 + alpha e) / (1 + e),   e = directionality * biweight(m - 1) * (m - 1).                  (4)
 
-With *cells* (``kernels/desk_cells.py``) (3) takes the part of the room's light that boxes and balls let through, and
+With *cells* (``kernels/receiver_cells.py``) (3) takes the part of the environment that boxes and balls let through, and
 the irradiance by virtual light that lit proxies send to each other is added to the direct one:
 
     added += Kd / pi * E_bounced.                                                                                  (5)
 
-Where the room is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key light's
-dominance.
+Where the environment is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key
+light's directionality.
 
 Edges. A lamp without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
 lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
-along outlines; what the camera's pixel says of the desk holds for all of them.
+along outlines; what the camera's pixel says of the receiver holds for all of them.
 
 References:
     [DH04] DiVerdi, Hoellerer, "Combining Dynamic Physical and Virtual Illumination in Augmented Reality", 2004.
@@ -68,12 +68,12 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
+from warp_ar.kernels.emitters import add_nearness
 from warp_ar.kernels.irradiance import sh_irradiance
-from warp_ar.kernels.lamps import add_nearness
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
-from warp_ar.kernels.structs import FrameParams, KeyLight, Light, Probe, RayScene, RoomLamp
+from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean
 from warp_ar.kernels.visibility import (
     FAR,
@@ -89,17 +89,17 @@ from warp_ar.kernels.visibility import (
 
 wp.set_module_options({"enable_backward": False})
 
-RUNGS = ("flat", "paper", "relief", "reflectance")
+METHODS = ("flat", "paper", "relief", "reflectance")
 """Cheapest first."""
 
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
-"""Of a desk that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
+"""Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
 """Irradiance at which the prior counts as much as the frame: that of a white desk at half a code of 255."""
 RELIEF_LIMIT = wp.constant(wp.float32(0.6))
 """Relative deviation from the surroundings from which structure is paint, not relief."""
 MAX_RELIEF = wp.constant(wp.float32(4.0))
-"""Largest m: a glint of the desk is no reason to add more than four times the light."""
+"""Largest m: a glint of the receiver is no reason to add more than four times the light."""
 SURROUNDINGS = 1.0 / 8.0
 """Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a lamp's falloff."""
 _HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
@@ -117,28 +117,28 @@ _BALL = wp.constant(-2 << (_MASKED + 1))
 class RelightConfig:
     """What is compiled into the kernel."""
 
-    rung: Literal["flat", "paper", "relief", "reflectance"]
-    """How the desk responds."""
+    method: Literal["flat", "paper", "relief", "reflectance"]
+    """How the receiver responds."""
     trace: TraceConfig
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
-    """Form of the room's irradiance, for ``reflectance``."""
+    """Form of the environment's irradiance, for ``reflectance``."""
     probes: bool = False
-    """Whether there are mirror balls, which hide the desk and throw shadows of virtual light."""
+    """Whether there are mirror balls, which hide the receiver and throw shadows of virtual light."""
     soft: bool = False
     """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
     lamps: bool = False
-    """Whether ``reflectance`` knows lamps of the room by their places."""
+    """Whether ``reflectance`` knows lamps of the environment by their places."""
     share: bool = False
-    """Whether ``reflectance`` knows which part of the room's light reaches a point."""
+    """Whether ``reflectance`` knows which part of the environment reaches a point."""
     bounced: bool = False
     """Whether light that lit proxies send to each other is known."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
 
     def __post_init__(self) -> None:
-        if self.rung not in RUNGS:
-            raise ValueError(f"rung: {self.rung!r} is none of {', '.join(RUNGS)}")
+        if self.method not in METHODS:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(RUNGS)}")
         check_edge_samples(self.edge_samples)
 
 
@@ -163,11 +163,11 @@ def relief_factor(m: wp.float32, alpha: wp.float32) -> wp.float32:
 
 
 @wp.func
-def turned_relief(m: wp.float32, alpha: wp.float32, dominance: wp.float32) -> wp.float32:
+def turned_relief(m: wp.float32, alpha: wp.float32, directionality: wp.float32) -> wp.float32:
     """Factor on N.L in equation (4)."""
     deviation = wp.clamp((m - 1.0) / RELIEF_LIMIT, -1.0, 1.0)
     window = 1.0 - deviation * deviation
-    e = dominance * window * window * deviation * RELIEF_LIMIT
+    e = directionality * window * window * deviation * RELIEF_LIMIT
     return (1.0 + alpha * e) / (1.0 + e)
 
 
@@ -203,10 +203,10 @@ def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_
 
 
 @wp.struct
-class DeskCells:
-    """What ``kernels/desk_cells.py`` found for cells of the frame, each with the surface that it lies on."""
+class ReceiverCells:
+    """What ``kernels/receiver_cells.py`` found for cells of the frame, each with the surface that it lies on."""
 
-    share: wp.array2d[wp.vec3]  # of the room's light that reaches a cell
+    share: wp.array2d[wp.vec3]  # of the environment that reaches a cell
     share_surface: wp.array2d[wp.int32]
     share_stride: wp.int32  # pixels per cell
     bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
@@ -215,8 +215,8 @@ class DeskCells:
 
 
 @wp.struct
-class Desk:
-    """What is known of the real desk and of the room that lights it; what a ``RelightConfig`` leaves out is empty."""
+class Receiver:
+    """The receiver and the environment that lights it; what a ``RelightConfig`` leaves out is empty."""
 
     frame: wp.array2d[wp.vec3ub]
     decode_table: wp.array[wp.vec3]
@@ -226,26 +226,26 @@ class Desk:
     key_lights: wp.array[KeyLight]
     irradiance_sh: wp.array[wp.vec3]
     irradiance_map: wp.array2d[wp.vec3]
-    lamps: wp.array[RoomLamp]
-    cells: DeskCells
+    lamps: wp.array[Emitter]
+    cells: ReceiverCells
 
 
 @wp.struct
 class Lit:
-    """What virtual light does at a point of the desk."""
+    """What virtual light does at a point of the receiver."""
 
     added: wp.vec3  # radiance
-    seen: wp.int32  # whether any light arrives, whatever the desk makes of it, and which do not: see ``is_edge``
+    seen: wp.int32  # whether any light arrives, whatever the receiver makes of it, and which do not: see ``is_edge``
 
 
 @wp.struct
 class Matter:
-    """What a point of the desk is taken to be."""
+    """What a point of the receiver is taken to be."""
 
     kd: wp.vec3  # reflectance
     m: wp.float32  # luminance over that of the surroundings, or the intensity itself
-    key: wp.vec3  # unit, toward the room's dominant light
-    dominance: wp.float32
+    key: wp.vec3  # unit, toward the environment's dominant light
+    directionality: wp.float32
 
 
 @wp.func
@@ -334,10 +334,10 @@ def is_bounced_to(
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
     """``find_matter(scene, desk, hit, row, col, mirror) -> Matter``; arguments as those of ``lit_by``."""
-    rung = config.rung
+    method = config.method
 
     @wp.func(module="unique")
-    def find_matter(scene: RayScene, desk: Desk, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3) -> Matter:
+    def find_matter(scene: RayScene, desk: Receiver, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3) -> Matter:
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         matter.m = 1.0
@@ -346,24 +346,24 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         if is_mirrored:
             radiance = wp.cw_div(radiance, mirror)
         matter.key = desk.key_lights[0].direction
-        matter.dominance = desk.key_lights[0].dominance
-        if wp.static(rung == "paper"):
+        matter.directionality = desk.key_lights[0].directionality
+        if wp.static(method == "paper"):
             matter.m = luminance(radiance)
         else:
             around = luminance(radiance)
             if not is_mirrored:
                 around = surrounding_luminance(desk.table, desk.decode_table, row, col, desk.box)
                 matter.m = luminance(radiance) / around
-            if wp.static(rung == "relief"):
+            if wp.static(method == "relief"):
                 hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
                 matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
             else:
                 if wp.static(config.irradiance == "sh"):
-                    room = sh_irradiance(desk.irradiance_sh, hit.normal)
+                    distant = sh_irradiance(desk.irradiance_sh, hit.normal)
                 else:
-                    room = sample_latlong(desk.irradiance_map, hit.normal)
+                    distant = sample_latlong(desk.irradiance_map, hit.normal)
                 if wp.static(config.lamps):
-                    room = add_nearness(room, desk.lamps, hit.point, hit.normal)
+                    distant = add_nearness(distant, desk.lamps, hit.point, hit.normal)
                 if wp.static(config.share):
                     if not is_mirrored:
                         cells = desk.cells
@@ -371,11 +371,11 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
                         size = wp.vec2i(desk.frame.shape[0], desk.frame.shape[1])
                         share = look_up_cells(cells.share, cells.share_surface, cells.share_stride, key, size, row, col)
                         if share[3] > 0.0:
-                            room = wp.cw_mul(room, wp.vec3(share[0], share[1], share[2]))
+                            distant = wp.cw_mul(distant, wp.vec3(share[0], share[1], share[2]))
                 matter.kd = wp.vec3(
-                    reflectance_of(radiance[0], room[0]),
-                    reflectance_of(radiance[1], room[1]),
-                    reflectance_of(radiance[2], room[2]),
+                    reflectance_of(radiance[0], distant[0]),
+                    reflectance_of(radiance[1], distant[1]),
+                    reflectance_of(radiance[2], distant[2]),
                 )
         return matter
 
@@ -392,13 +392,13 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter = make_find_matter(config)
-    rung = config.rung
+    method = config.method
 
     @wp.func(module="unique")
     def lit_by(
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         hit: Hit,
         row: wp.int32,
         col: wp.int32,
@@ -406,7 +406,7 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
         turn: wp.float32,
     ) -> Lit:
         result = Lit()
-        known = bool(False)  # what the desk is, found only once some light falls here
+        known = bool(False)  # what the receiver is, found only once some light falls here
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         added = wp.vec3()
@@ -433,17 +433,17 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
                     continue
             result.seen |= _LIT
             response = n_dot_l
-            if wp.static(rung != "flat"):
+            if wp.static(method != "flat"):
                 if not known:
                     known = True
                     matter = find_matter(scene, desk, hit, row, col, mirror)
                 alpha = wp.dot(light.wi, matter.key)
-                if wp.static(rung == "paper"):
-                    response = printed_response(n_dot_l, matter.m, alpha * matter.dominance)
-                elif wp.static(rung == "relief"):
-                    response = n_dot_l * relief_factor(matter.m, alpha * matter.dominance)
+                if wp.static(method == "paper"):
+                    response = printed_response(n_dot_l, matter.m, alpha * matter.directionality)
+                elif wp.static(method == "relief"):
+                    response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
                 else:
-                    response = n_dot_l * turned_relief(matter.m, alpha, matter.dominance)
+                    response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
             added += visible * response * light.irradiance_normal
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
@@ -477,7 +477,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         # Out:
         physical_added_out: wp.array2d[wp.vec3],
         seen_out: wp.array2d[wp.int32],
@@ -556,7 +556,7 @@ def make_sample_lit(config: RelightConfig) -> wp.Function:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         row: wp.int32,
         col: wp.int32,
         sample: wp.int32,
@@ -587,7 +587,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         seen: wp.array2d[wp.int32],
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
@@ -644,7 +644,7 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
         # Out:
@@ -689,7 +689,7 @@ def surroundings_size(height: int) -> int:
     return 2 * round(0.5 * SURROUNDINGS * height) + 1
 
 
-def make_desk(
+def make_receiver(
     config: RelightConfig,
     frame: wp.array,
     decode_table: wp.array,
@@ -698,10 +698,10 @@ def make_desk(
     key_lights: wp.array | None,
     irradiance: wp.array | None,
     lamps: wp.array | None = None,
-    cells: DeskCells | None = None,
-) -> Desk:
-    """What kernels read of the desk; arguments as those of ``relight``."""
-    desk = Desk()
+    cells: ReceiverCells | None = None,
+) -> Receiver:
+    """What kernels read of the receiver; arguments as those of ``relight``."""
+    desk = Receiver()
     if cells is not None:
         desk.cells = cells
     desk.frame, desk.decode_table, desk.box = frame, decode_table, surroundings_size(frame.shape[0])
@@ -729,15 +729,15 @@ def relight(
     seen_out: wp.array | None = None,
     *,
     lamps: wp.array | None = None,
-    cells: DeskCells | None = None,
+    cells: ReceiverCells | None = None,
     rows: Rows | None = None,
 ) -> None:
-    """Write the radiance that virtual lights add to the desk; zero outside ``params[0].light_rect``.
+    """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
 
     One sample per pixel: where ``config.edge_samples`` is more than 1, ``smooth_edges`` comes next.
 
     Args:
-        config: Rung and kinds of shape.
+        config: Method and kinds of shape.
         params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
         rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         frame: (H, W) vec3ub, the camera's frame, RGB.
@@ -746,17 +746,17 @@ def relight(
         scene: Objects and proxies.
         probes: (p,) Probe; needed if ``config.probes``.
         lights: (n,) Light.
-        key_lights: (k,) KeyLight, brightest first; needed by all rungs but ``flat``.
-        irradiance: Irradiance of the room, nine coefficients or a latlong map as ``config.irradiance`` says; needed by
-            ``reflectance``.
+        key_lights: (k,) KeyLight, brightest first; needed by all methods but ``flat``.
+        irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
+            needed by ``reflectance``.
         physical_added_out: (H, W) vec3, linear radiance in camera values.
         seen_out: (H, W) int32, which surface a pixel sees and which lights do not; needed if ``config.edge_samples``
             is more than 1. Only what lies in ``light_rect`` is written.
-        lamps: (q,) RoomLamp, seen from the first probe; needed if ``config.lamps``.
-        cells: From ``desk_cells``; needed if ``config.share`` or ``config.bounced``.
+        lamps: (q,) Emitter, seen from the first probe; needed if ``config.lamps``.
+        cells: From ``receiver_cells``; needed if ``config.share`` or ``config.bounced``.
         rows: Band of rows; None means all.
     """
-    desk = make_desk(config, frame, decode_table, table, probes, key_lights, irradiance, lamps, cells)
+    desk = make_receiver(config, frame, decode_table, table, probes, key_lights, irradiance, lamps, cells)
     launch_rows(
         make_relight_kernel(config),
         frame.shape,
@@ -773,7 +773,7 @@ def smooth_edges(
     rays: wp.array,
     scene: RayScene,
     lights: wp.array,
-    desk: Desk,
+    desk: Receiver,
     seen: wp.array,
     physical_added_out: wp.array,
     *,
@@ -788,7 +788,7 @@ def smooth_edges(
         rays: Likewise.
         scene: Likewise.
         lights: Likewise.
-        desk: Of ``make_desk``.
+        desk: Of ``make_receiver``.
         seen: (H, W) int32 as ``relight`` writes.
         physical_added_out: (H, W) vec3 as ``relight`` writes; changed along edges.
         edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.

@@ -1,4 +1,4 @@
-"""Virtual objects as the camera would see them: lit by the room and by virtual lights, shadowed, with smooth edges.
+"""Virtual objects as the camera would see them: lit by environment and virtual lights, with smooth edges.
 
 The result is premultiplied: RGB is radiance times coverage, alpha the share of the pixel that virtual objects cover.
 
@@ -24,7 +24,7 @@ import warp as wp
 from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
-from warp_ar.kernels.reflect import Room, RoomConfig, make_mirrored, make_room_irradiance
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig, make_distant_irradiance, make_mirrored
 from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import Hit, check_edge_samples, inside_rect, make_primary, make_sample_direction
@@ -46,8 +46,8 @@ SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
 class ShadeConfig:
     """What a scene calls for; everything else is not compiled in."""
 
-    room: RoomConfig
-    """Kinds of shape, of material and of the room's light."""
+    distant: DistantLightConfig
+    """Kinds of shape, of material and of the environment."""
     lights: tuple[int, ...]
     """Sorted kinds of virtual light that exist."""
     edge_samples: int
@@ -65,9 +65,9 @@ class ShadeConfig:
 class Nearby:
     """What surrounds a point of an object at close range, of ``object_light``."""
 
-    known: wp.bool  # False: the distant room is all that the point receives
+    known: wp.bool  # False: the distant environment is all that the point receives
     irradiance: wp.vec3
-    mirrored: wp.vec4  # radiance that adds to the prefiltered room, and the share of that which it replaces
+    mirrored: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
 @functools.cache
@@ -76,10 +76,10 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
 
     ``turn`` is for ``visible_share``.
     """
-    forms = config.room
+    forms = config.distant
     surface_at = make_surface(forms.models, forms.textures)
     glossy = make_mirrored(forms)
-    room_irradiance = make_room_irradiance(forms)
+    distant_irradiance = make_distant_irradiance(forms)
     reflect_direct = make_reflect_direct(forms.models)
     sample_light = make_sample_light(config.lights)
     is_lit = make_shadow(forms.trace)
@@ -89,7 +89,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
     def shade_hit(
         scene: RayScene,
         lights: wp.array[Light],
-        room: Room,
+        distant: DistantLight,
         hit: Hit,
         direction: wp.vec3,
         near: Nearby,
@@ -105,11 +105,11 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if facing < MIN_FACING:
             normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
         cos_o = wp.dot(normal, wo)
-        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
 
         radiance = wp.vec3(0.0)
         if wp.static(forms.diffuse != "none"):
-            irradiance = room_irradiance(room, hit.point, normal)
+            irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.near):
                 if near.known:
                     irradiance = near.irradiance
@@ -117,7 +117,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if wp.static(forms.specular):
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 outward = reflect(wo, normal)
-                mirrored = glossy(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
+                mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
                 if wp.static(config.near):
                     if near.known:
                         close = wp.vec3(near.mirrored[0], near.mirrored[1], near.mirrored[2])
@@ -189,7 +189,7 @@ def most_alike(hit_object: wp.array2d[wp.int32], hits: wp.array2d[Hit], i: wp.in
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
     """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
     shade_hit = make_shade_hit(config)
-    closest_visible = make_primary(config.room.trace)
+    closest_visible = make_primary(config.distant.trace)
     centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
 
     @wp.func(module="unique")
@@ -198,7 +198,7 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        room: Room,
+        distant: DistantLight,
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
@@ -224,11 +224,11 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
                 pixel = most_alike(hit_object, hits, i, j, hit)
             near.known = pixel[0] >= 0
             if near.known:
-                if wp.static(config.room.diffuse != "none"):
+                if wp.static(config.distant.diffuse != "none"):
                     near.irradiance = near_irradiance[pixel[0], pixel[1]]
-                if wp.static(config.room.specular):
+                if wp.static(config.distant.specular):
                     near.mirrored = near_mirrored[pixel[0], pixel[1]]
-        radiance = shade_hit(scene, lights, room, hit, direction, near, tile_turn(i, j))
+        radiance = shade_hit(scene, lights, distant, hit, direction, near, tile_turn(i, j))
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 
     return shade_sample
@@ -254,7 +254,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        room: Room,
+        distant: DistantLight,
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
@@ -295,7 +295,7 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
                     rays,
                     scene,
                     lights,
-                    room,
+                    distant,
                     hit_object,
                     hits,
                     near_irradiance,
@@ -329,7 +329,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        room: Room,
+        distant: DistantLight,
         hit_object: wp.array2d[wp.int32],
         hits: wp.array2d[Hit],
         near_irradiance: wp.array2d[wp.vec3],
@@ -348,7 +348,7 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
                 rays,
                 scene,
                 lights,
-                room,
+                distant,
                 hit_object,
                 hits,
                 near_irradiance,
@@ -392,7 +392,7 @@ def shade(
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
     lights: wp.array[Light] | None,
-    room: Room,
+    distant: DistantLight,
     hit_object: wp.array2d[wp.int32],
     hits: wp.array2d[Hit],
     virtual_out: wp.array2d[wp.vec4],
@@ -413,7 +413,7 @@ def shade(
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
         scene: What rays meet, and what it is made of.
         lights: Virtual lights.
-        room: The room's light; neither its environment nor its probes are read.
+        distant: The environment; neither its map nor its probes are read.
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
@@ -422,7 +422,7 @@ def shade(
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    inputs = [params, rays, scene, lights, room, hit_object, hits]
+    inputs = [params, rays, scene, lights, distant, hit_object, hits]
     near = [near_irradiance, near_mirrored]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:

@@ -45,7 +45,7 @@ class FrameParams:
     object_rect: wp.vec4i  # row_start, row_stop, col_start, col_stop: where virtual objects can be on screen
     light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
     direct_rect: wp.vec4i  # the part of light_rect that light reaches without a bounce
-    shadow_rect: wp.vec4i  # the same for what virtual objects do to the room's light on the physical
+    shadow_rect: wp.vec4i  # the same for what virtual objects do to the environment on the physical
     ball_rect: wp.vec4i  # the same for mirror balls
 
 
@@ -128,16 +128,16 @@ class RayScene:
 
 @wp.struct
 class KeyLight:
-    """A dominant direction of the room's light."""
+    """A dominant direction of the environment."""
 
     direction: wp.vec3  # unit, toward the light
     irradiance: wp.vec3  # on a surface that faces it, from the texels that belong to it
-    dominance: wp.float32  # 0 ambient room .. 1 all light from this direction
+    directionality: wp.float32  # 0 ambient environment .. 1 all light from this direction
 
 
 @wp.struct
-class RoomLamp:
-    """A lamp of the room whose light clips in the ball; distant ones are directions."""
+class Emitter:
+    """A lamp of the environment whose light clips in the ball; distant ones are directions."""
 
     origin: wp.vec3  # where on the first ball the camera sees it mirrored
     direction: wp.vec3  # unit, from there, as in the environment; zero where there is no lamp

@@ -245,7 +245,7 @@ def find_bin(middle: wp.float32, low: wp.float32, bins_per_length: wp.float32) -
 
 @wp.struct
 class Building:
-    """What a tree is built from, and room to work."""
+    """What a tree is built from, and environment to work."""
 
     corners: wp.array2d[wp.vec3]  # (triangles, 3)
     lower: wp.array[wp.vec3]  # boxes, with their margins
@@ -343,14 +343,14 @@ def build_wide_bvh_kernel(
     tree_out: wp.array[wp.float32],
     blocks_out: wp.array[wp.int32],
 ):
-    """One thread: writes a tree while there is room, and how many blocks it takes, or more than there are."""
-    room = tree_out.shape[0] // BLOCK
+    """One thread: writes a tree while there is environment, and how many blocks it takes, or more than there are."""
+    distant = tree_out.shape[0] // BLOCK
     for lane in range(WIDTH):
         tree_out[NODE_BLOCKS * BLOCK + 9 * WIDTH + lane] = wp.cast(wp.int32(-1), wp.float32)
     blocks = wp.int32(NODE_BLOCKS + LEAF_BLOCKS)
     tasks = wp.int32(1)
     b.tasks[0] = wp.vec4i(0, b.corners.shape[0], -1, 0)
-    while tasks > 0 and blocks <= room:
+    while tasks > 0 and blocks <= distant:
         tasks -= 1
         task = b.tasks[tasks]
         node = wp.int32(0)
@@ -389,7 +389,7 @@ def build_wide_bvh_kernel(
                 areas[parts] = half_area(box[0], box[1])
                 parts += 1
 
-        if blocks + WIDTH * LEAF_BLOCKS <= room:
+        if blocks + WIDTH * LEAF_BLOCKS <= distant:
             at = node * BLOCK
             for k in range(WIDTH):
                 lower = wp.vec3(wp.inf, wp.inf, wp.inf)
@@ -419,7 +419,7 @@ def build_wide_bvh_kernel(
                     tree_out[at + WIDTH * axis + k] = lower[axis]
                     tree_out[at + WIDTH * (3 + axis) + k] = upper[axis]
         else:
-            blocks = room + 1
+            blocks = distant + 1
     blocks_out[0] = blocks
 
 

@@ -4,14 +4,15 @@
     python scenes/make_clips.py --truth FOLDER [--scene torus] [--frames N]
     python scenes/make_clips.py --bundle [--scene torus] [--spp 512]
 
-A clip is what a camera would have seen: one room, one desk, a printed marker, a mirror ball, and clutter that no scene
-file mentions. Everything is made here, in code: geometry, textures, light. Radiance is in camera values throughout
-(1 clips), so no exposure is applied: a frame is clipped at 1, sRGB-encoded and rounded to 8 bit.
+A clip is what a camera would have seen: one environment, one desk, a printed marker, a mirror ball, and clutter that no
+scene file mentions. Everything is made here, in code: geometry, textures, light. Radiance is in camera values
+throughout (1 clips), so no exposure is applied: a frame is clipped at 1, sRGB-encoded and rounded to 8 bit.
 
-The virtual things are never in a clip. ``--truth`` reads them from the scene file and renders the same frames with the
+The virtual objects are never in a clip. ``--truth`` reads them from the scene file and renders the same frames with the
 objects, the lights, or both, really there; also the frames at half the exposure and the light arriving at the ball's
-centre. ``--bundle`` writes one frame of each scene as ``truth/SCENE_NNNN.png``, transparent wherever the virtual things
-(or the clipping that a shorter exposure undoes) change nothing: what ``warp_ar.tradeoff`` compares pictures with.
+centre. ``--bundle`` writes one frame of each scene as ``truth/SCENE_NNNN.png``, transparent wherever the virtual
+objects (or the clipping that a shorter exposure undoes) change nothing: what ``warp_ar.tradeoff`` compares pictures
+with.
 
 Needs the extra ``assets``. ``cuda_ad_rgb`` takes about a second per frame; ``llvm_ad_rgb`` works on any CPU, slowly,
 and wants LLVM 19 (DRJIT_LIBLLVM_PATH names the library; 16 and 22 do not compile the scene ``torus``). Open Image
@@ -48,10 +49,10 @@ MARKER, CARD, PAPER, INK = 0.08, 0.12, 0.85, 0.04
 BALL, BALL_RADIUS, BALL_REFLECTANCE = (-0.12, 0.03, 0.0346), 0.035, (0.85, 0.85, 0.87)
 PROXY = {"at": (0.0, 0.21, 0.0446), "size": (0.2, 0.075, 0.09), "turn": 9.0}
 """The tea tin behind the marker, which the scene files model as a box."""
-ROOM = {"x": (-1.7, 2.3), "y": (-2.6, 0.85), "z": (-0.74, 1.75)}
+ENVIRONMENT = {"x": (-1.7, 2.3), "y": (-2.6, 0.85), "z": (-0.74, 1.75)}
 
 PATH = {"type": "path", "max_depth": 8, "rr_depth": 4}
-"""Path tracing up to seven bounces: what more would add is below a grey level in a room this bright."""
+"""Path tracing up to seven bounces: what more would add is below a grey level in an environment this bright."""
 GUIDE_SPP = 32
 """Samples per pixel of the albedo and the normals that guide the denoiser: they need to resolve edges, not light."""
 
@@ -277,7 +278,7 @@ def view(seed: int) -> np.ndarray:
     return np.clip(image, 0.02, None)
 
 
-# ---- the room and the desk -----------------------------------------------------------------------
+# ---- the environment and the desk -----------------------------------------------------------------------
 
 
 def window(name: str, center: Any, right: Any, up: Any, radiance: np.ndarray) -> Dict:
@@ -303,9 +304,9 @@ def window(name: str, center: Any, right: Any, up: Any, radiance: np.ndarray) ->
     return shapes
 
 
-def room(clip: str) -> Dict:
+def environment(clip: str) -> Dict:
     """Walls, floor, furniture and every lamp, each at level 1; the lamps' names are keys of a clip's levels."""
-    (x0, x1), (y0, y1), (z0, z1) = ROOM["x"], ROOM["y"], ROOM["z"]
+    (x0, x1), (y0, y1), (z0, z1) = ENVIRONMENT["x"], ENVIRONMENT["y"], ENVIRONMENT["z"]
     cx, cy, cz, hx, hy, hz = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2
     plaster = matte((0.72, 0.68, 0.6))
     floor = glossy(texture(wood((0.34, 0.22, 0.13), (0.16, 0.09, 0.05), 11, 12, (1024, 1024))), 0.4)
@@ -644,7 +645,7 @@ BUNDLED = {"desk": 24, "torus": 84, "mirror": 24, "wire_coincident": 36, "wire_o
 """Frame of each scene whose truth is bundled: daylight, ceiling lamp, daylight; the light of the others is still."""
 
 
-# ---- the virtual things of a scene file, for truth -----------------------------------------------
+# ---- the virtual objects of a scene file, for truth -----------------------------------------------
 
 
 def leaving_share(exponent: float, count: int = 512) -> np.ndarray:
@@ -741,36 +742,36 @@ def virtual_material(material: Dict) -> Dict:
     return mirror(material["base_color"]) if model == "mirror" else matte(material["base_color"])
 
 
-def virtual_object(thing: Dict, folder: pathlib.Path) -> Dict:
+def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
     t = mi.ScalarTransform4f()
-    rx, ry, rz = thing.get("rotate", (0, 0, 0))
+    rx, ry, rz = item.get("rotate", (0, 0, 0))
     place = (
-        t.translate(thing.get("at", [0, 0, 0]))
+        t.translate(item.get("at", [0, 0, 0]))
         @ t.rotate([0, 0, 1], rz)
         @ t.rotate([0, 1, 0], ry)
         @ t.rotate([1, 0, 0], rx)
     )
-    place = place @ t.scale(thing.get("scale", 1.0))
-    bsdf = virtual_material(thing["material"])
-    if thing["shape"] == "mesh":
+    place = place @ t.scale(item.get("scale", 1.0))
+    bsdf = virtual_material(item["material"])
+    if item["shape"] == "mesh":
         return {
             "type": "ply",
-            "filename": str(HERE / thing["file"]),
+            "filename": str(HERE / item["file"]),
             "to_world": place,
             "bsdf": {"type": "twosided", "bsdf": bsdf},
         }
-    if thing["shape"] == "sphere":
-        return {"type": "sphere", "to_world": place @ t.scale(thing["radius"]), "bsdf": bsdf}
-    if thing["shape"] == "box":
-        return {"type": "cube", "to_world": place @ t.scale([s / 2 for s in thing["size"]]), "bsdf": bsdf}
+    if item["shape"] == "sphere":
+        return {"type": "sphere", "to_world": place @ t.scale(item["radius"]), "bsdf": bsdf}
+    if item["shape"] == "box":
+        return {"type": "cube", "to_world": place @ t.scale([s / 2 for s in item["size"]]), "bsdf": bsdf}
     u, v = np.meshgrid(*(np.linspace(0, 2 * np.pi, n) for n in (193, 97)), indexing="ij")
     v = -v[:, :-1]
     u = u[:, :-1]
-    ring = thing["major_radius"] + thing["minor_radius"] * np.cos(v)
+    ring = item["major_radius"] + item["minor_radius"] * np.cos(v)
     return grid_mesh(
         folder,
         "torus",
-        np.stack([ring * np.cos(u), ring * np.sin(u), thing["minor_radius"] * np.sin(v)], -1),
+        np.stack([ring * np.cos(u), ring * np.sin(u), item["minor_radius"] * np.sin(v)], -1),
         bsdf,
         place,
     )
@@ -802,9 +803,9 @@ class Renderer:
         self.clip, self.spp = clip, spp
         with tempfile.TemporaryDirectory() as name:
             folder = pathlib.Path(name)
-            content = room(clip) | essentials(clip, with_ball) | clutter(clip, folder)
-            for k, thing in enumerate((virtual or {}).get("object", [])):
-                content[f"object{k}"] = virtual_object(thing, folder)
+            content = environment(clip) | essentials(clip, with_ball) | clutter(clip, folder)
+            for k, item in enumerate((virtual or {}).get("object", [])):
+                content[f"object{k}"] = virtual_object(item, folder)
             for k, light in enumerate((virtual or {}).get("light", [])):
                 content[f"light{k}"] = virtual_light(light)
             self.scene = mi.load_dict({"type": "scene", **content})
@@ -922,7 +923,7 @@ def make_clip(clip: str, options: argparse.Namespace) -> None:
 
 
 def make_truth(name: str, options: argparse.Namespace) -> None:
-    """Frames first, middle and last of a scene with its virtual things really there, under ``TRUTH/NAME``."""
+    """Frames first, middle and last of a scene with its virtual objects really there, under ``TRUTH/NAME``."""
     clip = SCENES[name]
     scene = tomllib.loads((HERE / f"{name}.toml").read_text())
     moments = times(clip, options.frames)

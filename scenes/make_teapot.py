@@ -33,7 +33,7 @@ PROFILES = {  # (radius, height) of four control points each
     "shoulder": [(1.5, 2.4), (1.75, 1.875), (2.0, 1.35), (2.0, 0.9)],
     "belly": [(2.0, 0.9), (2.0, 0.45), (1.5, 0.225), (1.5, 0.15)],
     "bottom": [(1.5, 0.15), (1.5, 0.075), (1.425, 0.0), (0.0, 0.0)],
-    "knob": [(0.0, 3.15), (0.8, 3.15), (0.0, 2.85), (0.2, 2.7)],
+    "setting": [(0.0, 3.15), (0.8, 3.15), (0.0, 2.85), (0.2, 2.7)],
     "lid": [(0.2, 2.7), (0.4, 2.55), (1.3, 2.55), (1.3, 2.4)],
 }
 
@@ -70,7 +70,7 @@ def patches() -> list[np.ndarray]:
     """The 32 patches, each ``(4, 4, 3)``: the first index runs along the part, the second around it."""
     found = []
     for name, profile in PROFILES.items():
-        fit = LID_FIT if name in ("knob", "lid") else 1.0
+        fit = LID_FIT if name in ("setting", "lid") else 1.0
         for turn in range(4):
             rotation = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), turn)
             ring = QUARTER @ rotation.T

@@ -31,7 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Name the marker by which tests say what they cover."""
-    config.addinivalue_line("markers", "atlas(row, stage, rung): hard case that a test covers; see hard_cases")
+    config.addinivalue_line("markers", "atlas(row, stage, method): hard case that a test covers; see hard_cases")
 
 
 @pytest.hookimpl(tryfirst=True)

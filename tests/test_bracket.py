@@ -39,10 +39,10 @@ from warp_ar.stages.quality import PRESETS
 
 TWIN = 2e-6
 """Float32 weights and means: a dozen roundings."""
-ROOM = 0.01
-"""Irradiance of the rendered room, relative: codes of 8 bits, and lamps spread over texels of 2.8 degrees; measured
-0.0052."""
-ROOM_TRACKED = 0.03
+ENVIRONMENT = 0.01
+"""Irradiance of the rendered environment, relative: codes of 8 bits, and lamps spread over texels of 2.8 degrees;
+measured 0.0052."""
+ENVIRONMENT_TRACKED = 0.03
 """The same with poses that put the ball a third of a pixel off; measured 0.020."""
 CLIPPED_LOSES = 0.7
 """What the longest exposure alone loses there at the least; measured 0.86."""
@@ -78,7 +78,7 @@ def expose(light, ratios=RATIOS):
 
 
 def test_equal_exposures_stay_equal(device):
-    """A room that no exposure clips: every one says the same, and so does their mean."""
+    """An environment that no exposure clips: every one says the same, and so does their mean."""
     ratios = (1.0, 0.25, 0.0625)  # powers of two, exact
     light = np.full((8, 16, 3), 0.625)
     values, clipped = expose(light, ratios)
@@ -168,11 +168,11 @@ def test_bands_give_the_same_bits(device):
         assert one.tobytes() == other.tobytes()
 
 
-# ---- a room with lamps far above clipping ----
+# ---- an environment with lamps far above clipping ----
 
 
-def room_light(d):
-    """A dim room, a window, and three lamps of 30 to 240 times what the long exposure can show."""
+def environment_light(d):
+    """A dim environment, a window, and three lamps of 30 to 240 times what the long exposure can show."""
     light = 0.15 + 0.1 * d[..., 2:] * np.array([1.0, 0.8, 0.6])
     light = light + 2.5 * (np.abs(d - np.array([0.8, -0.1, 0.6])).max(-1, keepdims=True) < 0.25)
     for toward, cosine, power in (((0.5, -0.5, 0.7), 0.99, 30.0), ((-0.6, -0.3, 0.74), 0.995, 120.0)):
@@ -212,7 +212,9 @@ def frames(count=9):
     pictures = []
     for index in range(count):
         camera, ratio = view(index), RATIOS[index % len(RATIOS)]
-        linear = probe_reference.render(camera, [(CENTER, RADIUS, REFLECTANCE)], room_light, lambda d: 0.1 + 0 * d)
+        linear = probe_reference.render(
+            camera, [(CENTER, RADIUS, REFLECTANCE)], environment_light, lambda d: 0.1 + 0 * d
+        )
         linear = np.clip(linear * ratio, 0, 1)
         codes = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) * 255
         noisy = codes + rng.uniform(-0.5, 0.5, codes.shape)
@@ -243,7 +245,7 @@ def irradiance(light, rows=None):
 def true_irradiance():
     height = 1024
     rows, columns = np.meshgrid(np.arange(height) + 0.5, np.arange(2 * height) + 0.5, indexing="ij")
-    light = room_light(latlong_reference.directions(height, 2 * height, rows, columns))
+    light = environment_light(latlong_reference.directions(height, 2 * height, rows, columns))
     # Band by band: cosines of all texels with all directions at once are gigabytes.
     return sum(irradiance(light, band) for band in np.split(np.arange(height), 128))
 
@@ -265,9 +267,9 @@ def test_lamps_far_above_clipping_give_their_whole_light(clip, device):
     def error(light):
         return np.linalg.norm(irradiance(light) - truth) / np.linalg.norm(truth)
 
-    assert error(captured(exact, device, exposures, quality)) < ROOM
-    assert error(captured(clip, device, exposures, quality)) < ROOM_TRACKED
-    assert error(captured(exact[:1], device, (), quality.with_rungs(recover="clipped"))) > CLIPPED_LOSES
+    assert error(captured(exact, device, exposures, quality)) < ENVIRONMENT
+    assert error(captured(clip, device, exposures, quality)) < ENVIRONMENT_TRACKED
+    assert error(captured(exact[:1], device, (), quality.with_methods(recover="clipped"))) > CLIPPED_LOSES
 
 
 # ---- what is shown ----

@@ -13,8 +13,8 @@ import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import budget as auto_quality
-from warp_ar.accuracy.budget import AIM, GAIN, KNOB_SECONDS, MEMORY, RAISE, WINDOW, AutoPipeline, Controller
-from warp_ar.accuracy.cost_table import Knob, load_errors, relevant_knobs, setting
+from warp_ar.accuracy.budget import AIM, GAIN, MEMORY, RAISE, SETTING_SECONDS, WINDOW, AutoPipeline, Controller
+from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings
 from warp_ar.accuracy.costs import Costs
 from warp_ar.errors import UsageError
 from warp_ar.stages.quality import PRESETS
@@ -26,20 +26,20 @@ COSTS = Costs(
         "environment_height": {"32": -2.0, "64": 0.0, "128": 8.0, "256": 36.0},
         "diffuse": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
         "specular": {"box_mip": -2.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
-        "room_shadow": {"none": -8.0, "coarse": 0.0, "bounce": 30.0},
+        "environment_shadow": {"none": -8.0, "coarse": 0.0, "bounce": 30.0},
     },
     {"environment_height": {"32": {"specular": 0.25}, "128": {"specular": 4.0}, "256": {"specular": 16.0}}},
 )
-BASE = {"environment_height": "64", "diffuse": "sh2", "specular": "energy_mip", "room_shadow": "coarse"}
-CHEAPEST = {"environment_height": "32", "diffuse": "top_mip", "specular": "box_mip", "room_shadow": "none"}
+BASE = {"environment_height": "64", "diffuse": "sh2", "specular": "energy_mip", "environment_shadow": "coarse"}
+CHEAPEST = {"environment_height": "32", "diffuse": "top_mip", "specular": "box_mip", "environment_shadow": "none"}
 ERRORS = {
     "environment_height": {"32": 0.03, "64": 0.01, "128": 0.007, "256": 0.0},
     "diffuse": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
     "specular": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
-    "room_shadow": {"none": 0.06, "coarse": 0.03, "bounce": 0.0},
+    "environment_shadow": {"none": 0.06, "coarse": 0.03, "bounce": 0.0},
 }
-UNSCALED = Costs(COSTS.base, COSTS.rungs)
-"""The same prices as if they added up."""
+UNSCALED = Costs(COSTS.base, COSTS.methods)
+"""The same costs as if they added up."""
 BUILDING = (3, 20)
 """Frames for which a pipeline is built: from, to."""
 BESIDE = 1.4
@@ -128,10 +128,10 @@ class Machine:
 
 def best_error(budget: float) -> float:
     """Least error of settings that truly take no longer."""
-    names = list(COSTS.rungs)
-    every = [dict(zip(names, rungs, strict=True)) for rungs in itertools.product(*COSTS.rungs.values())]
+    names = list(COSTS.methods)
+    every = [dict(zip(names, methods, strict=True)) for methods in itertools.product(*COSTS.methods.values())]
     fitting = [own for own in every if COSTS.base + COSTS.excess(own) <= budget]
-    return min(sum(ERRORS[knob][rung] for knob, rung in own.items()) for own in fitting)
+    return min(sum(ERRORS[setting][method] for setting, method in own.items()) for own in fitting)
 
 
 @pytest.mark.parametrize("budget", [12.0, 20.0, 33.0, 60.0, 100.0, 400.0])
@@ -157,18 +157,18 @@ def test_a_tighter_budget_never_errs_less():
     assert errors[-1] == 0.0
 
 
-def test_knobs_that_multiply_are_priced_so():
-    """The dearest rungs of both add up to 56 ms and take 356."""
+def test_settings_that_multiply_are_priced_so():
+    """The dearest methods of both add up to 56 ms and take 356."""
     adding, multiplying = (Controller(costs, ERRORS, 130.0) for costs in (UNSCALED, COSTS))
     both = {"environment_height": "256", "specular": "fis128"}
-    assert both.items() <= adding.settings.items(), "as if prices added up, both would fit"
+    assert both.items() <= adding.settings.items(), "as if costs added up, both would fit"
     assert not both.items() <= multiplying.settings.items()
     assert COSTS.base + COSTS.excess(multiplying.settings) <= AIM * 130.0
 
 
 @pytest.mark.parametrize("budget", [110.0, 130.0, 200.0])
 def test_what_nobody_knew_is_found_out_before_it_is_shown(budget):
-    """Prices that add up, on a machine where they multiply."""
+    """Costs that add up, on a machine where they multiply."""
     machine = Machine(budget, known=UNSCALED)
     machine.run(30.0)
     assert machine.rejected > 0, "it must have been tempted"
@@ -178,8 +178,8 @@ def test_what_nobody_knew_is_found_out_before_it_is_shown(budget):
 
 
 def test_the_first_choice_is_not_taken_for_being_cheaper_than_the_base():
-    """A rung that promises to cost 1 ms and costs 8 leaves less than the base takes, and more than the budget."""
-    promised = {**COSTS.rungs, "diffuse": {**COSTS.rungs["diffuse"], "clusters": 1.0}}
+    """A method that promises to cost 1 ms and costs 8 leaves less than the base takes, and more than the budget."""
+    promised = {**COSTS.methods, "diffuse": {**COSTS.methods["diffuse"], "clusters": 1.0}}
     machine = Machine(13.0, known=Costs(COSTS.base, promised, COSTS.scales))
     machine.run(10.0)
     assert machine.rejected > 0, "it must have been tempted"
@@ -232,7 +232,7 @@ def test_a_load_that_triples_is_answered_before_the_window_has_passed():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_knob_moves_twice_in_half_a_second_or_by_two_rungs(seed):
+def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
     machine = Machine(33.0, seed)
     loads = np.random.default_rng(seed)
     machine.run(2.0)
@@ -242,32 +242,32 @@ def test_no_knob_moves_twice_in_half_a_second_or_by_two_rungs(seed):
     moved: dict[str, float] = {}
     assert machine.changes() > 5, "the load must have moved it at all"
     for (_, _, a), (now, _, b) in itertools.islice(itertools.pairwise(machine.history), int(2.0 * FPS), None):
-        for knob in a:
-            if a[knob] == b[knob]:
+        for setting in a:
+            if a[setting] == b[setting]:
                 continue
-            ladder = machine.controller._ladders[knob]
-            assert abs(ladder.index(a[knob]) - ladder.index(b[knob])) == 1
-            assert now - moved.get(knob, -1.0) >= KNOB_SECONDS - 1e-9
-            moved[knob] = now
+            ladder = machine.controller._ladders[setting]
+            assert abs(ladder.index(a[setting]) - ladder.index(b[setting])) == 1
+            assert now - moved.get(setting, -1.0) >= SETTING_SECONDS - 1e-9
+            moved[setting] = now
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("budget", [12.0, 33.0, 60.0, 400.0])
 def test_ten_thousand_noisy_frames_bring_no_flicker(budget, seed):
-    """Frames whose times scatter by a fifth, every fiftieth five times too long; prices that are a fifth off."""
+    """Frames whose times scatter by a fifth, every fiftieth five times too long; costs that are a fifth off."""
     off = np.random.default_rng(100 + seed)
     # Those that multiply stay as they are: one alone that is off would give stages negative times.
-    rungs = dict(COSTS.rungs)
-    for knob in ("diffuse", "room_shadow"):
-        rungs[knob] = {rung: ms * float(off.uniform(0.8, 1.2)) for rung, ms in COSTS.rungs[knob].items()}
-    machine = Machine(budget, seed, known=Costs(COSTS.base, rungs, COSTS.scales))
+    methods = dict(COSTS.methods)
+    for setting in ("diffuse", "environment_shadow"):
+        methods[setting] = {method: ms * float(off.uniform(0.8, 1.2)) for method, ms in COSTS.methods[setting].items()}
+    machine = Machine(budget, seed, known=Costs(COSTS.base, methods, COSTS.scales))
     times = machine.run(10_000 / FPS, noise=0.2, slow=0.02)
     assert machine.changes() <= 6, "two changes a minute at the very most"
     assert statistics.median(times) <= budget
 
 
-def test_no_flicker_where_the_better_rung_does_not_quite_fit():
-    """Prices that promise too much, and no trials: what was shown and took too long is not tried again soon."""
+def test_no_flicker_where_the_better_method_does_not_quite_fit():
+    """Costs that promise too much, and no trials: what was shown and took too long is not tried again soon."""
     machine = Machine(33.0, running=None)
     honest_error = machine.controller.expected_error
 
@@ -305,14 +305,14 @@ def test_what_is_hardly_better_is_not_worth_a_change():
 # ------------------------------------------------------------------------------------------------------ the pipelines
 
 
-def even_costs(knobs: tuple[Knob, ...], base: float = 1.0, step: float = 1.0) -> Costs:
-    """Each rung a step dearer than the one before, from the base's."""
-    rungs = {}
-    for knob in knobs:
-        names = [rung for rung in knob.rungs if rung != "brute_force"]
-        start = names.index(setting(PRESETS["medium"], knob))
-        rungs[knob.name] = {rung: step * (place - start) for place, rung in enumerate(names)}
-    return Costs(base, rungs)
+def even_costs(settings: tuple[Setting, ...], base: float = 1.0, step: float = 1.0) -> Costs:
+    """Each method a step dearer than the one before, from the base's."""
+    methods = {}
+    for setting in settings:
+        names = [method for method in setting.methods if method != "brute_force"]
+        start = names.index(chosen(PRESETS["medium"], setting))
+        methods[setting.name] = {method: step * (place - start) for place, method in enumerate(names)}
+    return Costs(base, methods)
 
 
 def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
@@ -327,11 +327,16 @@ def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
 
 
 def test_changes_over_and_keeps_the_light(frames: Frames, device: str, tmp_path) -> None:
-    """It starts at the base, chooses, goes over as soon as that is built, and the room's light goes along."""
+    """It starts at the base, chooses, goes over as soon as that is built, and the environment goes along."""
     scene = make_scene()
-    knobs = relevant_knobs(scene, (320, 240))
+    settings = relevant_settings(scene, (320, 240))
     with AutoPipeline(
-        scene, device=device, budget_ms=1e6, costs=even_costs(knobs), folder=tmp_path, outputs=("image", "environment")
+        scene,
+        device=device,
+        budget_ms=1e6,
+        costs=even_costs(settings),
+        folder=tmp_path,
+        outputs=("image", "environment"),
     ) as pipeline:
         base = pipeline.quality
         before = pipeline(frames[0], time_seconds=0.0).environment
@@ -342,9 +347,12 @@ def test_changes_over_and_keeps_the_light(frames: Frames, device: str, tmp_path)
         assert result.environment is not None
         assert result.environment.mean() == pytest.approx(before.mean(), rel=0.25)
         status = pipeline.status()
-    # Nothing limits it: the best rungs there are, brute force aside.
+    # Nothing limits it: the best methods there are, brute force aside.
     errors = load_errors()
-    best = sum(min(errors[knob.name][rung] for rung in knob.rungs if rung != "brute_force") for knob in knobs)
+    best = sum(
+        min(errors[setting.name][method] for method in setting.methods if method != "brute_force")
+        for setting in settings
+    )
     assert status["expected_error"] == pytest.approx(best, abs=1e-5)
     assert status["budget_ms"] == 1e6
     assert status["fits"]
@@ -355,7 +363,7 @@ def test_changes_over_and_keeps_the_light(frames: Frames, device: str, tmp_path)
 def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monkeypatch) -> None:
     """Costs by which everything fits, and a trial of the dearest that says otherwise."""
     scene = make_scene()
-    knobs = relevant_knobs(scene, (320, 240))
+    settings = relevant_settings(scene, (320, 240))
     tried = []
 
     def trial(pipeline, image, pose, costs, settings):
@@ -363,7 +371,7 @@ def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monk
         return 1e9 if settings["diffuse"] == "clusters" else costs.base
 
     monkeypatch.setattr(auto_quality, "time_alone", trial)
-    costs = dataclasses.replace(even_costs(knobs, base=20.0, step=0.1), work=20.0)
+    costs = dataclasses.replace(even_costs(settings, base=20.0, step=0.1), work=20.0)
     with AutoPipeline(scene, device="cpu", budget_ms=1e4, costs=costs, folder=tmp_path) as pipeline:
         assert pipeline.status() == {"budget_ms": 1e4, "changes": []}
         pipeline(frames[0])
@@ -378,14 +386,14 @@ def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monk
 
 def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:
     scene = make_scene()
-    knobs = relevant_knobs(scene, (320, 240))
+    settings = relevant_settings(scene, (320, 240))
     with AutoPipeline(
-        scene, device="cpu", budget_ms=1e-3, costs=even_costs(knobs, base=50.0), folder=tmp_path
+        scene, device="cpu", budget_ms=1e-3, costs=even_costs(settings, base=50.0), folder=tmp_path
     ) as pipeline:
         light(pipeline, frames[0], 60)
         status = pipeline.status()
     assert not status["fits"]
-    assert status["settings"] == {knob.name: knob.rungs[0] for knob in knobs}
+    assert status["settings"] == {setting.name: setting.methods[0] for setting in settings}
     assert status["measured_ms"] > status["budget_ms"]
     assert capsys.readouterr().err.count("nothing keeps to 0.001 ms here") == 1
 
@@ -393,9 +401,9 @@ def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:
 def test_costs_are_measured_once(frames: Frames, device: str, tmp_path, monkeypatch, capsys) -> None:
     calls, said = [], []
 
-    def measure(scene, image, pose, device, size, knobs):
+    def measure(scene, image, pose, device, size, settings):
         calls.append(pose)
-        return even_costs(knobs)
+        return even_costs(settings)
 
     monkeypatch.setattr(auto_quality, "measure_costs", measure)
     for _ in range(2):

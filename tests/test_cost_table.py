@@ -1,4 +1,4 @@
-"""Knobs turn what they say; choices are the best there are, against trying all."""
+"""Settings turn what they say; choices are the best there are, against trying all."""
 
 import dataclasses
 import itertools
@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from warp_ar.accuracy.cost_table import (
-    KNOBS,
-    Price,
+    SETTINGS,
+    MethodCost,
     choose,
     choose_for_error,
-    frontier,
+    chosen,
+    pareto_front,
+    pareto_optimal,
     read_errors,
-    relevant_knobs,
-    setting,
+    relevant_settings,
     turn,
-    undominated,
 )
 from warp_ar.errors import UsageError
 from warp_ar.scene import load_scene
@@ -26,33 +26,35 @@ from warp_ar.stages.quality import PRESETS
 EXACT = 1e-12
 
 
-@pytest.mark.parametrize("knob", KNOBS, ids=lambda knob: knob.name)
-def test_what_is_turned_is_set(knob):
-    for rung in knob.rungs:
-        assert setting(turn(PRESETS["medium"], {knob.name: rung}), knob) == rung
+@pytest.mark.parametrize("setting", SETTINGS, ids=lambda setting: setting.name)
+def test_what_is_turned_is_set(setting):
+    for method in setting.methods:
+        assert chosen(turn(PRESETS["medium"], {setting.name: method}), setting) == method
 
 
 def test_turning_changes_nothing_else():
     turned = turn(PRESETS["medium"], {"diffuse": "sh4", "edge_samples": "16"})
-    for knob in KNOBS:
-        if knob.name not in ("diffuse", "edge_samples"):
-            assert setting(turned, knob) == setting(PRESETS["medium"], knob)
+    for setting in SETTINGS:
+        if setting.name not in ("diffuse", "edge_samples"):
+            assert chosen(turned, setting) == chosen(PRESETS["medium"], setting)
 
 
 def test_bad_turns_are_refused():
-    with pytest.raises(UsageError, match="diffuse has no rung 'sh9'; expected top_mip"):
+    with pytest.raises(UsageError, match="diffuse has no method 'sh9'; expected top_mip"):
         turn(PRESETS["medium"], {"diffuse": "sh9"})
     with pytest.raises(UsageError, match="nothing called 'colour'"):
         turn(PRESETS["medium"], {"colour": "red"})
 
 
-def test_scenes_have_the_knobs_that_they_call_for():
+def test_scenes_have_the_settings_that_they_call_for():
     def names(scene):
-        return {knob.name for knob in relevant_knobs(load_scene(scene), (640, 480))}
+        return {setting.name for setting in relevant_settings(load_scene(scene), (640, 480))}
 
     assert "expose" in names("darken")
     assert names("darken").isdisjoint({"diffuse", "specular", "relight", "shade", "edge_samples"})
-    assert {"diffuse", "specular", "relight", "room_shadow", "environment_height", "mirror_ball"} <= names("desk")
+    assert {"diffuse", "specular", "relight", "environment_shadow", "environment_height", "mirror_ball"} <= names(
+        "desk"
+    )
     assert "expose" not in names("desk")
     assert "relight" not in names("torus")
 
@@ -61,24 +63,24 @@ def test_scenes_without_a_ball_or_anything_virtual_have_nothing_to_mirror():
     desk = load_scene("desk")
     for changes in ({"probes": ()}, {"objects": (), "lights": ()}):
         bare = dataclasses.replace(desk, **changes)
-        assert "mirror_ball" not in {knob.name for knob in relevant_knobs(bare, (640, 480))}
+        assert "mirror_ball" not in {setting.name for setting in relevant_settings(bare, (640, 480))}
 
 
-def random_prices(seed, knobs=4, rungs=4):
+def random_method_costs(seed, settings=4, methods=4):
     rng = np.random.default_rng(seed)
     return [
-        Price(f"knob{k}", f"rung{r}", float(rng.integers(1, 20)), float(rng.integers(0, 9)))
-        for k in range(knobs)
-        for r in range(rungs)
+        MethodCost(f"setting{k}", f"method{r}", float(rng.integers(1, 20)), float(rng.integers(0, 9)))
+        for k in range(settings)
+        for r in range(methods)
     ]
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_choice_is_the_best_of_all(seed):
-    prices = random_prices(seed)
-    groups = [list(own) for _, own in itertools.groupby(prices, lambda price: price.knob)]
+    method_costs = random_method_costs(seed)
+    groups = [list(own) for _, own in itertools.groupby(method_costs, lambda method_cost: method_cost.setting)]
     every = [(sum(p.milliseconds for p in pick), sum(p.error for p in pick)) for pick in itertools.product(*groups)]
-    front = frontier(prices)
+    front = pareto_front(method_costs)
     for budget in (5.0, 12.0, 25.0, 40.0, 1e9):
         choice = choose(front, budget)
         fitting = [error for cost, error in every if cost <= budget]
@@ -95,24 +97,31 @@ def test_choice_is_the_best_of_all(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_choice_is_the_best_of_all_where_knobs_multiply(seed):
-    """A knob that others share makes each of them dearer by a factor of its own, the more the dearer it is itself."""
-    prices = random_prices(seed)
-    shared = {price.rung: price.milliseconds for price in prices if price.knob == "knob0"}
-    factors = {"knob1": 0.5, "knob2": 0.1}
-    scales = {
-        "knob0": {rung: {knob: 1.0 + factor * ms for knob, factor in factors.items()} for rung, ms in shared.items()}
+def test_choice_is_the_best_of_all_where_settings_multiply(seed):
+    """A setting that others share makes each of them dearer by a factor of its own, the more the dearer it is
+    itself."""
+    method_costs = random_method_costs(seed)
+    shared = {
+        method_cost.method: method_cost.milliseconds
+        for method_cost in method_costs
+        if method_cost.setting == "setting0"
     }
-    groups = [list(own) for _, own in itertools.groupby(prices, lambda price: price.knob)]
+    factors = {"setting1": 0.5, "setting2": 0.1}
+    scales = {
+        "setting0": {
+            method: {setting: 1.0 + factor * ms for setting, factor in factors.items()} for method, ms in shared.items()
+        }
+    }
+    groups = [list(own) for _, own in itertools.groupby(method_costs, lambda method_cost: method_cost.setting)]
     every = [
         (
-            sum(p.milliseconds * scales["knob0"][pick[0].rung].get(p.knob, 1.0) for p in pick),
+            sum(p.milliseconds * scales["setting0"][pick[0].method].get(p.setting, 1.0) for p in pick),
             sum(p.error for p in pick),
         )
         for pick in itertools.product(*groups)
     ]
-    front = frontier(prices, scales)
-    assert front != frontier(prices)
+    front = pareto_front(method_costs, scales)
+    assert front != pareto_front(method_costs)
     for budget in (12.0, 25.0, 60.0, 200.0, 1e9):
         choice = choose(front, budget)
         fitting = [error for cost, error in every if cost <= budget]
@@ -123,19 +132,19 @@ def test_choice_is_the_best_of_all_where_knobs_multiply(seed):
             assert choice.milliseconds == pytest.approx(min(cost for cost, _ in every), abs=EXACT)
 
 
-def test_choice_adds_up_and_covers_every_knob():
-    prices = random_prices(3)
-    by_name = {(price.knob, price.rung): price for price in prices}
-    for choice in frontier(prices):
-        assert [knob for knob, _ in choice.settings] == ["knob0", "knob1", "knob2", "knob3"]
+def test_choice_adds_up_and_covers_every_setting():
+    method_costs = random_method_costs(3)
+    by_name = {(method_cost.setting, method_cost.method): method_cost for method_cost in method_costs}
+    for choice in pareto_front(method_costs):
+        assert [setting for setting, _ in choice.settings] == ["setting0", "setting1", "setting2", "setting3"]
         own = [by_name[pair] for pair in choice.settings]
-        assert choice.milliseconds == pytest.approx(sum(price.milliseconds for price in own), abs=EXACT)
-        assert choice.error == pytest.approx(sum(price.error for price in own), abs=EXACT)
+        assert choice.milliseconds == pytest.approx(sum(method_cost.milliseconds for method_cost in own), abs=EXACT)
+        assert choice.error == pytest.approx(sum(method_cost.error for method_cost in own), abs=EXACT)
 
 
-def test_dominated_rungs_are_dropped():
-    a, b, c, d = (Price("k", n, ms, e) for n, ms, e in (("a", 1, 9), ("b", 2, 9), ("c", 3, 4), ("d", 5, 4.5)))
-    assert undominated([d, c, b, a]) == [a, c]
+def test_dominated_methods_are_dropped():
+    a, b, c, d = (MethodCost("k", n, ms, e) for n, ms, e in (("a", 1, 9), ("b", 2, 9), ("c", 3, 4), ("d", 5, 4.5)))
+    assert pareto_optimal([d, c, b, a]) == [a, c]
 
 
 def test_price_list_is_checked():

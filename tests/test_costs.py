@@ -1,4 +1,4 @@
-"""Costs: measured with everything at work, scaled where knobs share a stage, kept in a folder."""
+"""Costs: measured with everything at work, scaled where settings share a stage, kept in a folder."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import costs as costs_module
-from warp_ar.accuracy.cost_table import KNOBS, relevant_knobs, setting, turn
+from warp_ar.accuracy.cost_table import SETTINGS, chosen, relevant_settings, turn
 from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_again, time_alone, write_costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS
 
-KNOB = next(knob for knob in KNOBS if knob.name == "diffuse")
+SETTING = next(setting for setting in SETTINGS if setting.name == "diffuse")
 KEPT = Costs(12.5, {"diffuse": {"sh2": 0.0, "sh4": 1.25}}, {"diffuse": {"sh4": {"specular": 2.0}}}, 2.5, 20.0)
 
 
 def test_costs_are_kept(tmp_path):
     write_costs(tmp_path / "new", "a", KEPT)
     write_costs(tmp_path / "new", "b", Costs(1.0, {"diffuse": {"sh2": 0.0}}))
-    assert read_costs(tmp_path / "new", "a", [KNOB]) == KEPT
-    assert read_costs(tmp_path / "new", "c", [KNOB]) is None
+    assert read_costs(tmp_path / "new", "a", [SETTING]) == KEPT
+    assert read_costs(tmp_path / "new", "c", [SETTING]) is None
 
 
 @pytest.mark.parametrize(
@@ -33,19 +33,19 @@ def test_costs_are_kept(tmp_path):
         "[]",
         '{"a": 3}',
         '{"a": {"base": 1}}',
-        '{"a": {"base": "x", "rungs": {"diffuse": {"sh2": 0}}}}',
-        '{"a": {"base": 1, "rungs": {"diffuse": {"sh9": 0}}}}',
-        '{"a": {"base": 1, "rungs": {"diffuse": {}}}}',
-        '{"a": {"base": 1, "rungs": {"specular": {"box_mip": 0}}}}',
-        '{"a": {"base": 1, "rungs": {"diffuse": {"sh2": 0}}}}',
-        '{"a": {"base": 1, "rungs": {"diffuse": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
+        '{"a": {"base": "x", "methods": {"diffuse": {"sh2": 0}}}}',
+        '{"a": {"base": 1, "methods": {"diffuse": {"sh9": 0}}}}',
+        '{"a": {"base": 1, "methods": {"diffuse": {}}}}',
+        '{"a": {"base": 1, "methods": {"specular": {"box_mip": 0}}}}',
+        '{"a": {"base": 1, "methods": {"diffuse": {"sh2": 0}}}}',
+        '{"a": {"base": 1, "methods": {"diffuse": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
     ],
 )
 def test_costs_that_are_not_ours_are_measured_anew(tmp_path, text):
     (tmp_path / "costs.json").write_text(text)
-    assert read_costs(tmp_path, "a", [KNOB]) is None
+    assert read_costs(tmp_path, "a", [SETTING]) is None
     write_costs(tmp_path, "a", KEPT)
-    assert read_costs(tmp_path, "a", [KNOB]) == KEPT
+    assert read_costs(tmp_path, "a", [SETTING]) == KEPT
 
 
 def test_a_cache_that_cannot_be_written_is_no_failure(tmp_path, capsys):
@@ -57,7 +57,7 @@ def test_a_cache_that_cannot_be_written_is_no_failure(tmp_path, capsys):
 def test_key_follows_device_version_scene_and_size(monkeypatch):
     def key(size=(320, 240), **changes):
         with Pipeline(make_scene(**changes), device="cpu", quality="low", size=size) as pipeline:
-            return costs_module.cost_key(pipeline.plan, pipeline.device, [KNOB])
+            return costs_module.cost_key(pipeline.plan, pipeline.device, [SETTING])
 
     keys = [key(), key((160, 120)), key(lights=()), key(objects=())]
     assert key() == keys[0]
@@ -66,18 +66,18 @@ def test_key_follows_device_version_scene_and_size(monkeypatch):
     assert len(set(keys)) == len(keys)
 
 
-def test_measured_costs_cover_every_rung_but_brute_force(frames: Frames, device: str) -> None:
+def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, device: str) -> None:
     scene = make_scene()
     with Pipeline(scene, device=device, quality="low") as pipeline:
         pose = pipeline(frames[0]).pose
     names = ("diffuse", "expose", "unwrap", "environment_height")
-    knobs = [knob for knob in relevant_knobs(scene, (320, 240)) if knob.name in names]
-    costs = measure_costs(scene, frames[0], pose, device, (320, 240), knobs)
+    settings = [setting for setting in relevant_settings(scene, (320, 240)) if setting.name in names]
+    costs = measure_costs(scene, frames[0], pose, device, (320, 240), settings)
     assert costs.base > costs.track > 0.0
     assert costs.work > 0.0
-    for knob in knobs:
-        assert set(costs.rungs[knob.name]) == set(knob.rungs) - {"brute_force"}
-        assert costs.rungs[knob.name][setting(PRESETS["medium"], knob)] == 0.0
+    for setting in settings:
+        assert set(costs.methods[setting.name]) == set(setting.methods) - {"brute_force"}
+        assert costs.methods[setting.name][chosen(PRESETS["medium"], setting)] == 0.0
     # The map's rows multiply what is done for each texel, and say nothing of what is not.
     assert costs.scales.keys() == {"environment_height"}
     scales = costs.scales["environment_height"]
@@ -87,7 +87,7 @@ def test_measured_costs_cover_every_rung_but_brute_force(frames: Frames, device:
     assert scales["256"]["unwrap"] > scales["32"]["unwrap"]
 
 
-def test_what_shared_knobs_do_multiplies():
+def test_what_shared_settings_do_multiplies():
     costs = Costs(
         10.0,
         {"height": {"64": 0.0, "128": 6.0}, "specular": {"mip": 0.0, "fis": 5.0}, "shade": {"one": 0.0, "two": 1.0}},
@@ -116,9 +116,9 @@ def test_timed_alone_counts_all_but_what_recovery_does_beside(frames: Frames, mo
     monkeypatch.setattr(costs_module, "WORK", lambda: next(ticks) * 1e-3)
     scene = make_scene()
     costs = Costs(12.0, {"recover": {"white_card": 0.0, "shading": 7.0}}, track=2.0, work=20.0)
-    for rung, beside in (("white_card", 0.0), ("shading", 7.0)):
-        with Pipeline(scene, device="cpu", quality=turn(BASE, {"recover": rung})) as pipeline:
-            own = time_alone(pipeline, frames[0], None, costs, {"recover": rung, "diffuse": "clusters"})
+    for method, beside in (("white_card", 0.0), ("shading", 7.0)):
+        with Pipeline(scene, device="cpu", quality=turn(BASE, {"recover": method})) as pipeline:
+            own = time_alone(pipeline, frames[0], None, costs, {"recover": method, "diffuse": "clusters"})
             others = len(pipeline.plan.stages) - 1
             assert pipeline.scheduler.clock is time.perf_counter, "its own clock is back"
         assert own == pytest.approx(2.0 + others * (12.0 - 2.0) / 20.0 + beside)

@@ -158,7 +158,7 @@ def test_never_below_clipping(device):
 
 
 def environment(height=64, base=0.3, spots=()):
-    """Grey room with square spots: (theta, phi, half width in radians, radiance)."""
+    """Grey environment with square spots: (theta, phi, half width in radians, radiance)."""
     theta, phi = np.meshgrid(
         (np.arange(height) + 0.5) * np.pi / height,
         ((np.arange(2 * height) + 0.5) / height - 1.0) * np.pi,
@@ -178,8 +178,8 @@ def test_ball_pixel_shows_what_it_mirrors(device):
     frame = np.full((65, 65, 3), 60, np.uint8)
     frame[31:34, 31:34] = 255
     for radiance in (3.0, 30.0):
-        room = environment(spots=[(0.5 * np.pi, -0.5 * np.pi, 0.5, radiance)])
-        middle = run(frame, BALL, room, looking_at_ball())[32, 32]
+        surroundings = environment(spots=[(0.5 * np.pi, -0.5 * np.pi, 0.5, radiance)])
+        middle = run(frame, BALL, surroundings, looking_at_ball())[32, 32]
         # Two levels up at most: growth of 3/4 toward 0.8 times the radiance.
         assert (middle <= 0.8 * radiance * (1.0 + FLOAT)).all()
         assert (middle >= (0.8 * radiance) ** 0.5).all()
@@ -198,8 +198,8 @@ def test_ball_pixel_off_the_middle_shows_what_it_mirrors(device, pixel):
     mirrored = direction - 2.0 * (direction @ normal) * normal
 
     def lit_from(d):
-        room = environment(spots=[(np.arccos(d[2]), np.arctan2(d[1], d[0]), 0.2, 30.0)])
-        return run(frame, BALL, room, looking_at_ball())[pixel]
+        surroundings = environment(spots=[(np.arccos(d[2]), np.arctan2(d[1], d[0]), 0.2, 30.0)])
+        return run(frame, BALL, surroundings, looking_at_ball())[pixel]
 
     assert (lit_from(mirrored) >= 24.0**0.5).all()
     for elsewhere in (normal, direction, -mirrored):
@@ -245,7 +245,7 @@ def view(panorama, azimuth, elevation, size=(120, 160), field=1.0):
 
 
 def test_nearer_to_panoramas_than_clipping(device, shared):
-    """Log error of clipped pixels, up to the two stops that a quarter of the exposure shows, in eight rooms."""
+    """Log error of clipped pixels, up to the two stops that a quarter of the exposure shows, in eight environments."""
     import OpenEXR
 
     rng = np.random.default_rng(8)

@@ -79,21 +79,21 @@ def test_first_sight_is_taken_whole(device):
 
 
 def test_no_drift_over_ten_thousand_frames(device):
-    """Hard case 7: a constant room, seen with changing confidence, stays as it is to the bit."""
+    """Hard case 7: a constant environment, seen with changing confidence, stays as it is to the bit."""
     rng = np.random.default_rng(2)
     light = Light(8, 16)
-    room = np.float32(rng.uniform(1e-4, 3, (8, 16, 3)))
+    surroundings = np.float32(rng.uniform(1e-4, 3, (8, 16, 3)))
     masks = np.float32(rng.random((16, 8, 16)) * (rng.random((16, 8, 16)) > 0.2))
-    light.step(room)
+    light.step(surroundings)
     for frame in range(10_000):
-        light.step(room, masks[frame % 16])
-    assert (light.radiance.numpy() == room).all()
+        light.step(surroundings, masks[frame % 16])
+    assert (light.radiance.numpy() == surroundings).all()
     assert light.confidence.numpy().min() > 0.3
 
 
 @pytest.mark.parametrize("fps", [12, 30, 120])
 @pytest.mark.parametrize(("old", "new"), [(0.2, 0.9), (0.9, 0.2), (0.5, 0.51), (1.0, 0.0), (0.0, 1.0)])
-def test_follows_the_room_within_half_a_second(device, fps, old, new):
+def test_follows_the_environment_within_half_a_second(device, fps, old, new):
     light = Light()
     for _ in range(5):
         light.step(old, time_step=1 / fps)
@@ -223,18 +223,18 @@ def fill(radiance, confidence):
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_a_constant_room_stays_constant_under_any_mask(device, height, width):
+def test_a_constant_environment_stays_constant_under_any_mask(device, height, width):
     """Hard case 18, to the bit; what is masked out holds garbage."""
     rng = np.random.default_rng(4)
-    room = np.float32([0.1, 7.3, 1.2e-5])
+    surroundings = np.float32([0.1, 7.3, 1.2e-5])
     one = np.zeros((height, width))
     one[height // 2, width - 1] = 0.001
     masks = [one, rng.random((height, width)), (rng.random((height, width)) > 0.9) * 1.0, np.ones((height, width))]
     masks[2][0, 0] = 1.0
     for mask in masks:
-        radiance = np.where(mask[..., None] > 0, room, np.float32(1e6))
+        radiance = np.where(mask[..., None] > 0, surroundings, np.float32(1e6))
         radiance[(mask == 0) & (rng.random((height, width)) < 0.3)] = np.nan
-        assert (fill(radiance, mask) == room).all()
+        assert (fill(radiance, mask) == surroundings).all()
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
@@ -284,7 +284,7 @@ def test_a_hole_in_a_ramp_is_bridged_without_shift(device, height, width):
         assert np.abs((across * weight).sum(0) / weight.sum()).max() < 0.05, name
 
 
-def test_rotating_the_room_rotates_the_fill(device):
+def test_rotating_the_environment_rotates_the_fill(device):
     """The seam is nowhere special: turned by a multiple of the coarsest texels used, the result turns along to the
     bit."""
     rng = np.random.default_rng(7)
@@ -347,7 +347,7 @@ def request(height=16):
     import dataclasses
     import types
 
-    quality = dataclasses.replace(PRESETS["medium"].with_rungs(recover="clipped"), environment_height=height)
+    quality = dataclasses.replace(PRESETS["medium"].with_methods(recover="clipped"), environment_height=height)
     return Request(types.SimpleNamespace(probes=(1,), proxies=()), quality, (64, 48))
 
 
@@ -375,10 +375,10 @@ def test_readers_lag_by_no_more_than_the_stated_bound(device):
     def irradiance(light):
         return lobes @ (light.reshape(-1, 3).astype(float) * area)
 
-    room, seen, runs = rng.uniform(0.05, 1, (16, 32, 3)), None, 0
+    surroundings, seen, runs = rng.uniform(0.05, 1, (16, 32, 3)), None, 0
     for frame in range(100):
-        drift = 1 + 0.002 * frame + 0.002 * rng.standard_normal(room.shape)
-        arrays["environment_radiance"].assign(np.float32(room * drift))
+        drift = 1 + 0.002 * frame + 0.002 * rng.standard_normal(surroundings.shape)
+        arrays["environment_radiance"].assign(np.float32(surroundings * drift))
         for step in passes:
             step.launch(None)
         now = arrays["environment"].numpy().copy()
@@ -438,10 +438,10 @@ def angle(a, b):
 
 @pytest.mark.parametrize("value", [0.0, 1e-6, 0.7, 1e4])
 @pytest.mark.parametrize(("height", "width"), [(64, 128), (32, 64), (5, 9), (1, 2)])
-def test_a_uniform_room_has_no_key_light(device, value, height, width):
+def test_a_uniform_environment_has_no_key_light(device, value, height, width):
     """Hard case 10: no dominant direction at all."""
     for light in key_lights(np.full((height, width, 3), value)):
-        assert light["dominance"] == pytest.approx(0, abs=SUMS)
+        assert light["directionality"] == pytest.approx(0, abs=SUMS)
         assert np.linalg.norm(light["direction"]) == pytest.approx(1, abs=ROUNDING)
         np.testing.assert_allclose(light["irradiance"], 0, atol=SUMS * value * np.pi)
 
@@ -454,31 +454,33 @@ def test_an_empty_place_looks_up(device):
 @pytest.mark.parametrize("column", [0, 63, 127])
 def test_a_single_sun(device, row, column):
     """Hard case 6: one texel of 1e6 over 1e-4, at the poles, the seam and elsewhere: all of it, exactly there."""
-    room = np.full((64, 128, 3), 1e-4)
-    room[row, column] = [1e6, 5e5, 2e5]
-    light = key_lights(room)[0]
+    surroundings = np.full((64, 128, 3), 1e-4)
+    surroundings[row, column] = [1e6, 5e5, 2e5]
+    light = key_lights(surroundings)[0]
     direction = latlong.directions(64, 128)[row, column]
     assert np.radians(angle(light["direction"], direction)) < DIRECTION
-    assert light["dominance"] == pytest.approx(1, abs=1e-3)
-    mean = reference.flow(room)[1] / (4 * np.pi)
+    assert light["directionality"] == pytest.approx(1, abs=1e-3)
+    mean = reference.flow(surroundings)[1] / (4 * np.pi)
     expected = (
-        latlong.solid_angles(64, 128)[row, column] * room[row, column] * (1 - mean / (room[row, column] @ LUMINANCE))
+        latlong.solid_angles(64, 128)[row, column]
+        * surroundings[row, column]
+        * (1 - mean / (surroundings[row, column] @ LUMINANCE))
     )
     np.testing.assert_allclose(light["irradiance"], expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.25, 0.4])
-def test_a_lamp_in_a_uniform_room_dominates_by_twice_its_share(device, share):
+def test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share(device, share):
     lamp = cap(64, (0.3, -0.8, 0.5), 5)
     flow, total = reference.flow(lamp)
-    room = lamp + share_to_ambient(share, total)
-    light = key_lights(room)[0]
+    surroundings = lamp + share_to_ambient(share, total)
+    light = key_lights(surroundings)[0]
     assert angle(light["direction"], (0.3, -0.8, 0.5)) < CORE_CENTROID
-    assert light["dominance"] == pytest.approx(2 * share * np.linalg.norm(flow) / total, abs=0.01)
+    assert light["directionality"] == pytest.approx(2 * share * np.linalg.norm(flow) / total, abs=0.01)
 
 
 def share_to_ambient(share, total):
-    """Radiance of a uniform room in which light with scalar irradiance ``total`` is a ``share`` of all."""
+    """Radiance of a uniform environment in which light with scalar irradiance ``total`` is a ``share`` of all."""
     return total * (1 - share) / share / (4 * np.pi)
 
 
@@ -489,7 +491,7 @@ def test_windows_up_to_half_the_sky(device, degrees):
     light = key_lights(cap(64, axis, degrees))[0]
     # What is inside of a wide lobe is cut by texels; a degree is a third of one.
     assert angle(light["direction"], axis) < 1.0
-    assert light["dominance"] > 0.95
+    assert light["directionality"] > 0.95
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.98, 0.5, 0.1])
@@ -501,36 +503,36 @@ def test_two_opposite_lights(device, ratio):
     assert found[0] < 0.5
     assert found[1] > 179.5
     expected = min(1.0, 2 * (1 - ratio) / (1 + ratio)) * (1 - ratio)
-    assert lights[0]["dominance"] == pytest.approx(expected, abs=0.02)
+    assert lights[0]["directionality"] == pytest.approx(expected, abs=0.02)
     if ratio < 1:
         assert angle(lights[0]["direction"], a) < 0.5
-        assert lights[1]["dominance"] == pytest.approx(0, abs=1e-3)
+        assert lights[1]["directionality"] == pytest.approx(0, abs=1e-3)
 
 
 def test_four_lights_brightest_first(device):
     axes = [(1, 0, 0.3), (-0.2, 1, 0.5), (-1, -0.4, 0.2), (0.1, -0.8, 0.9)]
-    room = sum(cap(64, axis, 6, value) for axis, value in zip(axes, (0.4, 0.9, 0.2, 0.6), strict=True)) + 0.01
-    lights = key_lights(room)
+    surroundings = sum(cap(64, axis, 6, value) for axis, value in zip(axes, (0.4, 0.9, 0.2, 0.6), strict=True)) + 0.01
+    lights = key_lights(surroundings)
     assert [int(np.argmin([angle(light["direction"], axis) for axis in axes])) for light in lights] == [1, 3, 0, 2]
     for light in lights:
         assert min(angle(light["direction"], axis) for axis in axes) < CORE_CENTROID
-    one = key_lights(room, 1)[0]
+    one = key_lights(surroundings, 1)[0]
     assert angle(one["direction"], axes[1]) < 0.5
 
 
 def test_irradiance_is_that_of_a_facing_surface(device):
-    """A cap of half angle a gives pi sin^2 a; above the mean of the room, which the key light leaves to it."""
+    """A cap of half angle a gives pi sin^2 a; above the mean of the environment, which the key light leaves to it."""
     for degrees in (5, 10, 18):
-        room = cap(64, (0.2, 0.9, 0.4), degrees)
-        mean = reference.flow(room)[1] / (4 * np.pi)
-        light = key_lights(room)[0]
+        surroundings = cap(64, (0.2, 0.9, 0.4), degrees)
+        mean = reference.flow(surroundings)[1] / (4 * np.pi)
+        light = key_lights(surroundings)[0]
         expected = np.pi * np.sin(np.radians(degrees)) ** 2 * (1 - mean)
         check_error("key_lights", light["irradiance"], np.broadcast_to(expected, 3))
 
 
 def test_continuous_while_a_lamp_moves(device):
-    """Around the room, over the seam, past the pole: the found direction follows within a third of a texel, without a
-    jump."""
+    """Around the environment, over the seam, past the pole: the found direction follows within a third of a texel,
+    without a jump."""
     last = None
     for t in np.linspace(0, 2 * np.pi, 150):
         axis = np.array([np.cos(t), np.sin(t) * 0.4, np.sin(t) * 0.9])
@@ -538,20 +540,20 @@ def test_continuous_while_a_lamp_moves(device):
         assert angle(light["direction"], axis) < 2.0
         if last is not None:
             assert angle(light["direction"], last["direction"]) < 5.0
-            assert abs(light["dominance"] - last["dominance"]) < 0.05
+            assert abs(light["directionality"] - last["directionality"]) < 0.05
         last = light
 
 
 @pytest.mark.parametrize("apart", [20, 40, 60, 90, 120, 180])
 def test_handing_over_to_another_light_does_not_pop(device, apart):
-    """While one lamp fades and another comes up, dominance times direction moves in small steps, and never points
+    """While one lamp fades and another comes up, directionality times direction moves in small steps, and never points
     between them."""
     t = np.radians(apart)
     a, b = cap(32, (1, 0, 0.2), 7), cap(32, (np.cos(t), np.sin(t), 0.2), 7)
     last = None
     for share in np.linspace(0, 1, 81):
         light = key_lights((1 - share) * a + share * b + 0.02)[0]
-        weighted = light["dominance"] * light["direction"]
+        weighted = light["directionality"] * light["direction"]
         if apart > 40 and abs(share - 0.5) > 0.02:
             brighter = (1, 0, 0.2) if share < 0.5 else (np.cos(t), np.sin(t), 0.2)
             assert angle(light["direction"], brighter) < 2.0
@@ -570,17 +572,17 @@ def test_noise_does_not_shake_a_broad_window(device):
 
 def test_same_input_same_output(device):
     """Hard case 17."""
-    room = np.random.default_rng(12).random((64, 128, 3)) ** 8
-    assert key_lights(room).tobytes() == key_lights(room).tobytes()
+    surroundings = np.random.default_rng(12).random((64, 128, 3)) ** 8
+    assert key_lights(surroundings).tobytes() == key_lights(surroundings).tobytes()
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_every_size_gives_finite_lights(device, height, width):
-    room = np.random.default_rng(13).random((height, width, 3)) ** 4
-    for light in key_lights(room):
+    surroundings = np.random.default_rng(13).random((height, width, 3)) ** 4
+    for light in key_lights(surroundings):
         assert np.isfinite(light["direction"]).all()
         assert np.isfinite(light["irradiance"]).all()
-        assert 0 <= light["dominance"] <= 1
+        assert 0 <= light["directionality"] <= 1
 
 
 def test_too_many_lights(device):

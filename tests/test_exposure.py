@@ -15,7 +15,7 @@ SCALES = [0.0, 0.01, 0.25, 0.5, 0.9, np.nextafter(np.float32(1), np.float32(0)),
 
 
 def run(
-    frame, scale, rung="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, mirrored=None, transfer="srgb"
+    frame, scale, method="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, mirrored=None, transfer="srgb"
 ):
     frame_array = wp.array(frame, dtype=wp.vec3ub)
     shape = frame.shape[:2]
@@ -28,7 +28,7 @@ def run(
     exposure.read_scale(params, scale_array)
     exposure.expose_codes(decode, encode, scale_array, codes)
     over = make_arrays(virtual, added, ratio, mirrored)
-    config = exposure.ExposureConfig(rung, layers)
+    config = exposure.ExposureConfig(method, layers)
     exposure.expose(
         config,
         params,
@@ -61,16 +61,16 @@ def disc(size=96, radius=20):
 
 
 @pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
-@pytest.mark.parametrize("rung", exposure.RUNGS)
-def test_scale_one_is_the_identity(device, rung, transfer):
+@pytest.mark.parametrize("method", exposure.METHODS)
+def test_scale_one_is_the_identity(device, method, transfer):
     frame = make_layers()[0]
-    np.testing.assert_array_equal(run(frame, 1.0, rung, transfer=transfer), frame)
+    np.testing.assert_array_equal(run(frame, 1.0, method, transfer=transfer), frame)
 
 
-@pytest.mark.parametrize("rung", exposure.RUNGS)
+@pytest.mark.parametrize("method", exposure.METHODS)
 @pytest.mark.parametrize("frame", [disc(), np.full((20, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
-def test_scale_zero_is_black(device, frame, rung):
-    np.testing.assert_array_equal(run(frame, 0.0, rung), 0)
+def test_scale_zero_is_black(device, frame, method):
+    np.testing.assert_array_equal(run(frame, 0.0, method), 0)
 
 
 @pytest.mark.parametrize("scale", SCALES)

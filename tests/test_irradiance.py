@@ -20,15 +20,15 @@ FURNACE = 5e-4
 ROUNDING = 1e-5
 # The reference cuts texels in 8 x 8 parts, ours takes their spread: of the largest irradiance, texels of 11 degrees.
 REFERENCE_SPREAD = 2e-3
-# Clusters: blocks of 18 degrees share one direction and one spread. Relative RMS error on real rooms; measured below
-# 0.5 %.
+# Clusters: blocks of 18 degrees share one direction and one spread. Relative RMS error on real environments; measured
+# below 0.5 %.
 CLUSTER_ERROR = 0.015
 # Order-2 SH on real environments with lamps in them; measured 1.4 to 7.6 %.
 SH2_ERROR = 0.1
 SH4_ERROR = 0.05
 
 SIZES = [(64, 128), (16, 32), (7, 13), (1, 9), (9, 1), (1, 1), (5, 10)]
-RUNGS = Diffuse.rungs
+METHODS = Diffuse.methods
 
 SCENE = """
 schema = 1
@@ -105,10 +105,10 @@ def clusters(radiance, blocks=None, size=(32, 64)):
     return out
 
 
-def run_rung(radiance, rung, normals, bands=1):
+def run_method(radiance, method, normals, bands=1):
     """Irradiance on ``normals`` as the stage makes it."""
     environment = upload(radiance)
-    quality = PRESETS["medium"].with_rungs(diffuse=rung)
+    quality = PRESETS["medium"].with_methods(diffuse=method)
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
     request = Request(loads_scene(SCENE), quality, (64, 48))
     stage = Diffuse(request, Diffuse.wire(request))
@@ -141,20 +141,20 @@ def sun(height, width, row, column, sky=0.0, value=1.0):
 # --- Closed forms -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("height", [64, 16, 9, 4, 1])
-def test_a_white_furnace_stays_white(device, rung, height):
-    values = run_rung(np.full((height, 2 * height, 3), (0.2, 1.0, 30.0)), rung, unit(300))
+def test_a_white_furnace_stays_white(device, method, height):
+    values = run_method(np.full((height, 2 * height, 3), (0.2, 1.0, 30.0)), method, unit(300))
     # Texels of 20 degrees and more are wider than the second moment of their spread tells.
-    tolerance = FURNACE if height > 9 or rung in ("top_mip", "sh2", "sh4") else 0.06
+    tolerance = FURNACE if height > 9 or method in ("top_mip", "sh2", "sh4") else 0.06
     np.testing.assert_allclose(
         values, np.broadcast_to(np.pi * np.array((0.2, 1.0, 30.0)), values.shape), rtol=tolerance
     )
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_no_light_is_zero(device, rung):
-    assert (run_rung(np.zeros((16, 32, 3)), rung, unit(50)) == 0).all()
+@pytest.mark.parametrize("method", METHODS)
+def test_no_light_is_zero(device, method):
+    assert (run_method(np.zeros((16, 32, 3)), method, unit(50)) == 0).all()
 
 
 @pytest.mark.parametrize("blocks", [None, (8, 16)])
@@ -330,25 +330,25 @@ def test_no_set_of_lamps_gives_negative_light(device, seed):
     assert (reference.evaluate(windowed, unit(5000)) > -1e-4 * windowed[0] / np.sqrt(4 * np.pi)).all()
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_no_rung_gives_negative_light_from_a_small_lamp(device, rung):
-    assert (run_rung(lamp(2.7, 64), rung, unit(2000)) >= 0).all()
+@pytest.mark.parametrize("method", METHODS)
+def test_no_method_gives_negative_light_from_a_small_lamp(device, method):
+    assert (run_method(lamp(2.7, 64), method, unit(2000)) >= 0).all()
 
 
 # --- Seam, poles, hard cases ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_turning_the_room_turns_the_irradiance(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_turning_the_environment_turns_the_irradiance(device, method):
     # Not at the poles themselves, where a bilinear map has no one value.
     radiance, normals = np.random.default_rng(12).random((32, 64, 3)) ** 6, unit(200)[6:]
     turned = normals @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])  # a quarter to the left: +x to +y
-    before, after = run_rung(radiance, rung, normals), run_rung(np.roll(radiance, 16, 1), rung, turned)
+    before, after = run_method(radiance, method, normals), run_method(np.roll(radiance, 16, 1), method, turned)
     np.testing.assert_allclose(after, before, rtol=1e-4)
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_up_is_up_and_left_is_left(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_up_is_up_and_left_is_left(device, method):
     # A ramp along each axis: a shift or a flip that passes the furnace does not pass this.
     directions = latlong.directions(64, 128)
     for axis in range(3):
@@ -356,46 +356,46 @@ def test_up_is_up_and_left_is_left(device, rung):
         normals = unit(100)
         expected = np.pi + 2 * np.pi / 3 * normals[:, axis]
         # The paper's top mip is not a cosine filter; it must only point the right way.
-        slope = np.polyfit(normals[:, axis], run_rung(radiance, rung, normals)[:, 0] - np.pi, 1)[0]
-        if rung == "top_mip":
+        slope = np.polyfit(normals[:, axis], run_method(radiance, method, normals)[:, 0] - np.pi, 1)[0]
+        if method == "top_mip":
             assert slope > np.pi / 2
         else:
-            np.testing.assert_allclose(run_rung(radiance, rung, normals)[:, 0], expected, atol=5e-3 * np.pi)
+            np.testing.assert_allclose(run_method(radiance, method, normals)[:, 0], expected, atol=5e-3 * np.pi)
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_bad_texels_are_contained(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_bad_texels_are_contained(device, method):
     radiance = np.ones((16, 32, 3))
     radiance[2, 3], radiance[4, 5] = np.nan, -3281.0
-    values = run_rung(radiance, rung, unit(100))
+    values = run_method(radiance, method, unit(100))
     assert np.isfinite(values).all()
     assert (values <= np.pi * 1.01).all()
     assert (values > 0.9 * np.pi).all()
     radiance[9, 9] = np.inf
-    values = run_rung(radiance, rung, unit(100))
+    values = run_method(radiance, method, unit(100))
     assert np.isfinite(values).all()
     assert values.max() <= float(pyramid.MAX_RADIANCE) * 4 * np.pi
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_the_same_input_gives_the_same_bits_in_bands_or_not(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_input_gives_the_same_bits_in_bands_or_not(device, method):
     radiance, normals = np.random.default_rng(13).random((16, 32, 3)), unit(100)
-    first = run_rung(radiance, rung, normals)
-    np.testing.assert_array_equal(run_rung(radiance, rung, normals), first)
-    np.testing.assert_array_equal(run_rung(radiance, rung, normals, bands=3), first)
+    first = run_method(radiance, method, normals)
+    np.testing.assert_array_equal(run_method(radiance, method, normals), first)
+    np.testing.assert_array_equal(run_method(radiance, method, normals, bands=3), first)
 
 
 @pytest.mark.parametrize("name", ["city", "forest", "night", "studio", "sunrise"])
-def test_errors_on_real_rooms(device, shared, name):
+def test_errors_on_real_environments(device, shared, name):
     image = pytest.importorskip("OpenEXR").File(str(shared / "hdri" / f"{name}.exr")).channels()["RGB"].pixels
     small = wp.zeros((32, 64), dtype=wp.vec3)
     pyramid.reduce_latlong(upload(image), small)
     radiance, normals = small.numpy(), latlong.directions(16, 32).reshape(-1, 3)
     weights = latlong.solid_angles(16, 32).reshape(-1, 1)
-    exact = run_rung(radiance, "brute_force", normals)
-    for rung, limit in (("sh2", SH2_ERROR), ("sh4", SH4_ERROR), ("clusters", CLUSTER_ERROR)):
-        error = run_rung(radiance, rung, normals) - exact
-        assert math.sqrt((weights * error**2).sum() / (weights * exact**2).sum()) < limit, rung
+    exact = run_method(radiance, "brute_force", normals)
+    for method, limit in (("sh2", SH2_ERROR), ("sh4", SH4_ERROR), ("clusters", CLUSTER_ERROR)):
+        error = run_method(radiance, method, normals) - exact
+        assert math.sqrt((weights * error**2).sum() / (weights * exact**2).sum()) < limit, method
 
 
 def test_tables_reject_an_order_they_lack(device):

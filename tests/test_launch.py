@@ -99,8 +99,8 @@ def test_tiles_beside_other_kernels() -> None:
 def test_kernels_with_tiles_have_modules_of_their_own() -> None:
     found = []
     for module in pkgutil.iter_modules(warp_ar.kernels.__path__, "warp_ar.kernels."):
-        for thing in vars(importlib.import_module(module.name)).values():
-            if isinstance(thing, wp.Kernel) and "wp.tile" in inspect.getsource(thing.func):
-                found.append(thing.key)
-                assert list(thing.module.kernels) == [thing.key], f"{thing.key}: declare it with tile_kernel"
+        for item in vars(importlib.import_module(module.name)).values():
+            if isinstance(item, wp.Kernel) and "wp.tile" in inspect.getsource(item.func):
+                found.append(item.key)
+                assert list(item.module.kernels) == [item.key], f"{item.key}: declare it with tile_kernel"
     assert "sum_clusters_kernel" in found

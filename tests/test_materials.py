@@ -171,7 +171,7 @@ def test_phong_lobe_is_normalised(device, exponent):
 @pytest.mark.parametrize("roughness", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
 def test_white_furnace(device, model, roughness, metallic):
-    """A white surface in a white room is white, from every side."""
+    """A white surface in a white environment is white, from every side."""
     record = material(model=model, roughness=roughness, metallic=metallic, shininess=10.0)
     if model == PHONG:
         record["base_color"], record["specular"] = 0.25, 0.75
@@ -229,8 +229,9 @@ def test_ggx_matches_reference(device, roughness):
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("roughness", [0.2, 0.5, 1.0])
 @pytest.mark.parametrize("cos_o", [1.0, 0.6, 0.15])
-def test_virtual_lights_from_everywhere_are_a_white_room(device, metallic, roughness, cos_o):
-    """The integral of direct reflection over all lights is the room's reflectance: the two ways of lighting agree."""
+def test_virtual_lights_from_everywhere_are_a_white_environment(device, metallic, roughness, cos_o):
+    """The integral of direct reflection over all lights is the environment's reflectance: the two ways of lighting
+    agree."""
     record = material(model=METALLIC_ROUGHNESS, roughness=roughness, metallic=metallic, base_color=(0.9, 0.5, 0.1))
     wo = np.array([np.sqrt(1 - cos_o**2), 0.0, cos_o])
     wi, solid = hemisphere(600, 256, about=wo * [-1, -1, 1] + [1e-9, 0, 0], width=roughness**2)

@@ -1,4 +1,4 @@
-"""The ball in the picture: closed forms, the float64 twin, what hides what, rungs, garbage, and the stage."""
+"""The ball in the picture: closed forms, the float64 twin, what hides what, methods, garbage, and the stage."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tests.reference import mirror_ball as reference
 from tests.reference import relight as reference_relight
 from tests.reference.visibility import Body
 from tests.test_composite import tables
-from tests.test_relight import constant_room, records
+from tests.test_relight import constant_environment, records
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
-from warp_ar.kernels.reflect import Room, RoomConfig
-from warp_ar.kernels.relight import RUNGS as RELIGHT_RUNGS
-from warp_ar.kernels.relight import RelightConfig, make_desk
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.relight import METHODS as RELIGHT_METHODS
+from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     BOX,
@@ -67,8 +67,8 @@ X, Y = np.meshgrid((np.arange(W) - (W - 1) / 2) / FOCAL, (np.arange(H) - (H - 1)
 RAYS = np.stack([X, Y], -1).astype(np.float32)
 RHO = (0.85, 0.8, 0.7)
 BALL = {"center": CENTER, "radius": RADIUS, "reflectance": RHO}
-KEY, DOMINANCE = np.array([-0.48, 0.36, 0.8]), 0.7
-ROOM = np.array([0.8, 0.7, 0.5])
+KEY, DIRECTIONALITY = np.array([-0.48, 0.36, 0.8]), 0.7
+ENVIRONMENT = np.array([0.8, 0.7, 0.5])
 
 
 def shape(kind, position, extent, material=-1):
@@ -114,7 +114,7 @@ def run(
     materials=(CHALK,),
     ratio=None,
     samples=1,
-    rung="flat",
+    method="flat",
     pose=POSE,
     rays=RAYS,
     rect=(0, H, 0, W),
@@ -123,15 +123,15 @@ def run(
     irradiance=None,
     config=None,
 ):
-    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even room ``irradiance``."""
+    """The change of radiance, (H, W, 3); objects are lit by ``lights`` and the even environment ``irradiance``."""
     frame = grey_frame() if frame is None else frame
     trace = TraceConfig(kinds(objects), kinds(proxies))
     models = tuple(sorted({one["model"] for one in materials}))
     if config is None:
         lit = irradiance is not None
-        forms = RoomConfig(trace, models, False, "sh" if lit else "none", lit, True)
+        forms = DistantLightConfig(trace, models, False, "sh" if lit else "none", lit, True)
         shading = ShadeConfig(forms, kinds(lights), 1)
-        relighting = RelightConfig(rung, trace, "sh", True) if lights and proxies else None
+        relighting = RelightConfig(method, trace, "sh", True) if lights and proxies else None
         config = mirror_ball.MirrorBallConfig(
             trace, samples, shading if objects else None, relighting, ratio is not None
         )
@@ -149,29 +149,29 @@ def run(
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **one} for one in materials])
-    desk = make_desk(
-        config.relight or RelightConfig(rung, trace),
+    desk = make_receiver(
+        config.relight or RelightConfig(method, trace),
         wp.array(frame, dtype=wp.vec3ub),
         tables()[0],
         None,
         records(Probe, *balls),
-        records(KeyLight, {"direction": KEY, "dominance": DOMINANCE}),
-        wp.array(constant_room(ROOM), dtype=wp.vec3),
+        records(KeyLight, {"direction": KEY, "directionality": DIRECTIONALITY}),
+        wp.array(constant_environment(ENVIRONMENT), dtype=wp.vec3),
     )
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     light = np.ones(3) if irradiance is None else irradiance
-    room = Room()
-    room.irradiance_sh = wp.array(constant_room(light), dtype=wp.vec3)
-    room.levels = wp.full(4096, wp.vec3(*map(float, light)), dtype=wp.vec3)
-    room.level_height = 8
-    room.dfg = wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2)
+    surroundings = DistantLight()
+    surroundings.irradiance_sh = wp.array(constant_environment(light), dtype=wp.vec3)
+    surroundings.levels = wp.full(4096, wp.vec3(*map(float, light)), dtype=wp.vec3)
+    surroundings.level_height = 8
+    surroundings.dfg = wp.full((8, 8), wp.vec2(0.9, 0.05), dtype=wp.vec2)
     mirror_ball.mirror_ball(
         config,
         params,
         wp.array(rays, dtype=wp.vec2),
         scene,
         records(Light, *lights),
-        room,
+        surroundings,
         desk,
         None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
         out,
@@ -214,15 +214,16 @@ assert (ON_BALL & ~DOWN).sum() > 100
 @pytest.mark.parametrize("rho", [0.4, 0.85, 1.0])
 @pytest.mark.parametrize("kd", [0.3, 0.5, 0.9])
 def test_light_above_a_desk_seen_in_the_ball(device, rho, kd):
-    """A matt desk under an even room, and a sun straight above it: rho kd E / pi, but in the ball's own shadow."""
-    code = reference_color.encode(rho * kd * ROOM, reference_color.encoded_srgb)
+    """A matt desk under an even environment, and a sun straight above it: rho kd E / pi, but in the ball's own
+    shadow."""
+    code = reference_color.encode(rho * kd * ENVIRONMENT, reference_color.encoded_srgb)
     frame = np.broadcast_to(code, (H, W, 3)).copy()
     ball = {**BALL, "reflectance": (rho,) * 3}
-    got = run(frame, lights=[SUN], balls=[ball], rung="reflectance")
+    got = run(frame, lights=[SUN], balls=[ball], method="reflectance")
     shadow = np.linalg.norm(MET[..., :2] - CENTER[:2], axis=-1)
     sure = np.abs(shadow - RADIUS) > 1e-3
     lit = ON_BALL & DOWN & (shadow > RADIUS)
-    added = linear(frame) / ROOM * SUN["intensity"] / np.pi
+    added = linear(frame) / ENVIRONMENT * SUN["intensity"] / np.pi
     np.testing.assert_allclose(got[lit & sure], added[lit & sure], rtol=PRIOR)
     np.testing.assert_allclose(got[lit & sure].mean(0), rho * kd * np.array(SUN["intensity"]) / np.pi, rtol=HALF_CODE)
     np.testing.assert_array_equal(got[~lit & sure], 0.0)
@@ -230,12 +231,12 @@ def test_light_above_a_desk_seen_in_the_ball(device, rho, kd):
 
 
 def test_a_ball_that_sees_nothing_virtual_stays_as_it_is(device):
-    """Lights under the desk or turned away, a thing behind a wall, shadows nowhere: no change, to the bit."""
+    """Lights under the desk or turned away, a object behind a wall, shadows nowhere: no change, to the bit."""
     below = {**LAMP, "position": (0.1, 0.0, -0.2)}
     up = {**SUN, "direction": (0.0, 0.0, 1.0)}
     wall = shape(BOX, (0.1, 0.0, 0.1), (0.005, 0.3, 0.1))
     hidden = shape(SPHERE, (0.3, 0.0, 0.04), (0.02,) * 3, 0)
-    for rung in RELIGHT_RUNGS:
+    for method in RELIGHT_METHODS:
         for samples in SAMPLES.values():
             got = run(
                 noise_frame(),
@@ -244,22 +245,23 @@ def test_a_ball_that_sees_nothing_virtual_stays_as_it_is(device):
                 lights=[below, up],
                 ratio=np.ones((H, W, 3)),
                 samples=samples,
-                rung=rung,
+                method=method,
             )
             np.testing.assert_array_equal(got, 0.0)
 
 
-def test_an_opaque_thing_replaces_what_the_camera_saw(device):
-    """A white shell around everything, in an even room: what looks up shows rho times its radiance, whatever was."""
+def test_an_opaque_item_replaces_what_the_camera_saw(device):
+    """A white shell around everything, in an even environment: what looks up shows rho times its radiance, whatever
+    was."""
     shell = shape(SPHERE, (0.0, 0.0, 0.0), (3.0,) * 3, 0)
-    frame, room = noise_frame(), np.array([0.5, 0.4, 0.3])
-    got = linear(frame) + run(frame, objects=[shell], irradiance=room)
+    frame, surroundings = noise_frame(), np.array([0.5, 0.4, 0.3])
+    got = linear(frame) + run(frame, objects=[shell], irradiance=surroundings)
     _, near = on_desk(POINTS, OUTWARD)
     near &= np.linalg.norm(np.nan_to_num(MET), axis=-1) < 3.0
-    thing = ON_BALL & ~near
-    expected = np.array(RHO) * CHALK["base_color"] * room
-    np.testing.assert_allclose(got[thing], np.broadcast_to(expected, got[thing].shape), rtol=FLOAT_ERROR)
-    np.testing.assert_array_equal(got[~thing], linear(frame)[~thing].astype(np.float32))
+    item = ON_BALL & ~near
+    expected = np.array(RHO) * CHALK["base_color"] * surroundings
+    np.testing.assert_allclose(got[item], np.broadcast_to(expected, got[item].shape), rtol=FLOAT_ERROR)
+    np.testing.assert_array_equal(got[~item], linear(frame)[~item].astype(np.float32))
 
 
 def test_shadows_halve_the_desk_and_leave_the_sky(device):
@@ -305,13 +307,20 @@ def body(one):
     return Body(kind, np.eye(3), np.asarray(one["position"], float), 1.0, np.asarray(one["extent"], float))
 
 
-def respond(rung):
+def respond(method):
     """The desk's answer: from its radiance and E cos / pi, radiance; the light's alpha stands for one light only."""
 
     def answer(radiance, light):
         around = radiance @ reference_relight.LUMINANCE
         kd, response = reference_relight.respond(
-            rung, None, radiance, around, np.ones((len(radiance), 1)), np.zeros((len(radiance), 1)), 0.0, np.pi * ROOM
+            method,
+            None,
+            radiance,
+            around,
+            np.ones((len(radiance), 1)),
+            np.zeros((len(radiance), 1)),
+            0.0,
+            np.pi * ENVIRONMENT,
         )
         return kd * response * light
 
@@ -323,9 +332,9 @@ BLOCK = shape(BOX, (-0.12, -0.02, 0.03), (0.02, 0.03, 0.03))
 CUBE = shape(BOX, (0.02, -0.12, 0.015), (0.015, 0.02, 0.015), 0)
 
 
-@pytest.mark.parametrize("rung", ["flat", "relief", "reflectance"])
+@pytest.mark.parametrize("method", ["flat", "relief", "reflectance"])
 @pytest.mark.parametrize("lit", [True, False], ids=["lit", "dark"])
-def test_matches_twin(device, rung, lit):
+def test_matches_twin(device, method, lit):
     """Two balls, desk and block, a ball and a box of chalk, a lamp, shadows; rays close to an edge are left out."""
     frame, objects, proxies = noise_frame(1), [BESIDE, CUBE], [DESK, BLOCK]
     rows, columns = np.mgrid[:H, :W]
@@ -345,17 +354,17 @@ def test_matches_twin(device, rung, lit):
     def twin(offset):
         rays = RAYS.astype(float) + np.array(offset) / FOCAL
         directions = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ POSE.inverse().rotation.T
-        return reference.mirror(world, directions.reshape(-1, 3), seen, respond(rung), project, ramp, (H, W))
+        return reference.mirror(world, directions.reshape(-1, 3), seen, respond(method), project, ramp, (H, W))
 
     expected, label = twin((0.0, 0.0))
     sure = np.ones(len(label), bool)
     for offset in ((NUDGE, 0), (-NUDGE, 0), (0, NUDGE), (0, -NUDGE)):
         sure &= twin(offset)[1] == label
     got = run(
-        frame, objects=objects, proxies=proxies, balls=TWO, lights=[LAMP] if lit else (), ratio=ratio, rung=rung
+        frame, objects=objects, proxies=proxies, balls=TWO, lights=[LAMP] if lit else (), ratio=ratio, method=method
     ).reshape(-1, 3)
     assert sure.mean() > 0.98
-    # A desk, a block, both things and another ball are mirrored; the desk lit and in shadow, in the picture and not.
+    # A desk, a block, both objects and another ball are mirrored; the desk lit and in shadow, in the picture and not.
     assert len(set(label[sure].tolist())) > (12 if lit else 8), set(label.tolist())
     np.testing.assert_allclose(got[sure], expected[sure], atol=FLOAT_ERROR)
     check_error("mirror_ball", got[sure], expected[sure])
@@ -386,7 +395,7 @@ def test_the_mirror_image_of_another_ball_is_not_changed(device):
     miss = np.linalg.norm(along[..., None] * OUTWARD - toward, axis=-1)
     to_other = ON_BALL & (along > 0) & (miss < 0.99 * RADIUS)
     front = ~mirrored_rays(center=other["center"])[2]
-    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ROOM, "lights": [SUN]}
+    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ENVIRONMENT, "lights": [SUN]}
     assert (to_other & front).sum() > 20
     assert not run(balls=[BALL, other], **shell)[to_other & front].any()
     assert run(balls=[BALL], **shell)[to_other & front & ~DOWN].any(-1).all(), "alone it mirrors the shell there"
@@ -402,32 +411,34 @@ def test_a_ball_behind_what_is_mirrored_hides_nothing(device, away):
     np.testing.assert_array_equal(run(**{**scene, "balls": [BALL, other]}), run(**scene))
 
 
-def test_a_thing_before_another_ball_is_mirrored(device):
+def test_a_item_before_another_ball_is_mirrored(device):
     """A chalk ball stands right between the two."""
-    thing = shape(SPHERE, (0.085, 0.0, 0.06), (0.02,) * 3, 0)
+    item = shape(SPHERE, (0.085, 0.0, 0.06), (0.02,) * 3, 0)
     other = {**BALL, "center": np.array([0.2, 0.0, 0.06])}
-    toward = np.asarray(thing["position"]) - POINTS
+    toward = np.asarray(item["position"]) - POINTS
     along = (toward * OUTWARD).sum(-1)
     seen = ON_BALL & (along > 0) & (np.linalg.norm(along[..., None] * OUTWARD - toward, axis=-1) < 0.019)
     assert seen.sum() > 3
     frame = noise_frame()
-    got = linear(frame) + run(frame, objects=[thing], balls=[BALL, other], irradiance=ROOM)
-    np.testing.assert_allclose(got[seen], np.broadcast_to(RHO * ROOM * CHALK["base_color"], got[seen].shape), rtol=1e-4)
+    got = linear(frame) + run(frame, objects=[item], balls=[BALL, other], irradiance=ENVIRONMENT)
+    np.testing.assert_allclose(
+        got[seen], np.broadcast_to(RHO * ENVIRONMENT * CHALK["base_color"], got[seen].shape), rtol=1e-4
+    )
 
 
 def test_two_balls_are_two(device):
     """Far enough apart to see next to nothing of each other, each has its own reflectance."""
     second = {"center": np.array([0.08, 0.12, 0.05]), "radius": 0.03, "reflectance": (0.3, 0.4, 0.5)}
-    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ROOM}
+    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ENVIRONMENT}
     frame = noise_frame()
     got = linear(frame) + run(frame, balls=[BALL, second], **shell)
     _, outward, hit = mirrored_rays(center=second["center"], radius=second["radius"])
     up = outward[..., 2] > 0.2
-    expected = np.array(second["reflectance"]) * ROOM * CHALK["base_color"]
+    expected = np.array(second["reflectance"]) * ENVIRONMENT * CHALK["base_color"]
     assert (hit & up).sum() > 30
     share = np.isclose(got[hit & up], expected, rtol=1e-4).all(-1).mean()
     assert share > 0.95
-    own = np.array(RHO) * ROOM * CHALK["base_color"]
+    own = np.array(RHO) * ENVIRONMENT * CHALK["base_color"]
     assert np.isclose(got[ON_BALL & (OUTWARD[..., 2] > 0.2)], own, rtol=1e-4).all(-1).mean() > 0.95
 
 
@@ -436,7 +447,7 @@ def test_partly_outside_the_frame(device, shift):
     """The picture's window moved over the ball: what both show is the same to the bit."""
     x, y = shift
     moved = RAYS + np.float32(shift) / np.float32(FOCAL)
-    scene = {"objects": [BESIDE, CUBE], "lights": [LAMP, SUN], "proxies": (DESK, BLOCK), "rung": "reflectance"}
+    scene = {"objects": [BESIDE, CUBE], "lights": [LAMP, SUN], "proxies": (DESK, BLOCK), "method": "reflectance"}
     whole, part = run(**scene, rays=np.broadcast_to(RAYS, RAYS.shape)), run(**scene, rays=moved)
     here = np.s_[max(y, 0) : H + min(y, 0), max(x, 0) : W + min(x, 0)]
     there = np.s_[max(-y, 0) : H + min(-y, 0), max(-x, 0) : W + min(-x, 0)]
@@ -461,7 +472,7 @@ def test_a_camera_inside_the_ball_sees_no_mirror(device, eye):
 def test_a_camera_close_to_the_ball(device, gap, samples):
     """Touching the near plane, looking at it and along its skin: finite, and no more than what is there to be seen."""
     outside = CENTER + np.array([0.0, -(1.0 + gap) * RADIUS, 0.0])
-    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ROOM, "samples": samples}
+    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ENVIRONMENT, "samples": samples}
     for target in (CENTER, outside + np.array([1.0, 0.0, 0.0]), outside + np.array([1.0, 0.3 * gap, 0.0])):
         got = linear(grey_frame()) + run(**shell, pose=look_at(outside, target))
         assert np.isfinite(got).all()
@@ -484,9 +495,9 @@ def test_grazing_the_silhouette(device):
     local = directions @ inverse.rotation
     rays = (local[:, :2] / local[:, 2:]).reshape(H, W, 2).astype(np.float32)
     shell = [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)]
-    got = run(objects=shell, proxies=(), irradiance=ROOM, rays=rays) + linear(grey_frame())
+    got = run(objects=shell, proxies=(), irradiance=ENVIRONMENT, rays=rays) + linear(grey_frame())
     assert np.isfinite(got).all()
-    expected = np.array(RHO) * ROOM * CHALK["base_color"]
+    expected = np.array(RHO) * ENVIRONMENT * CHALK["base_color"]
     shown = np.isclose(got, expected, rtol=1e-4).all(-1)
     missed = (got == linear(grey_frame()).astype(np.float32)).all(-1)
     assert (shown | missed).all(), "a ray meets the ball and mirrors the shell, or passes by; nothing between"
@@ -494,12 +505,12 @@ def test_grazing_the_silhouette(device):
     assert shown[clearly].all()
 
 
-# --- rungs
+# --- methods
 
 
 def test_smooth_is_the_mean_over_the_pixel(device):
     """At edges and all: ``n`` rays per pixel give the mean of ``n`` pictures of one ray, moved within the pixel."""
-    frame, scene = noise_frame(), {**BUSY, "rung": "reflectance"}
+    frame, scene = noise_frame(), {**BUSY, "method": "reflectance"}
     for samples in (4, 16, 64):
         side = round(samples**0.5)
         mean = np.zeros((H, W, 3))
@@ -514,8 +525,8 @@ def test_smooth_is_the_mean_over_the_pixel(device):
 
 
 def test_more_rays_converge(device):
-    """On smooth content one ray does; at edges every step of the ladder leaves less of the error."""
-    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ROOM, "proxies": ()}
+    """On smooth content one ray does; at edges every step of the methods leaves less of the error."""
+    shell = {"objects": [shape(SPHERE, (0, 0, 0), (3.0,) * 3, 0)], "irradiance": ENVIRONMENT, "proxies": ()}
     inner = ON_BALL & (np.linalg.norm(RAYS - RAYS[ON_BALL].mean(0), axis=-1) < 15.0 / FOCAL)
     assert inner.sum() > 300
     one, many = (run(**shell, samples=n)[inner] for n in (1, 64))
@@ -535,10 +546,10 @@ def test_specialised_is_the_general_kernel(device):
     """A kernel that knows every shape, material and light gives the same picture as one made for the scene."""
     trace = TraceConfig((BOX, MESH, SPHERE), (PLANE, BOX, MESH))
     models = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
-    shading = ShadeConfig(RoomConfig(trace, models, True, "sh", True, True), (POINT, SPOT, DIRECTIONAL), 1)
+    shading = ShadeConfig(DistantLightConfig(trace, models, True, "sh", True, True), (POINT, SPOT, DIRECTIONAL), 1)
     relighting = RelightConfig("reflectance", trace, "sh", True)
     general = mirror_ball.MirrorBallConfig(trace, 4, shading, relighting, True)
-    scene = {**BUSY, "irradiance": ROOM, "rung": "reflectance", "samples": 4}
+    scene = {**BUSY, "irradiance": ENVIRONMENT, "method": "reflectance", "samples": 4}
     frame = noise_frame()
     np.testing.assert_allclose(run(frame, **scene, config=general), run(frame, **scene), atol=1e-6)
     # Layers that are neutral, and a lamp without light, are none.
@@ -587,7 +598,7 @@ def test_a_broken_shadow_reaches_only_what_mirrors_its_place(device, bad):
 
 
 def test_a_pixel_of_the_frame_changes_itself_alone(device):
-    frame, scene = grey_frame(), {**BUSY, "rung": "reflectance"}
+    frame, scene = grey_frame(), {**BUSY, "method": "reflectance"}
     clean = run(frame, **scene)
     for row, column in np.argwhere(clean.any(-1))[::40]:
         for code in ((255, 0, 7), (0, 0, 0), (255, 255, 255)):
@@ -600,10 +611,10 @@ def test_a_pixel_of_the_frame_changes_itself_alone(device):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_broken_light_reaches_only_what_mirrors_a_thing(device, bad):
-    """The room's light on the thing is broken; the desk beside it, and the light there, are as they were."""
-    scene = {**BUSY, "objects": (BESIDE,), "rung": "reflectance"}
-    clean, got = run(**scene, irradiance=ROOM), run(**scene, irradiance=np.array([bad] * 3))
+def test_broken_light_reaches_only_what_mirrors_a_item(device, bad):
+    """The environment on the object is broken; the desk beside it, and the light there, are as they were."""
+    scene = {**BUSY, "objects": (BESIDE,), "method": "reflectance"}
+    clean, got = run(**scene, irradiance=ENVIRONMENT), run(**scene, irradiance=np.array([bad] * 3))
     none = run(**{**scene, "objects": (shape(SPHERE, (9.0, 9.0, -9.0), (0.01,) * 3, 0),)})
     touched = ~(got == clean).all(-1)
     assert touched.any()
@@ -617,24 +628,24 @@ def test_broken_light_reaches_only_what_mirrors_a_thing(device, bad):
 # --- the truth
 
 # Of the error without the stage, where the stage changes anything: measured 0.32 by one ray, 0.28 by four. What stays:
-# the objects' own light, which is the room's alone, and what the path tracer's ball mirrors twice.
+# the objects' own light, which is the environment's alone, and what the path tracer's ball mirrors twice.
 TRUTH_LEFT = 0.4
 
 
-def test_nearer_to_the_truth_rung_by_rung(device, shared):
+def test_nearer_to_the_truth_method_by_method(device, shared):
     """Against a path-traced frame with the torus and the lamp really there, in the pixels of the ball that change."""
     case = shared / "truth" / "gold_torus_interior"
     scene = load_scene(case / "scene_both.toml")
     pictures = {}
-    for rung in ("none", "single", "smooth"):
-        quality = PRESETS["low"].with_rungs(mirror_ball=rung, room_shadow="coarse")
+    for method in ("none", "single", "smooth"):
+        quality = PRESETS["low"].with_methods(mirror_ball=method, environment_shadow="coarse")
         with Pipeline(scene, device=device, quality=quality) as pipeline:
             for number in (4, 5, 6):
                 frame = cv2.imread(str(case / "camera" / f"{number:04}.png"))[..., ::-1].copy()
-                pictures[rung] = pipeline(frame, time_seconds=number / 30).image.astype(float)
+                pictures[method] = pipeline(frame, time_seconds=number / 30).image.astype(float)
     truth = cv2.imread(str(case / "both" / "0006.png"))[..., ::-1].astype(float)
     changed = np.abs(pictures["smooth"] - pictures["none"]).max(-1) > 4
-    left = {rung: np.abs(picture - truth)[changed].mean() for rung, picture in pictures.items()}
+    left = {method: np.abs(picture - truth)[changed].mean() for method, picture in pictures.items()}
     assert changed.sum() > 200
     assert left["smooth"] < left["single"] < TRUTH_LEFT * left["none"], left
 
@@ -642,8 +653,10 @@ def test_nearer_to_the_truth_rung_by_rung(device, shared):
 # --- the stage
 
 
-def plan_of(scene, **rungs):
-    return make_plan(Request(scene, PRESETS["medium"].with_rungs(**rungs), (scene.camera.width, scene.camera.height)))
+def plan_of(scene, **methods):
+    return make_plan(
+        Request(scene, PRESETS["medium"].with_methods(**methods), (scene.camera.width, scene.camera.height))
+    )
 
 
 def test_stage_runs_where_a_ball_has_something_to_show():
@@ -662,8 +675,8 @@ def test_config_holds_what_the_scene_calls_for():
     desk = load_scene("desk")
     size = desk.camera.width, desk.camera.height
 
-    def config(scene, **rungs):
-        return mirror_config(Request(scene, PRESETS["high"].with_rungs(**rungs), size))
+    def config(scene, **methods):
+        return mirror_config(Request(scene, PRESETS["high"].with_methods(**methods), size))
 
     whole = config(desk, mirror_ball="smooth")
     assert whole.samples == 4
@@ -675,4 +688,4 @@ def test_config_holds_what_the_scene_calls_for():
     bare = config(dataclasses.replace(desk, objects=()), mirror_ball="single")
     assert bare.shade is None
     assert not bare.ratio
-    assert not config(desk, mirror_ball="single", room_shadow="none").ratio
+    assert not config(desk, mirror_ball="single", environment_shadow="none").ratio

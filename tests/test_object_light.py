@@ -8,12 +8,12 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import object_light as reference
 from tests.test_composite import tables
+from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
-from tests.test_room_shadow import COUNT, SIDE, draw, sky, sphere
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import object_light, shade
 from warp_ar.kernels.prefilter import lobe_texels
-from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
 from warp_ar.scene import load_scene
@@ -37,10 +37,10 @@ def run(
     rows=None,
     environment=None,
     samples=1,
-    room_shows=1.0,
+    environment_shows=1.0,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
-    forms = RoomConfig(
+    forms = DistantLightConfig(
         TraceConfig((SPHERE,), (DESK["kind"],)),
         models,
         False,
@@ -63,17 +63,17 @@ def run(
         },
     )
     scene = RayScene()
-    scene.objects = records(Shape, *[{**thing, "material": k} for k, thing in enumerate(objects)])
+    scene.objects = records(Shape, *[{**item, "material": k} for k, item in enumerate(objects)])
     scene.proxies = records(Shape, DESK)
     scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **m} for m in materials])
-    room = Room()
+    surroundings = DistantLight()
     environment = sky() if environment is None else environment
-    room.environment = wp.array(environment, dtype=wp.vec3)
+    surroundings.environment = wp.array(environment, dtype=wp.vec3)
     coefficients = np.zeros((9, 3), np.float32)
     coefficients[0] = np.pi / 0.28209479
-    room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
-    room.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(*3 * [room_shows]), dtype=wp.vec3)
-    room.level_height = LEVEL_HEIGHT
+    surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    surroundings.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(*3 * [environment_shows]), dtype=wp.vec3)
+    surroundings.level_height = LEVEL_HEIGHT
     rays = wp.array(RAYS, dtype=wp.vec2)
     hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
     trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
@@ -89,7 +89,7 @@ def run(
         tables()[0],
         *layers,
         scene,
-        room,
+        surroundings,
         drawn[2],
         hit_object,
         hits,
@@ -150,14 +150,14 @@ def test_dark_desk_darkens_the_flanks_not_the_top(device):
 
 
 def test_mirror_shows_the_picture_of_the_desk(device):
-    # A mirror ball next to a chalk ball: rays that go down see the desk, others a black room or the other ball.
-    things = [sphere(BALL, RADIUS), sphere((0.14, 0.0, 0.06), RADIUS)]
+    # A mirror ball next to a chalk ball: rays that go down see the desk, others a black environment or the other ball.
+    items = [sphere(BALL, RADIUS), sphere((0.14, 0.0, 0.06), RADIUS)]
     ratio = np.full((H, W, 3), 0.5, np.float32)
     added = np.full((H, W, 3), 0.25, np.float32)
-    _, plain, found, hits, _ = run(things, [CHROME, CHALK], room_shows=0.0)
-    _, layered, _, _, _ = run(things, [CHROME, CHALK], ratio=ratio, added=added, room_shows=0.0)
+    _, plain, found, hits, _ = run(items, [CHROME, CHALK], environment_shows=0.0)
+    _, layered, _, _, _ = run(items, [CHROME, CHALK], ratio=ratio, added=added, environment_shows=0.0)
     ball = found == 0
-    assert (plain[ball, 3] == 1).all(), "nothing is left to the prefiltered room"
+    assert (plain[ball, 3] == 1).all(), "nothing is left to the prefiltered environment"
     near = plain[..., 0]
     np.testing.assert_allclose(near[ball & (near > 0)], 1, atol=1e-5)
     changed = ball & (near > 0) & (np.abs(layered[..., 0] - 1) > 1e-6)
@@ -173,7 +173,8 @@ def test_mirror_shows_the_picture_of_the_desk(device):
 
 
 def shown_by_a_mirror(offset):
-    """What a mirror ball in a black room shows of a white desk from one place of each pixel; NaN beside the ball."""
+    """What a mirror ball in a black environment shows of a white desk from one place of each pixel; NaN beside the
+    ball."""
     rays = np.stack([*(RAYS + np.array(offset) / 60).transpose(2, 0, 1), np.ones((H, W))], -1) @ LOOK_DOWN.T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     to_ball = CAMERA - np.array(BALL)
@@ -198,7 +199,7 @@ def test_mirror_is_the_mean_over_its_pixel(device):
         expected = np.nanmean([shown_by_a_mirror((x, y)) for x in places for y in places], axis=0)
     errors = {}
     for samples in (1, 16):
-        _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, room_shows=0.0)
+        _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, environment_shows=0.0)
         errors[samples] = np.abs(mirrored[..., 0] - expected)[found == 0]
     assert len(errors[1]) > 50
     # A place of sixteen or two on the wrong side of the desk's picture.
@@ -256,7 +257,9 @@ def test_share_follows_the_light(device):
 def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None, passed=None):
     """Filter estimates as given, (h, w); object k has material k."""
     height, width = found.shape
-    forms = RoomConfig(TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False)
+    forms = DistantLightConfig(
+        TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False
+    )
     config = object_light.ObjectLightConfig(forms, COUNT, 4, 1, SIDE, False, False)
     scene = RayScene()
     scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
@@ -287,8 +290,8 @@ def test_averages_stop_at_the_edges_of_objects(device):
     light = np.where(found == 0, 1.0, np.where(found == 1, 5.0, np.nan))
     irradiance, mirrored = average(found, (0, 0, 1), light[..., None].repeat(3, -1), light[..., None].repeat(4, -1))
     for out in (irradiance, mirrored):
-        for thing, value in ((0, 1.0), (1, 5.0)):
-            np.testing.assert_allclose(out[found == thing], value, rtol=1e-6)
+        for item, value in ((0, 1.0), (1, 5.0)):
+            np.testing.assert_allclose(out[found == item], value, rtol=1e-6)
         assert (out[found < 0] == 0).all(), "what is no object is left alone"
 
 
@@ -313,7 +316,7 @@ def test_a_tile_of_estimates_averages_to_their_mean(device):
         np.testing.assert_allclose(mirrored[..., 0][inner], expected[inner], rtol=1e-5)
 
 
-def test_garbage_in_the_room_stays_finite(device):
+def test_garbage_in_the_environment_stays_finite(device):
     environment = sky()
     environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
     irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
@@ -349,10 +352,10 @@ def _alike_kernel(found: wp.array2d[wp.int32], hits: wp.array2d[Hit], asked: wp.
     out[k] = shade.most_alike(found, hits, 1, 1, asked[k])
 
 
-def test_stage_follows_the_rung_of_shade():
+def test_stage_follows_the_method_of_shade():
     scene = load_scene("mirror")
-    for rung, expected in (("environment", False), ("one_bounce", True)):
-        quality = PRESETS["medium"].with_rungs(shade=rung)
+    for method, expected in (("environment", False), ("one_bounce", True)):
+        quality = PRESETS["medium"].with_methods(shade=method)
         plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
         assert ("object_light" in {stage.name for stage, _ in plan.stages}) == expected
     bare = dataclasses.replace(scene, objects=())

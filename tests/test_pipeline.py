@@ -247,17 +247,17 @@ def test_lost_marker_passes_the_frame_and_keeps_the_light(frames: Frames) -> Non
 
 def test_only_what_the_scene_calls_for_is_planned() -> None:
     def stages(**changes: object) -> set[str]:
-        quality = PRESETS["low"].with_rungs(expose="plain", relight="relief")
+        quality = PRESETS["low"].with_methods(expose="plain", relight="relief")
         with Pipeline(make_scene(**changes), device="cpu", quality=quality) as pipeline:
             return {stage.name for stage, _ in pipeline.plan.stages}
 
-    room = {"unwrap", "accumulate", "fill"}
+    surroundings = {"unwrap", "accumulate", "fill"}
     off = Exposure(1.0)
     assert stages(objects=(), lights=(), exposure=off) == set()
     assert stages(objects=(), lights=()) == {"expose"}, "plain scaling asks for nothing else"
     assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
     assert {"shade", "visibility", "diffuse", "specular"}.isdisjoint(stages(objects=(), exposure=off))
-    assert room.isdisjoint(stages(probes=())), "without a ball there is no room light to capture"
+    assert surroundings.isdisjoint(stages(probes=())), "without a ball there is no environment light to capture"
 
 
 @pytest.mark.parametrize(
@@ -364,7 +364,7 @@ def dimmed(frames: Frames) -> Frames:
 @pytest.mark.parametrize("recover", ["white_card", "shading"])
 def test_handing_over_between_equals_shows_nothing(recover: str, frames: Frames, device: str) -> None:
     """One pipeline, and two that take turns: light, recovered lamps, exposure and clock go along."""
-    quality = PRESETS["low"].with_rungs(recover=recover, expose="ball")
+    quality = PRESETS["low"].with_methods(recover=recover, expose="ball")
     scene = make_scene(exposure=Exposure("auto"), lights=(Light("point", 3.0, at=(0.0, -0.1, 0.3)),))
     outputs = ("image", "environment")
     with contextlib.ExitStack() as stack:
@@ -434,7 +434,7 @@ def test_a_new_material_shows_where_nothing_else_moves(frames: Frames, device: s
 
 def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, frames, monkeypatch):
     """Looking at every pixel that bounced light might reach gives the picture of looking where it does."""
-    quality = PRESETS["medium"].with_rungs(relight="bounce")
+    quality = PRESETS["medium"].with_methods(relight="bounce")
     spot = Light(
         "spot", at=(0.0, 0.05, 0.2), target=(0.0, 0.05, 0.0), inner_angle=10.0, outer_angle=12.0, intensity=0.2
     )

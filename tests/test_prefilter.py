@@ -19,16 +19,16 @@ from warp_ar.stages.specular import Specular, scene_lobe
 FURNACE = 5e-4
 # Float32 sums over a map, relative.
 ROUNDING = 2e-5
-# Energy per level of the rungs that scale their levels: rounding.
+# Energy per level of the methods that scale their levels: rounding.
 SCALED_ENERGY = 1e-5
-# The reference sums a lobe at texel centres: measured 0.7 % for a room with a sun in it, at the widest level.
+# The reference sums a lobe at texel centres: measured 0.7 % for an environment with a sun in it, at the widest level.
 REFERENCE_ENERGY = 0.02
-# Relative RMS over all levels on real rooms of 32 rows: three quarters above what was measured.
+# Relative RMS over all levels on real environments of 32 rows: three quarters above what was measured.
 ERRORS = {"box_mip": 2.0, "energy_mip": 0.6, "fis32": 0.35, "fis128": 0.2}
 # Split-sum table: 1024 Hammersley directions against quadrature.
 DFG = 4e-3
 
-RUNGS = Specular.rungs
+METHODS = Specular.methods
 LOBES = ("ggx", "phong")
 MATERIALS = {
     "ggx": 'model = "metallic_roughness"\nbase_color = [1.0, 0.8, 0.3]\nmetallic = 1.0\nroughness = 0.4',
@@ -89,10 +89,10 @@ def dfg_kernel(
     factor_out[i] = prefilter.energy_compensation(out[i], wp.vec3(1.0, 0.5, 0.0))
 
 
-def run(radiance, rung, lobe="ggx", bands=1):
+def run(radiance, method, lobe="ggx", bands=1):
     """Packed levels as the stage makes them."""
     environment = wp.array(np.ascontiguousarray(radiance, np.float32), dtype=wp.vec3)
-    quality = PRESETS["medium"].with_rungs(specular=rung)
+    quality = PRESETS["medium"].with_methods(specular=method)
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
     request = Request(scene(lobe), quality, (64, 48))
     assert scene_lobe(request.scene) == ("ggx" if lobe == "mirror" else lobe)
@@ -173,17 +173,17 @@ def test_levels_grow_with_roughness_and_fall_with_shininess(device, height):
 
 
 @pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("height", [1, 3, 4, 7, 16, 25])
-def test_a_white_furnace_stays_white(device, rung, lobe, height):
-    for level in unpack(run(np.full((height, 2 * height, 3), (0.2, 1.0, 30.0)), rung, lobe), height):
+def test_a_white_furnace_stays_white(device, method, lobe, height):
+    for level in unpack(run(np.full((height, 2 * height, 3), (0.2, 1.0, 30.0)), method, lobe), height):
         np.testing.assert_allclose(level, np.broadcast_to((0.2, 1.0, 30.0), level.shape), rtol=FURNACE)
 
 
-@pytest.mark.parametrize("rung", [*RUNGS, "mirror"])
-def test_level_0_is_the_mirror(device, rung):
+@pytest.mark.parametrize("method", [*METHODS, "mirror"])
+def test_level_0_is_the_mirror(device, method):
     radiance = np.random.default_rng(1).random((16, 32, 3)).astype(np.float32)
-    levels = run(radiance, "box_mip", "mirror") if rung == "mirror" else run(radiance, rung)
+    levels = run(radiance, "box_mip", "mirror") if method == "mirror" else run(radiance, method)
     np.testing.assert_array_equal(unpack(levels, 16)[0], radiance)
 
 
@@ -198,9 +198,9 @@ def test_the_widest_lobe_is_irradiance(device):
             np.testing.assert_allclose(widest[..., 0], expected, atol=2e-3)  # texels of 5.6 degrees: their square / 12
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_no_light_is_zero(device, rung):
-    assert (run(np.zeros((16, 32, 3)), rung).numpy() == 0).all()
+@pytest.mark.parametrize("method", METHODS)
+def test_no_light_is_zero(device, method):
+    assert (run(np.zeros((16, 32, 3)), method).numpy() == 0).all()
 
 
 # --- Twins ------------------------------------------------------------------------------------------------------------
@@ -266,25 +266,25 @@ def test_samples_of_a_lobe_have_its_mean_cosine(device):
 
 
 @pytest.mark.parametrize("lobe", LOBES)
-@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("row", [2, 12])
-def test_every_level_keeps_the_energy_of_a_lamp(device, rung, lobe, row):
+def test_every_level_keeps_the_energy_of_a_lamp(device, method, lobe, row):
     # Atlas rows 6 and 18: one texel of 1e6 over 1e-4.
     height = 16
     radiance = sun(height, row)
     whole = reference_pyramid.energy(radiance)
-    for level in unpack(run(radiance, rung, lobe), height):
+    for level in unpack(run(radiance, method, lobe), height):
         assert np.isfinite(level).all()
         assert (level >= 0).all()
         energy = reference_pyramid.energy(level) / whole
-        # Rungs that scale are exact; the reference and the paper's are as good as their sampling of one texel.
-        np.testing.assert_allclose(energy, 1, rtol={"box_mip": 0.5, "brute_force": 0.03}.get(rung, SCALED_ENERGY))
+        # Methods that scale are exact; the reference and the paper's are as good as their sampling of one texel.
+        np.testing.assert_allclose(energy, 1, rtol={"box_mip": 0.5, "brute_force": 0.03}.get(method, SCALED_ENERGY))
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_seam_and_poles_are_continuous(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_seam_and_poles_are_continuous(device, method):
     height = 16
-    levels = run(np.random.default_rng(5).random((height, 2 * height, 3)), rung)
+    levels = run(np.random.default_rng(5).random((height, 2 * height, 3)), method)
     step = 1e-3
     for level in (0.0, 0.4, 1.0, 1.7, 3.0):
         beside = [[r, c] for r in (0.3, 4.2, 8.0, 15.9) for c in (step, 2 * height - step)]
@@ -296,14 +296,14 @@ def test_seam_and_poles_are_continuous(device, rung):
     assert np.isfinite(sample(levels, height, [[0, 0], [height, 0], [height, 2 * height]], 99.0)).all()
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_a_ramp_is_not_shifted_or_turned(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_a_ramp_is_not_shifted_or_turned(device, method):
     # Any lobe, being round, keeps the direction of order-1 light: a half-texel shift does not.
     height = 16
     directions = latlong.directions(height, 2 * height)
     for axis in range(3):
         radiance = 2.0 + directions[..., axis : axis + 1].repeat(3, 2)
-        for level in unpack(run(radiance, rung), height):
+        for level in unpack(run(radiance, method), height):
             d, areas = latlong.directions(*level.shape[:2]), latlong.solid_angles(*level.shape[:2])
             dipole = np.einsum("hw,hw,hwk->k", areas, level[..., 0], d)
             dipole /= np.linalg.norm(dipole)
@@ -311,33 +311,33 @@ def test_a_ramp_is_not_shifted_or_turned(device, rung):
             assert np.degrees(np.arccos(np.clip(dipole[axis], -1, 1))) < 1.5
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_turning_the_room_turns_the_reflection(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_turning_the_environment_turns_the_reflection(device, method):
     radiance = np.random.default_rng(6).random((16, 32, 3)) ** 4
-    for a, b in zip(unpack(run(radiance, rung), 16), unpack(run(np.roll(radiance, 8, 1), rung), 16), strict=True):
+    for a, b in zip(unpack(run(radiance, method), 16), unpack(run(np.roll(radiance, 8, 1), method), 16), strict=True):
         np.testing.assert_allclose(np.roll(a, a.shape[1] // 4, 1), b, atol=1e-4)
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_bad_texels_are_contained(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_bad_texels_are_contained(device, method):
     radiance = np.ones((16, 32, 3))
     radiance[2, 3], radiance[4, 5], radiance[9, 9] = np.nan, -3281.0, np.inf
-    values = run(radiance, rung).numpy()
+    values = run(radiance, method).numpy()
     assert np.isfinite(values).all()
     assert (values >= 0).all()
     assert values.max() <= float(pyramid.MAX_RADIANCE) * 4
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_the_same_input_gives_the_same_bits_in_bands_or_not(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_input_gives_the_same_bits_in_bands_or_not(device, method):
     radiance = np.random.default_rng(7).random((16, 32, 3))
-    first = run(radiance, rung).numpy()
-    np.testing.assert_array_equal(run(radiance, rung).numpy(), first)
-    np.testing.assert_array_equal(run(radiance, rung, bands=3).numpy(), first)
+    first = run(radiance, method).numpy()
+    np.testing.assert_array_equal(run(radiance, method).numpy(), first)
+    np.testing.assert_array_equal(run(radiance, method, bands=3).numpy(), first)
 
 
 @pytest.mark.parametrize(("name", "lobe"), [("forest", "ggx"), ("night", "phong"), ("studio", "ggx")])
-def test_errors_on_real_rooms(device, shared, name, lobe):
+def test_errors_on_real_environments(device, shared, name, lobe):
     image = pytest.importorskip("OpenEXR").File(str(shared / "hdri" / f"{name}.exr")).channels()["RGB"].pixels
     small = wp.zeros((32, 64), dtype=wp.vec3)
     pyramid.reduce_latlong(wp.array(np.ascontiguousarray(image, np.float32), dtype=wp.vec3), small)
@@ -345,11 +345,11 @@ def test_errors_on_real_rooms(device, shared, name, lobe):
     whole = reference_pyramid.energy(small.numpy().astype(np.float64))
     for level in exact:
         np.testing.assert_allclose(reference_pyramid.energy(level), whole, rtol=REFERENCE_ENERGY)
-    for rung, limit in ERRORS.items():
-        for ours, truth in zip(unpack(run(small.numpy(), rung, lobe), 32)[1:], exact, strict=True):
+    for method, limit in ERRORS.items():
+        for ours, truth in zip(unpack(run(small.numpy(), method, lobe), 32)[1:], exact, strict=True):
             weight = latlong.solid_angles(*ours.shape[:2])[..., None]
             error = math.sqrt((weight * (ours - truth) ** 2).sum() / (weight * truth**2).sum())
-            assert error < limit, rung
+            assert error < limit, method
 
 
 # --- Split sum --------------------------------------------------------------------------------------------------------

@@ -81,7 +81,7 @@ def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
 
 
 def unwrap(
-    view, frame, balls=(BALL,), *, rung="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
+    view, frame, balls=(BALL,), *, method="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
 ):
     corners = project(view, balls, shapes, kinds, height)
     radiance = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
@@ -91,7 +91,7 @@ def unwrap(
     frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
     for band in rows or [None]:
         probe.gather_probe(
-            frame, table, make_probes(balls), corners, radiance, confidence, clipped, rung=rung, rows=band
+            frame, table, make_probes(balls), corners, radiance, confidence, clipped, method=method, rows=band
         )
     return radiance.numpy(), confidence.numpy(), clipped.numpy()
 
@@ -119,12 +119,12 @@ def normal_kernel(distance: wp.array[wp.float32], psi: wp.array[wp.vec2], normal
 # ---- closed form ----
 
 
-@pytest.mark.parametrize("rung", probe.RUNGS)
+@pytest.mark.parametrize("method", probe.METHODS)
 @pytest.mark.parametrize("code", [1, 90, 255])
-def test_furnace_to_the_bit(device, rung, code):
-    """A constant frame is a constant room, exactly, whatever was seen how well."""
+def test_furnace_to_the_bit(device, method, code):
+    """A constant frame is a constant environment, exactly, whatever was seen how well."""
     view = look(0.4)
-    radiance, confidence, _ = unwrap(view, constant_frame(view, code), rung=rung)
+    radiance, confidence, _ = unwrap(view, constant_frame(view, code), method=method)
     expected = decode_table("srgb")[code] / np.float32(REFLECTANCE)
     seen = confidence > 0
     assert (confidence[seen] < 0.5).any()
@@ -183,24 +183,24 @@ def test_corners_match_twin(device, distortion):
     check_error("unwrap", got[~blind], expected[~blind])
 
 
-@pytest.mark.parametrize("rung", probe.RUNGS)
-def test_gather_matches_twin(device, rung):
+@pytest.mark.parametrize("method", probe.METHODS)
+def test_gather_matches_twin(device, method):
     """On noise, which forgives no wrong pixel. A sample exactly between two pixels may go to either in ``nearest``."""
     view = look(0.35, size=(200, 150), focal=280.0)
     frame = np.random.default_rng(6).integers(0, 256, (150, 200, 3)).astype(np.uint8)
-    got = unwrap(view, frame, rung=rung, height=16, transfer="linear")
+    got = unwrap(view, frame, method=method, height=16, transfer="linear")
     expected = reference.gather(
         frame,
         decode_table("linear"),
         REFLECTANCE,
         reference.corners(view, CENTER, RADIUS, 16),
-        rung,
+        method,
         probe.RIM_START,
         probe.RIM_WIDTH,
     )
     agree = np.abs(got[0] - expected[0]).max(-1) < SAMPLE
     assert agree.mean() > 0.999
-    if rung == "bilinear":
+    if method == "bilinear":
         assert agree.all()
     check_error("unwrap", got[0][agree], expected[0][agree])
     np.testing.assert_allclose(got[1], expected[1], atol=SAMPLE)
@@ -228,13 +228,13 @@ def test_specialised_equals_general(device):
 
 
 @pytest.mark.parametrize("distance", [0.15, 0.5, 2.0])
-@pytest.mark.parametrize("rung", probe.RUNGS)
-def test_ramp_is_where_it_belongs(device, rung, distance):
+@pytest.mark.parametrize("method", probe.METHODS)
+def test_ramp_is_where_it_belongs(device, method, distance):
     """Hard cases 2 and 4: seam, poles and perspective. One texel of shift would be 0.035, an orthographic map 0.06 at
     0.15 m."""
     view = look(distance, focal=min(0.8 * 110 * distance / RADIUS, 900.0), size=(400, 400))
     frame = encode(reference.render(view, [BALL], smooth_light, lambda d: np.ones_like(d)))
-    radiance, confidence, _ = unwrap(view, frame, rung=rung, transfer="linear")
+    radiance, confidence, _ = unwrap(view, frame, method=method, transfer="linear")
     expected = smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT))
     sure = confidence > 0.5
     assert sure.mean() > 0.6
@@ -268,8 +268,8 @@ def test_nothing_of_the_background_bleeds_in(device, distance, background, shift
     )
     center = true.principal
     tracked = look(distance, focal=500.0, principal=(center[0] + shift[0], center[1] + shift[1]))
-    for rung in probe.RUNGS:
-        radiance, confidence, _ = unwrap(tracked, frame, rung=rung, transfer="linear")
+    for method in probe.METHODS:
+        radiance, confidence, _ = unwrap(tracked, frame, method=method, transfer="linear")
         seen = confidence > 0
         assert seen.mean() > 0.7
         assert np.ptp(radiance[seen], axis=0).max() == 0.0
@@ -283,10 +283,10 @@ def test_light_is_a_mean_over_the_footprint(device):
     frame = np.repeat(checker[..., None], 3, -1)
     ball = (CENTER, RADIUS, (1.0, 1.0, 1.0))
     spread = {}
-    for rung in probe.RUNGS:
-        radiance, confidence, clipped = unwrap(view, frame, [ball], rung=rung, transfer="linear", height=16)
+    for method in probe.METHODS:
+        radiance, confidence, clipped = unwrap(view, frame, [ball], method=method, transfer="linear", height=16)
         sure = (confidence > 0.9) & (np.abs(np.arange(16) - 7.5) < 6)[:, None]
-        spread[rung] = radiance[sure].std()
+        spread[method] = radiance[sure].std()
         assert clipped[sure].mean() == pytest.approx(0.5, abs=0.06)
         assert radiance[sure].mean() == pytest.approx(0.5, abs=0.06)
     # Between four pixels of a checker at random: 1/2 (1 - 2x)(1 - 2y), of standard deviation 1/6.
@@ -368,7 +368,7 @@ BLOCKERS = {
 
 @pytest.mark.parametrize("kind", ["box", "plane", "mesh"])
 def test_hidden_by_a_proxy(device, kind):
-    """A white thing before the ball hides part of it, and none of its white gets in, not even along its edges."""
+    """A white object before the ball hides part of it, and none of its white gets in, not even along its edges."""
     view = look(0.4, focal=500.0)
     shape = dict(BLOCKERS["box" if kind == "mesh" else kind])
     half, at, turn = np.array(shape["extent"]), np.array(shape["position"]), np.array(shape.get("rotation", np.eye(3)))
@@ -523,10 +523,10 @@ def test_far_from_the_origin(device):
     np.testing.assert_allclose(got[seen], expected[seen], atol=PIXEL)
 
 
-def test_unknown_rung(device):
+def test_unknown_method(device):
     view = look(0.4)
     with pytest.raises(ValueError, match="expected bilinear, area"):
-        unwrap(view, constant_frame(view, 0), rung="cubic")
+        unwrap(view, constant_frame(view, 0), method="cubic")
 
 
 # ---- real and path-traced pictures ----
@@ -563,12 +563,12 @@ def test_light_directions_of_real_photographs(device, shared, number):
     light = lights.numpy()[0]
     cosine = light["direction"] @ expected / np.linalg.norm(expected)
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 1.0
-    assert light["dominance"] > 0.5
+    assert light["directionality"] > 0.5
 
 
 TRUTH = {
-    # Mean |error| over mean radiance, above the horizon (below it the desk is near: not a distant room), where nothing
-    # clips.
+    # Mean |error| over mean radiance, above the horizon (below it the desk is near: not a distant environment), where
+    # nothing clips.
     "gold_torus_interior": 0.035,
     "mirror_and_chalk_studio": 0.20,  # black walls with hair-thin edges, and a pixel is two texels wide
     "night_desk_lamp": 0.015,

@@ -123,8 +123,8 @@ def test_mesh_is_moved_to_its_middle_and_back(device, tmp_path):
     triangle = np.array([[1000.0, 5, 5], [1001, 5, 5], [1000, 6, 7]])
     path = tmp_path / "far.obj"
     path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in triangle) + "f 1 2 3\n")
-    thing = scenes.Object("mesh", file=path, rotate=(0.0, 0.0, 90.0), scale=2.0, at=(1.0, 2.0, 3.0))
-    host = HostScene(scenes.Scene(CAMERA, objects=(thing, thing)), wp.get_device(device))
+    item = scenes.Object("mesh", file=path, rotate=(0.0, 0.0, 90.0), scale=2.0, at=(1.0, 2.0, 3.0))
+    host = HostScene(scenes.Scene(CAMERA, objects=(item, item)), wp.get_device(device))
     value = records(host, "objects")[0]
     center = np.array([1000.5, 5.5, 6.0])
     np.testing.assert_allclose(
@@ -218,11 +218,11 @@ def test_texture_needs_coordinates(device, tmp_path):
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     )
     cv2.imwrite(str(picture), np.zeros((2, 2, 3), np.uint8))
-    thing = scenes.Object("mesh", file=mesh, material=scenes.LambertMaterial(picture))
+    item = scenes.Object("mesh", file=mesh, material=scenes.LambertMaterial(picture))
     with pytest.raises(
         SceneError, match=r"plain\.ply: the mesh has no texture coordinates for the texture .*wood\.png"
     ):
-        HostScene(scenes.Scene(CAMERA, objects=(thing,)), wp.get_device(device))
+        HostScene(scenes.Scene(CAMERA, objects=(item,)), wp.get_device(device))
 
 
 def test_which_light_a_material_reflects():
@@ -266,7 +266,7 @@ def test_object_rect_holds_every_ray_that_meets_an_object(device, camera):
             rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
             tight = (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
             wasted.append(inside.sum() / tight)
-    # Boxes around three small things, and a pixel on every side.
+    # Boxes around three small objects, and a pixel on every side.
     assert np.median(wasted) < 3.0
 
 

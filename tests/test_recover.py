@@ -131,7 +131,7 @@ def test_open_sky_gives_pi(device, normal):
 
 @pytest.mark.parametrize("distance", [1.3, 1.7, 2.5, 5.0])
 def test_white_furnace_beside_a_perfect_mirror(device, distance):
-    """What a perfectly reflecting ball hides of a uniform room it replaces: the irradiance stays pi."""
+    """What a perfectly reflecting ball hides of a uniform environment it replaces: the irradiance stays pi."""
     host = empty_scene()
     center = np.array([0.0, 0.0, 0.035])
     points = points_of(device, [center + 0.035 * distance * np.array([0.6, 0.48, -0.64])], [(0, 0, 1)])
@@ -293,7 +293,7 @@ def test_cells_keep_energy_and_excess_returns_it(device, height, scene):
     area = reference.cell_directions(*shape)[1].reshape(shape)[..., None]
     weight = got["solid_angle"][..., None]
     assert (weight * got["radiance"]).sum((0, 1)) == pytest.approx((area * radiance).sum((0, 1)), rel=1e-4)
-    # The ball stands on the table: it sees it below, and the box or the room above.
+    # The ball stands on the table: it sees it below, and the box or the environment above.
     assert got["modelled"][-1].all()
     assert not got["modelled"][0].any()
     excess = rng.uniform(0, 5, (*got.shape, 3)).astype(np.float32)
@@ -383,7 +383,7 @@ def test_wide_regions_are_split_into_compact_parts():
     assert len(np.unique(parts[labels == 1])) == 1
 
 
-class Room:
+class DistantLight:
     """Surfaces lit by cells and lamps exactly as the equations have it, seen by a camera that clips."""
 
     def __init__(self, device, scene, *, table=0.4, box=0.3, noise=0.0):
@@ -407,7 +407,7 @@ class Room:
         kernels.trace_lamps(self.points, self.seen, lamps, self.probes, self.host.ray_scene, out, proxies=self.proxies)
         return out.numpy().astype(float)
 
-    def estimate(self, radiance, rung="shading", extra=0.0, exposure=1.0, frames=1, camera=None):
+    def estimate(self, radiance, method="shading", extra=0.0, exposure=1.0, frames=1, camera=None):
         """Estimate from the true radiance of cells, (m, 3); ``extra`` is irradiance that does not come from cells."""
         values, _ = cells_of(self.device, np.minimum(radiance, 1.0).reshape(ROWS, COLUMNS, 3))
         values["clipped"] = values["lacking"] = (radiance >= 1.0).reshape(ROWS, COLUMNS, 3)
@@ -423,14 +423,14 @@ class Room:
         observed["radiance"], observed["clipped"] = np.minimum(shown, 1.0), shown >= 1.0
         observed["visible"] = ~self.hidden
         solver = recovery.Recovery(
-            self.surfaces, self.scene.marker.white, (-0.12, 0.03, 0.035), radius=0.035, rung=rung
+            self.surfaces, self.scene.marker.white, (-0.12, 0.03, 0.035), radius=0.035, method=method
         )
         for _ in range(frames):
             estimate = solver.update(values, straight, mirrored, observed, self.trace, camera)
         return estimate, values
 
 
-def lit_room(*lights):
+def lit_environment(*lights):
     """Radiance 0.2 above, 0.1 below, and lights: (direction, cosine of the radius, radiance)."""
     d, area = reference.cell_directions(ROWS, COLUMNS)
     radiance = np.where(d[:, 2:] > 0.0, 0.2, 0.1) * np.ones(3)
@@ -443,9 +443,9 @@ def lit_room(*lights):
 
 
 def test_white_card_finds_the_only_light(device, scene):
-    radiance, (mask,), area = lit_room(((-0.5, -0.6, 0.6), 0.985, 30.0))
-    for rung in ("white_card", "shading"):
-        estimate, values = Room(device, scene).estimate(radiance, rung)
+    radiance, (mask,), area = lit_environment(((-0.5, -0.6, 0.6), 0.985, 30.0))
+    for method in ("white_card", "shading"):
+        estimate, values = DistantLight(device, scene).estimate(radiance, method)
         excess = estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
         assert (area @ excess) == pytest.approx(area[mask].sum() * np.full(3, 29.0), rel=0.05)
         assert not excess[~mask].any()
@@ -455,12 +455,12 @@ def test_white_card_finds_the_only_light(device, scene):
 def test_shading_shares_energy_between_lights_where_the_card_cannot(device, scene):
     """Two lights of one size, one ten times the other: the card's answer is to make them equal."""
     lights = (((-0.5, -0.6, 0.5), 0.985, 40.0), ((0.7, -0.5, 0.5), 0.985, 5.0))
-    radiance, masks, area = lit_room(*lights)
+    radiance, masks, area = lit_environment(*lights)
     ratios = {}
-    for rung in ("white_card", "shading"):
-        estimate, values = Room(device, scene, noise=0.1).estimate(radiance, rung)
+    for method in ("white_card", "shading"):
+        estimate, values = DistantLight(device, scene, noise=0.1).estimate(radiance, method)
         excess = (estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
-        ratios[rung] = (area[masks[0]] @ excess[masks[0]]) / (area[masks[1]] @ excess[masks[1]])
+        ratios[method] = (area[masks[0]] @ excess[masks[0]]) / (area[masks[1]] @ excess[masks[1]])
     assert ratios["white_card"] == pytest.approx(1.0, abs=0.2)
     # The truth is 39 / 4; noise of 10 % on the table leaves the weak light uncertain by about a third.
     assert 6.0 < ratios["shading"] < 16.0
@@ -470,12 +470,12 @@ def test_shading_shares_energy_between_lights_where_the_card_cannot(device, scen
 def test_shading_finds_how_far_a_lamp_is(device, scene, distance):
     center = np.array([-0.12, 0.03, 0.035])
     direction = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
-    radiance, _, _ = lit_room((direction, 0.996, 1.0))
-    room = Room(device, scene, noise=0.1)
+    radiance, _, _ = lit_environment((direction, 0.996, 1.0))
+    surroundings = DistantLight(device, scene, noise=0.1)
     power = 2.5
     lamp = np.array([[*(center + distance * direction), 0.03]], np.float32)
-    extra = room.trace(lamp) * distance**2 * power * np.ones(3)
-    estimate, _ = room.estimate(radiance, extra=extra)
+    extra = surroundings.trace(lamp) * distance**2 * power * np.ones(3)
+    estimate, _ = surroundings.estimate(radiance, extra=extra)
     assert estimate.lamps
     found = estimate.lamps[0]
     # The grid of directions is 5.6 degrees wide, and distances are refined in steps of a tenth.
@@ -501,12 +501,12 @@ def test_a_lamp_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
     assert np.linalg.norm(normal) == pytest.approx(1.0)
     assert 2.0 * (normal @ view) * normal - view == pytest.approx(direction, abs=1e-6)
     assert np.linalg.norm(mirrors - center - (mirrors - center) @ direction * direction) > 0.018
-    radiance, _, _ = lit_room((direction, 0.997, 1.0))
-    room = Room(device, scene, noise=0.1)
-    extra = room.trace(np.array([[*lamp, 0.03]], np.float32)) * distance**2 * 2.5 * np.ones(3)
+    radiance, _, _ = lit_environment((direction, 0.997, 1.0))
+    surroundings = DistantLight(device, scene, noise=0.1)
+    extra = surroundings.trace(np.array([[*lamp, 0.03]], np.float32)) * distance**2 * 2.5 * np.ones(3)
     off = {}
     for name, seen_from in (("its surface", camera), ("its middle", None)):
-        found = room.estimate(radiance, extra=extra, camera=seen_from)[0].lamps[0]
+        found = surroundings.estimate(radiance, extra=extra, camera=seen_from)[0].lamps[0]
         off[name] = np.linalg.norm(found.origin + found.distance * found.direction - lamp)
     # Directions are known to half a cell, 2.8 degrees; distances are refined in steps of a tenth.
     assert off["its surface"] < 0.03
@@ -546,15 +546,15 @@ def test_noise_is_bounded_and_needs_points():
 
 
 def test_a_card_that_clips_is_a_lower_bound(device, scene):
-    """The rung ``white_card`` must not exceed the truth, and says so; ``shading`` goes on by ink and table."""
-    radiance, (mask,), area = lit_room(((-0.5, -0.6, 0.6), 0.985, 300.0))
+    """The method ``white_card`` must not exceed the truth, and says so; ``shading`` goes on by ink and table."""
+    radiance, (mask,), area = lit_environment(((-0.5, -0.6, 0.6), 0.985, 300.0))
     truth = area[mask].sum() * 299.0
     totals = {}
-    for rung in ("white_card", "shading"):
-        estimate, values = Room(device, scene, table=0.3).estimate(radiance, rung, exposure=1.0, extra=0.0)
+    for method in ("white_card", "shading"):
+        estimate, values = DistantLight(device, scene, table=0.3).estimate(radiance, method, exposure=1.0, extra=0.0)
         assert estimate.lower_bound == (True, True, True)
         excess = (estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
-        totals[rung] = area @ excess
+        totals[method] = area @ excess
     assert totals["white_card"] < 0.95 * truth
     # Ink is assumed to reflect 4 %, as it does here; the table's 30 % is not known.
     assert totals["shading"] == pytest.approx(truth, rel=0.3)
@@ -570,7 +570,7 @@ def test_a_sky_that_clips_is_not_shrunk_to_what_the_card_proves(device, scene, c
     """Relative deviations must not draw the light down: the card clips from 1.2 on, and ink tells how far beyond."""
     d, area = reference.cell_directions(ROWS, COLUMNS)
     radiance = np.where(d[:, 2:] > 0.0, np.array(colour), 0.1)
-    estimate, values = Room(device, scene, table=0.35, box=0.35).estimate(radiance)
+    estimate, values = DistantLight(device, scene, table=0.35, box=0.35).estimate(radiance)
     assert estimate.lower_bound == tuple(value * scene.marker.white > 1.0 for value in colour)
     excess = estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
     found, truth = area @ excess, area @ np.maximum(radiance - 1.0, 0.0)
@@ -621,19 +621,19 @@ def test_two_solvers_leave_blas_as_it_was():
 
 
 def test_nothing_clipped_nothing_added(device, scene):
-    radiance, _, _ = lit_room()
-    estimate, _ = Room(device, scene).estimate(radiance)
+    radiance, _, _ = lit_environment()
+    estimate, _ = DistantLight(device, scene).estimate(radiance)
     assert not estimate.excess.any()
     assert estimate.lamps == ()
 
 
 def test_estimates_are_reproducible_and_steady(device, scene):
     lights = (((-0.5, -0.6, 0.5), 0.985, 40.0), ((0.7, -0.5, 0.5), 0.985, 5.0))
-    radiance, _, _ = lit_room(*lights)
-    room = Room(device, scene, noise=0.1)
-    once, again = (room.estimate(radiance)[0].excess for _ in range(2))
+    radiance, _, _ = lit_environment(*lights)
+    surroundings = DistantLight(device, scene, noise=0.1)
+    once, again = (surroundings.estimate(radiance)[0].excess for _ in range(2))
     assert (once == again).all()
-    later = room.estimate(radiance, frames=5)[0].excess
+    later = surroundings.estimate(radiance, frames=5)[0].excess
     # Later searches may add a peak; the same frame must not drift.
     assert later.sum() == pytest.approx(once.sum(), rel=0.05)
 
@@ -641,38 +641,38 @@ def test_estimates_are_reproducible_and_steady(device, scene):
 def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
     """Everything clipped, and everything black."""
     for value in (0.0, 1e6):
-        for rung in ("white_card", "shading"):
-            estimate, _ = Room(device, scene).estimate(np.full((ROWS * COLUMNS, 3), value), rung)
+        for method in ("white_card", "shading"):
+            estimate, _ = DistantLight(device, scene).estimate(np.full((ROWS * COLUMNS, 3), value), method)
             assert np.isfinite(estimate.excess).all()
             assert (estimate.excess >= 0).all()
 
 
-def test_unknown_rung_is_named(scene):
+def test_unknown_method_is_named(scene):
     with pytest.raises(ValueError, match=r"'guess'.*white_card or shading"):
-        recovery.Recovery(recovery.find_surfaces(scene), 0.85, (0, 0, 0), rung="guess")
+        recovery.Recovery(recovery.find_surfaces(scene), 0.85, (0, 0, 0), method="guess")
 
 
 # ---- the stage ----------------------------------------------------------------------------------------------------
 
 
 def test_stage_is_left_out_where_the_quality_says_so(scene):
-    quality = PRESETS["low"].with_rungs(recover="clipped")
+    quality = PRESETS["low"].with_methods(recover="clipped")
     with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
         assert "recover" in dict(pipeline.plan.left_out)
         assert "filled_radiance" not in pipeline.arrays
 
 
 def test_points_are_traced_once_when_they_come_into_view(device):
-    """What a row holds stays as it is: the room does not move."""
+    """What a row holds stays as it is: the environment does not move."""
     points = points_of(device, [(5.0, 5.0, 0.0), (4.0, 5.0, 0.0)], [(0, 0, 1)] * 2)
     views, rows = np.zeros(2, np.dtype(kernels.Observation.numpy_dtype())), []
     traced = wp.zeros(2, dtype=wp.int32, device=device)
     out = [wp.full((2, ROWS * COLUMNS), -1.0, dtype=wp.float32, device=device) for _ in range(2)]
-    room = cells_of(device)[1], probes_of(device), empty_scene().ray_scene
+    surroundings = cells_of(device)[1], probes_of(device), empty_scene().ray_scene
     for visible in ((1, 0), (1, 1)):
         views["visible"] = visible
         seen_now = wp.array(views, dtype=kernels.Observation, device=device)
-        kernels.trace_transfer(points, seen_now, *room, traced, *out, proxies=())
+        kernels.trace_transfer(points, seen_now, *surroundings, traced, *out, proxies=())
         rows.append(out[0].numpy().sum(axis=1))
         out[0][:1].fill_(-1.0)
     assert rows[0] == pytest.approx([np.pi, -ROWS * COLUMNS], rel=QUADRATURE)
@@ -690,7 +690,7 @@ def test_estimates_are_a_few_a_second(scene, monkeypatch, fps, expected):
     monkeypatch.setattr(Recover, "_ask", counted)
     rng = np.random.default_rng(5)
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
-    quality = PRESETS["low"].with_rungs(recover="white_card")
+    quality = PRESETS["low"].with_methods(recover="white_card")
     with Pipeline(scene, device="cpu", quality=quality, outputs=("environment",)) as pipeline:
         for index in range(expected[-1] + 1):
             image = rng.integers(0, 255, (240, 320, 3), np.uint8)
@@ -716,7 +716,7 @@ def shown_estimates(scene, device, count, turns=1, waits=False):
     rng = np.random.default_rng(6)
     shown = []
     with contextlib.ExitStack() as stack:
-        quality = PRESETS["low"].with_rungs(recover="white_card")
+        quality = PRESETS["low"].with_methods(recover="white_card")
         arguments = {"device": device, "quality": quality, "outputs": ("environment",), "waits": waits}
         pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
         for index in range(count):
@@ -744,10 +744,13 @@ def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monk
     assert shown_estimates(scene, device, len(expected), waits=True) == expected
 
 
-def what_is_seen(room=0.4, table=0.3):
-    """Cells and observations of a room that does not clip."""
+def what_is_seen(surroundings=0.4, table=0.3):
+    """Cells and observations of an environment that does not clip."""
     cells = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
-    cells["solid_angle"], cells["radiance"] = reference.cell_directions(ROWS, COLUMNS)[1].reshape(ROWS, COLUMNS), room
+    cells["solid_angle"], cells["radiance"] = (
+        reference.cell_directions(ROWS, COLUMNS)[1].reshape(ROWS, COLUMNS),
+        surroundings,
+    )
     observations = np.zeros(40, np.dtype(kernels.Observation.numpy_dtype()))
     observations["visible"], observations["radiance"] = 1.0, table
     return cells, observations
@@ -772,14 +775,18 @@ def test_a_new_solver_does_not_rest(scene):
     assert not any(solver.rests(*what_is_seen()) for _ in range(5))
 
 
-@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.4}, {"table": 0.3 * 0.7}, {"room": 0.25, "table": 0.2}])
+@pytest.mark.parametrize(
+    "changed", [{"surroundings": 0.4 * 1.4}, {"table": 0.3 * 0.7}, {"surroundings": 0.25, "table": 0.2}]
+)
 def test_a_switched_lamp_is_solved_for_at_once(scene, changed):
     solver = settled_solver(scene)
     assert not solver.rests(*what_is_seen())
     assert not solver.rests(*what_is_seen(**changed))
 
 
-@pytest.mark.parametrize("changed", [{"room": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"room": 0.35, "table": 0.25}])
+@pytest.mark.parametrize(
+    "changed", [{"surroundings": 0.4 * 1.05}, {"table": 0.3 * 0.9}, {"surroundings": 0.35, "table": 0.25}]
+)
 def test_other_light_waits_once_at_most(scene, changed):
     solver = settled_solver(scene)
     assert not solver.rests(*what_is_seen())
@@ -806,9 +813,9 @@ def test_a_lamp_over_a_part_of_the_desk_is_other_light(scene):
     assert not solver.rests(cells, observations)
 
 
-def test_a_dark_room_rests_until_it_is_lit(scene):
+def test_a_dark_environment_rests_until_it_is_lit(scene):
     solver = settled_solver(scene)
-    assert [solver.rests(*what_is_seen(room=0.0)) for _ in range(2)] == [False, True]
+    assert [solver.rests(*what_is_seen(surroundings=0.0)) for _ in range(2)] == [False, True]
     assert not solver.rests(*what_is_seen())
 
 
@@ -831,7 +838,7 @@ def test_the_stage_lets_an_estimate_stand(scene, device, monkeypatch):
     image = np.full((240, 320, 3), 90, np.uint8)
     image[:100] = 255
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
-    quality = PRESETS["low"].with_rungs(recover="white_card")
+    quality = PRESETS["low"].with_methods(recover="white_card")
     lit = []
     with Pipeline(scene, device=device, quality=quality, outputs=("environment",), waits=True) as pipeline:
         for index in range(100):
@@ -859,7 +866,7 @@ SHADING_ERROR = 0.2
 """What may be left: the first frame alone leaves 0.13."""
 
 
-def test_light_of_a_path_traced_room_comes_back(shared):
+def test_light_of_a_path_traced_environment_comes_back(shared):
     case = shared / "truth" / "gold_torus_interior"
     truth = np.load(case / "env" / "0000.npy").astype(float)
     d, area = reference.cell_directions(*truth.shape[:2])
@@ -870,14 +877,14 @@ def test_light_of_a_path_traced_room_comes_back(shared):
         return cosine @ np.asarray(map_, float).reshape(-1, 3)
 
     errors = {}
-    for rung in ("clipped", "white_card", "shading"):
-        quality = PRESETS["medium"].with_rungs(recover=rung)
+    for method in ("clipped", "white_card", "shading"):
+        quality = PRESETS["medium"].with_methods(recover=method)
         source = load_scene(case / "scene_object.toml")
         with Session(source, device="cpu", quality=quality, outputs=("environment",)) as session:
             _, result = next(iter(session))
         small = result.environment
         got = np.repeat(np.repeat(small, truth.shape[0] // len(small), 0), truth.shape[0] // len(small), 1)
-        errors[rung] = np.linalg.norm(irradiance(got) - irradiance(truth)) / np.linalg.norm(irradiance(truth))
+        errors[method] = np.linalg.norm(irradiance(got) - irradiance(truth)) / np.linalg.norm(irradiance(truth))
     assert errors["clipped"] > CLIPPED_ERROR
     assert errors["white_card"] < errors["clipped"]
     assert errors["shading"] < SHADING_ERROR

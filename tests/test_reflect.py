@@ -1,4 +1,4 @@
-"""Where the camera's picture shows a point of the desk, and where it does not; near lamps in the room's light."""
+"""Where the camera's picture shows a point of the desk, and where it does not; near lamps in the environment."""
 
 from __future__ import annotations
 
@@ -10,8 +10,14 @@ import warp as wp
 
 from tests.test_relight import H, W, records, shape
 from warp_ar.kernels.prefilter import lobe_texels
-from warp_ar.kernels.reflect import Room, RoomConfig, make_find_in_frame, make_mirrored, make_room_irradiance
-from warp_ar.kernels.structs import BOX, LAMBERT, MIRROR, PLANE, FrameParams, Probe, RayScene, RoomLamp, Shape
+from warp_ar.kernels.reflect import (
+    DistantLight,
+    DistantLightConfig,
+    make_distant_irradiance,
+    make_find_in_frame,
+    make_mirrored,
+)
+from warp_ar.kernels.structs import BOX, LAMBERT, MIRROR, PLANE, Emitter, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
 
 FOCAL = 60.0
@@ -125,27 +131,27 @@ LEVEL_HEIGHT = 16
 
 
 @functools.cache
-def make_room_kernel(lamps):
-    config = RoomConfig(TraceConfig((), ()), (LAMBERT, MIRROR), False, "sh", True, False, lamps)
-    mirrored, irradiance = make_mirrored(config), make_room_irradiance(config)
+def make_environment_kernel(lamps):
+    config = DistantLightConfig(TraceConfig((), ()), (LAMBERT, MIRROR), False, "sh", True, False, lamps)
+    mirrored, irradiance = make_mirrored(config), make_distant_irradiance(config)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def room_kernel(
+    def environment_kernel(
         # In:
-        room: Room,
+        surroundings: DistantLight,
         point: wp.vec3,
         direction: wp.vec3,
         # Out:
         shown_out: wp.array[wp.vec3],
     ):
-        shown_out[0] = mirrored(room, wp.static(MIRROR), 0.0, 0.0, point, direction, 0.0)
-        shown_out[1] = irradiance(room, point, direction)
+        shown_out[0] = mirrored(surroundings, wp.static(MIRROR), 0.0, 0.0, point, direction, 0.0)
+        shown_out[1] = irradiance(surroundings, point, direction)
 
-    return room_kernel
+    return environment_kernel
 
 
 def test_near_lamps_are_mirrored_and_light_from_where_they_are(device):
-    """A lamp of a texel in a dim room: seen from the ball in one direction, from beside it in another."""
+    """A lamp of a texel in a dim environment: seen from the ball in one direction, from beside it in another."""
     direction = LAMP_AT / np.linalg.norm(LAMP_AT)
     distance = float(np.linalg.norm(LAMP_AT))
     power = 0.7
@@ -155,17 +161,22 @@ def test_near_lamps_are_mirrored_and_light_from_where_they_are(device):
     level[row, column] = 9.0
     packed = np.full((lobe_texels(LEVEL_HEIGHT), 3), 0.1, np.float32)
     packed[: 2 * LEVEL_HEIGHT**2] = level.reshape(-1, 3)
-    room = Room()
-    room.irradiance_sh = wp.zeros(9, wp.vec3)  # of which more than there is cannot be taken
-    room.levels, room.level_height = wp.array(packed, dtype=wp.vec3), LEVEL_HEIGHT
+    surroundings = DistantLight()
+    surroundings.irradiance_sh = wp.zeros(9, wp.vec3)  # of which more than there is cannot be taken
+    surroundings.levels, surroundings.level_height = wp.array(packed, dtype=wp.vec3), LEVEL_HEIGHT
     lamp = {"direction": direction, "distance": distance, "power": 3 * [power]}
-    room.lamps = records(RoomLamp, lamp)
+    surroundings.lamps = records(Emitter, lamp)
     aside = np.array([0.25, 0.2, 0.0])
     there = (LAMP_AT - aside) / np.linalg.norm(LAMP_AT - aside)
 
     def shown(lamps, point, toward):
         out = wp.zeros(2, wp.vec3)
-        wp.launch(make_room_kernel(lamps), dim=1, inputs=[room, wp.vec3(*point), wp.vec3(*toward)], outputs=[out])
+        wp.launch(
+            make_environment_kernel(lamps),
+            dim=1,
+            inputs=[surroundings, wp.vec3(*point), wp.vec3(*toward)],
+            outputs=[out],
+        )
         return out.numpy()[:, 0]
 
     for known in (False, True):

@@ -66,7 +66,7 @@ def point(at, intensity=(0.3, 0.3, 0.3), **more):
     return {"kind": POINT, "position": at, "intensity": intensity, "attenuation": (0, 0, 1), **more}
 
 
-def constant_room(radiance):
+def constant_environment(radiance):
     """Spherical harmonics of E = pi L, the same for every normal."""
     sh = np.zeros((9, 3), np.float32)
     sh[0] = np.pi * np.asarray(radiance) / 0.28209479
@@ -74,7 +74,7 @@ def constant_room(radiance):
 
 
 def run(
-    rung,
+    method,
     lights,
     frame=None,
     objects=(),
@@ -89,7 +89,7 @@ def run(
 ):
     frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
     config = relight.RelightConfig(
-        rung,
+        method,
         TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
         "sh" if irradiance_map is None else "map",
         bool(probes),
@@ -99,10 +99,10 @@ def run(
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     frame_array, table = wp.array(frame, dtype=wp.vec3ub), wp.zeros((H, W), wp.uint32)
     summed_area.sum_area(frame_array, table)
-    keys = records(KeyLight, {"direction": key[0], "dominance": key[1]})
-    room = wp.array(constant_room((1, 1, 1)) if sh is None else sh, dtype=wp.vec3)
+    keys = records(KeyLight, {"direction": key[0], "directionality": key[1]})
+    surroundings = wp.array(constant_environment((1, 1, 1)) if sh is None else sh, dtype=wp.vec3)
     if irradiance_map is not None:
-        room = wp.array(irradiance_map, dtype=wp.vec3)
+        surroundings = wp.array(irradiance_map, dtype=wp.vec3)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     relight.relight(
         config,
@@ -115,7 +115,7 @@ def run(
         records(Probe, *probes),
         records(Light, *lights),
         keys,
-        room,
+        surroundings,
         out,
         rows=rows,
     )
@@ -134,7 +134,7 @@ def run_edges(
     rows=None,
     listed=0,
 ):
-    """``relight`` on a white desk in a white room, and ``smooth_edges`` where samples are more than one.
+    """``relight`` on a white desk in a white environment, and ``smooth_edges`` where samples are more than one.
 
     ``detail`` times as many pixels along each axis see the same view.
     """
@@ -155,15 +155,15 @@ def run_edges(
         wp.zeros((height, width), wp.uint32),
     )
     summed_area.sum_area(frame, table)
-    keys = records(KeyLight, {"direction": (0, 0, 1), "dominance": 0.0})
+    keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
     rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
     known = frame, tables()[0], table
     balls, lamps = records(Probe, *probes), records(Light, *lights)
-    room = wp.array(constant_room((1, 1, 1)), dtype=wp.vec3)
+    surroundings = wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3)
     out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
-    relight.relight(config, params, rays, *known, scene, balls, lamps, keys, room, out, seen)
+    relight.relight(config, params, rays, *known, scene, balls, lamps, keys, surroundings, out, seen)
     if samples > 1:
-        desk, lists = relight.make_desk(config, *known, balls, keys, room), None
+        desk, lists = relight.make_receiver(config, *known, balls, keys, surroundings), None
         if listed:
             sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
             lists = EdgeLists(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
@@ -188,7 +188,7 @@ def unit(*v):
 
 
 def test_white_desk_has_the_value_of_the_scene_format(device):
-    """Reflectance 1 (as bright as white in a room of radiance 1), light above at d: intensity / (pi d^2)."""
+    """Reflectance 1 (as bright as white in an environment of radiance 1), light above at d: intensity / (pi d^2)."""
     frame = np.full((H, W, 3), 255, np.uint8)
     got = run("reflectance", [point((0, 0, 0.25))], frame)
     _, n_dot_l, e = reference.point_light(POINTS, np.array([0, 0, 0.25]), 0.3)
@@ -198,10 +198,15 @@ def test_white_desk_has_the_value_of_the_scene_format(device):
 
 @pytest.mark.parametrize("rho", [0.1, 0.5, 0.9])
 def test_reflectance_of_a_lambertian_desk_is_recovered(device, rho):
-    """Whatever the room: L = rho E / pi is what the camera sees."""
-    room = np.array([0.9, 0.6, 0.3])
-    code = reference_color.encode(rho * room, reference_color.encoded_srgb)
-    got = run("reflectance", [point((0, 0, 0.25))], np.broadcast_to(code, (H, W, 3)).copy(), sh=constant_room(room))
+    """Whatever the environment: L = rho E / pi is what the camera sees."""
+    surroundings = np.array([0.9, 0.6, 0.3])
+    code = reference_color.encode(rho * surroundings, reference_color.encoded_srgb)
+    got = run(
+        "reflectance",
+        [point((0, 0, 0.25))],
+        np.broadcast_to(code, (H, W, 3)).copy(),
+        sh=constant_environment(surroundings),
+    )
     _, n_dot_l, e = reference.point_light(POINTS, np.array([0, 0, 0.25]), 0.3)
     np.testing.assert_allclose(got, np.broadcast_to(rho / np.pi * n_dot_l * e, got.shape), rtol=HALF_CODE)
 
@@ -219,7 +224,7 @@ def test_paper_is_exact_at_its_three_cases(device, alpha):
 def response_kernel(
     n_dot_l: wp.float32,
     m: wp.float32,
-    dominance: wp.float32,
+    directionality: wp.float32,
     alpha: wp.array[wp.float32],
     printed_out: wp.array[wp.float32],
     relief_out: wp.array[wp.float32],
@@ -228,13 +233,13 @@ def response_kernel(
     i = wp.tid()
     printed_out[i] = relight.printed_response(n_dot_l, m, alpha[i])
     relief_out[i] = relight.relief_factor(m, alpha[i])
-    turned_out[i] = relight.turned_relief(m, alpha[i], dominance)
+    turned_out[i] = relight.turned_relief(m, alpha[i], directionality)
 
 
-def responses(n_dot_l, m, alpha, dominance=1.0):
+def responses(n_dot_l, m, alpha, directionality=1.0):
     alpha = wp.array(np.asarray(alpha, np.float32), dtype=wp.float32)
     out = [wp.zeros_like(alpha) for _ in range(3)]
-    wp.launch(response_kernel, alpha.shape, [n_dot_l, m, dominance, alpha], out)
+    wp.launch(response_kernel, alpha.shape, [n_dot_l, m, directionality, alpha], out)
     return [o.numpy() for o in out]
 
 
@@ -265,13 +270,13 @@ def test_desk_without_structure_gives_the_same_for_every_alpha(device):
         )
 
 
-@pytest.mark.parametrize("rung", ["paper", "relief"])
-def test_ambient_room_says_nothing_about_relief(device, rung):
-    """No dominant direction, or two equal and opposite lamps: dominance 0 and the direction does not matter."""
+@pytest.mark.parametrize("method", ["paper", "relief"])
+def test_ambient_environment_says_nothing_about_relief(device, method):
+    """No dominant direction, or two equal and opposite lamps: directionality 0 and the direction does not matter."""
     light, frame = [point((0.1, 0.05, 0.3))], noise_frame()
-    one = run(rung, light, frame, key=((0, 0, 1), 0.0))
-    np.testing.assert_array_equal(run(rung, light, frame, key=((0, 0, -1), 0.0)), one)
-    if rung == "paper":
+    one = run(method, light, frame, key=((0, 0, 1), 0.0))
+    np.testing.assert_array_equal(run(method, light, frame, key=((0, 0, -1), 0.0)), one)
+    if method == "paper":
         np.testing.assert_array_equal(one, run("flat", light, frame))
 
 
@@ -300,12 +305,12 @@ def test_relief_keeps_the_mean(device):
 # --- twins
 
 
-@pytest.mark.parametrize("rung", relight.RUNGS)
-def test_matches_twin(device, rung):
+@pytest.mark.parametrize("method", relight.METHODS)
+def test_matches_twin(device, method):
     frame = noise_frame()
-    key, dominance = unit(-0.5, 0.3, 0.8), 0.7
+    key, directionality = unit(-0.5, 0.3, 0.8), 0.7
     centers, radii = np.array([[0.05, 0.0, 0.08], [-0.1, -0.05, 0.05]]), [0.03, 0.04]
-    room = np.array([0.8, 0.7, 0.5])
+    surroundings = np.array([0.8, 0.7, 0.5])
     lights = [(np.array([0.1, 0.1, 0.3]), np.array([0.3, 0.2, 0.1])), (np.array([-0.2, 0.0, 0.2]), np.array([0.1] * 3))]
     table = color.decode_table("srgb")
     radiance = reference_color.decode(table, frame)
@@ -315,16 +320,18 @@ def test_matches_twin(device, rung):
         wi, n_dot_l, e = reference.point_light(POINTS, at, intensity)
         dark, near = reference.hidden(POINTS, at, centers, radii)
         alpha = (wi @ key)[..., None]
-        kd, response = reference.respond(rung, frame, radiance, around, n_dot_l, alpha, dominance, np.pi * room)
+        kd, response = reference.respond(
+            method, frame, radiance, around, n_dot_l, alpha, directionality, np.pi * surroundings
+        )
         expected += np.where(dark[..., None], 0.0, kd / np.pi * response * e)
         margin = np.minimum(margin, near)
     got = run(
-        rung,
+        method,
         [point(at, intensity) for at, intensity in lights],
         frame,
         objects=[shape(SPHERE, c, (r, 0, 0)) for c, r in zip(centers, radii, strict=True)],
-        key=(key, dominance),
-        sh=constant_room(room),
+        key=(key, directionality),
+        sh=constant_environment(surroundings),
     )
     sure = margin > RIM
     assert sure.mean() > 0.95
@@ -335,11 +342,11 @@ def test_matches_twin(device, rung):
 
 def test_irradiance_map_is_the_same_as_harmonics(device):
     frame, light = noise_frame(), [point((0, 0, 0.3))]
-    room = np.array([0.8, 0.7, 0.5], np.float32)
-    constant = np.broadcast_to(np.float32(np.pi) * room, (8, 16, 3)).copy()
+    surroundings = np.array([0.8, 0.7, 0.5], np.float32)
+    constant = np.broadcast_to(np.float32(np.pi) * surroundings, (8, 16, 3)).copy()
     np.testing.assert_allclose(
         run("reflectance", light, frame, irradiance_map=constant),
-        run("reflectance", light, frame, sh=constant_room(room)),
+        run("reflectance", light, frame, sh=constant_environment(surroundings)),
         rtol=1e-5,
     )
 
@@ -359,10 +366,10 @@ def test_box_is_lit_on_the_side_that_faces_the_light(device):
     assert low[H // 2, 3].min() > 0.0
 
 
-@pytest.mark.parametrize("rung", relight.RUNGS)
-def test_light_behind_every_surface_adds_nothing(device, rung):
+@pytest.mark.parametrize("method", relight.METHODS)
+def test_light_behind_every_surface_adds_nothing(device, method):
     lights = [point((0, 0, -0.2)), {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}]
-    np.testing.assert_array_equal(run(rung, lights, noise_frame(), key=((0, 0, -1), 1.0)), 0.0)
+    np.testing.assert_array_equal(run(method, lights, noise_frame(), key=((0, 0, -1), 1.0)), 0.0)
 
 
 def test_light_inside_an_object_does_not_leave_it(device):
@@ -383,7 +390,7 @@ def test_ball_hides_the_desk_and_throws_a_shadow(device):
     assert (dark & ~seen).any()
 
 
-@pytest.mark.parametrize("rung", relight.RUNGS)
+@pytest.mark.parametrize("method", relight.METHODS)
 @pytest.mark.parametrize(
     "light",
     [
@@ -404,12 +411,12 @@ def test_ball_hides_the_desk_and_throws_a_shadow(device):
     ids=["on desk", "1e6", "1e6 at 0", "no colour", "cone 0", "inner = outer", "cone 90"],
 )
 @pytest.mark.parametrize("content", ["noise", "black", "white"])
-def test_hard_lights_stay_finite(device, rung, light, content):
+def test_hard_lights_stay_finite(device, method, light, content):
     white = np.full((H, W, 3), 255, np.uint8)
     white = np.full((H, W, 3), 255, np.uint8)
     frame = {"noise": noise_frame(0, 256), "black": 0 * white, "white": white}
-    for room in ((1, 1, 1), (0, 0, 0), (np.nan, np.inf, -1)):
-        got = run(rung, [light], frame[content], key=((0, 0, 1), 1.0), sh=constant_room(room))
+    for surroundings in ((1, 1, 1), (0, 0, 0), (np.nan, np.inf, -1)):
+        got = run(method, [light], frame[content], key=((0, 0, 1), 1.0), sh=constant_environment(surroundings))
         assert np.isfinite(got).all()
         assert (got >= 0.0).all()
         if light["intensity"][0] == 0.0:
@@ -417,9 +424,9 @@ def test_hard_lights_stay_finite(device, rung, light, content):
 
 
 @pytest.mark.parametrize("irradiance", [np.nan, np.inf, -np.inf, -1.0, 0.0, 1e-30])
-def test_reflectance_is_within_bounds_for_any_room(device, irradiance):
-    room = np.full((8, 16, 3), irradiance, np.float32)
-    got = run("reflectance", [point((0, 0, 0.3))], irradiance_map=room)
+def test_reflectance_is_within_bounds_for_any_environment(device, irradiance):
+    surroundings = np.full((8, 16, 3), irradiance, np.float32)
+    got = run("reflectance", [point((0, 0, 0.3))], irradiance_map=surroundings)
     white = run("flat", [point((0, 0, 0.3))]) / 0.5
     assert ((got >= 0.0) & (got <= white * (1.0 + FLOAT_ERROR))).all()
 
@@ -539,8 +546,8 @@ def test_same_input_gives_the_same_output(device):
 # --- the truth
 
 
-def test_nearer_to_the_truth_rung_by_rung(device, shared):
-    """Against a path-traced frame with the light really there: each rung leaves less of the error than ``flat``."""
+def test_nearer_to_the_truth_method_by_method(device, shared):
+    """Against a path-traced frame with the light really there: each method leaves less of the error than ``flat``."""
     import json
 
     import cv2
@@ -553,7 +560,7 @@ def test_nearer_to_the_truth_rung_by_rung(device, shared):
     scene = load_scene(case / "scene_light.toml")
     camera, truth = (cv2.imread(str(case / name / "0006.png"))[..., ::-1].copy() for name in ("camera", "light"))
     environment = np.load(case / "env" / "0006.npy").astype(np.float64)
-    sh, direction, dominance = harmonics(environment)
+    sh, direction, directionality = harmonics(environment)
     pose = json.loads((case / "case.json").read_text())["poses"][6]
     rotation, translation = np.array(pose["R"]), np.array(pose["t"])
     host = HostScene(scene, wp.get_device())
@@ -568,10 +575,10 @@ def test_nearer_to_the_truth_rung_by_rung(device, shared):
     before, wanted = (reference_color.decode(decode_table, image) for image in (camera, truth))
     changed = np.abs(wanted - before).max(-1) > 0.05
     left = {}
-    for rung in relight.RUNGS:
+    for method in relight.METHODS:
         added = wp.zeros((height, width), wp.vec3)
         relight.relight(
-            relight.RelightConfig(rung, trace_config(scene), "sh", True),
+            relight.RelightConfig(method, trace_config(scene), "sh", True),
             records(FrameParams, {**params, "light_rect": (0, height, 0, width)}),
             wp.array(pixel_rays(scene.camera), dtype=wp.vec2),
             frame,
@@ -580,12 +587,12 @@ def test_nearer_to_the_truth_rung_by_rung(device, shared):
             host.ray_scene,
             records(Probe, {"center": probe.center, "radius": probe.radius}),
             wp.array(lights, dtype=Light),
-            records(KeyLight, {"direction": direction, "dominance": dominance}),
+            records(KeyLight, {"direction": direction, "directionality": directionality}),
             wp.array(sh, dtype=wp.vec3),
             added,
         )
         got = np.minimum(before + added.numpy(), 1.0)
-        left[rung] = np.abs(got - wanted)[changed].mean() / np.abs(before - wanted)[changed].mean()
+        left[method] = np.abs(got - wanted)[changed].mean() / np.abs(before - wanted)[changed].mean()
     assert left["paper"] < left["flat"]
     assert left["relief"] < left["paper"]
     assert left["reflectance"] < min(left["relief"], REFLECTANCE_LEFT)

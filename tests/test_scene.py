@@ -321,9 +321,9 @@ def test_calibration_that_is_none(folder: pathlib.Path, text: str, suffix: str) 
 
 
 def test_objects_stand_still_without_animation() -> None:
-    thing = sc.Object("sphere", radius=1.0, at=(1, 2, 3), rotate=(10, 20, 30))
+    item = sc.Object("sphere", radius=1.0, at=(1, 2, 3), rotate=(10, 20, 30))
     for seconds in (0.0, 7.5):
-        rotation, position = thing.pose_at(seconds)
+        rotation, position = item.pose_at(seconds)
         np.testing.assert_array_equal(rotation, rotation_matrix((10, 20, 30)))
         np.testing.assert_array_equal(position, (1, 2, 3))
 
@@ -624,13 +624,13 @@ def scenes(root: pathlib.Path) -> st.SearchStrategy[Scene]:
         st.builds(sc.LambertMaterial, tint),
         st.builds(sc.MirrorMaterial, tint),
     )
-    thing: dict[str, Any] = {**PLACES, "scale": POSITIVE, "material": materials, "animate": animations()}
+    item: dict[str, Any] = {**PLACES, "scale": POSITIVE, "material": materials, "animate": animations()}
     objects = st.one_of(
-        st.builds(sc.Object, st.just("mesh"), file=st.just(mesh), **thing),
-        st.builds(sc.Object, st.just("sphere"), radius=POSITIVE, **thing),
-        st.builds(sc.Object, st.just("box"), size=st.tuples(POSITIVE, POSITIVE, POSITIVE), **thing),
+        st.builds(sc.Object, st.just("mesh"), file=st.just(mesh), **item),
+        st.builds(sc.Object, st.just("sphere"), radius=POSITIVE, **item),
+        st.builds(sc.Object, st.just("box"), size=st.tuples(POSITIVE, POSITIVE, POSITIVE), **item),
         st.builds(
-            sc.Object, st.just("torus"), major_radius=st.floats(1.0, 1e18), minor_radius=st.floats(1e-18, 0.9), **thing
+            sc.Object, st.just("torus"), major_radius=st.floats(1.0, 1e18), minor_radius=st.floats(1e-18, 0.9), **item
         ),
     )
     proxies = st.one_of(

@@ -31,7 +31,7 @@ def test_the_scenes_are_these() -> None:
 def test_every_file_exists(name: str) -> None:
     scene = load(name)
     assert scene["name"] == name
-    files = [scene["source"]["path"]] + [thing["file"] for thing in scene.get("object", []) if "file" in thing]
+    files = [scene["source"]["path"]] + [item["file"] for item in scene.get("object", []) if "file" in item]
     for file in files:
         assert (SCENES / file).is_file(), file
 
@@ -76,4 +76,4 @@ def test_teapot_normals_are_unit_and_face_outward() -> None:
     assert np.allclose(np.linalg.norm(mesh.vertex_normals, axis=-1), 1.0, atol=NORMAL_TOLERANCE)
     assert (np.einsum("ij,ij->i", mesh.face_normals, mesh.vertex_normals[mesh.faces].mean(1)) > 0.0).all()
     assert mesh.bounds[0, 2] == 0.0  # it stands on z = 0
-    assert mesh.face_normals[mesh.triangles_center[:, 2] > 3.1, 2].min() > 0.0  # the knob's top looks up
+    assert mesh.face_normals[mesh.triangles_center[:, 2] > 3.1, 2].min() > 0.0  # the setting's top looks up

@@ -29,7 +29,7 @@ def add_one_kernel(row_start: wp.int32, values: wp.array[wp.int32], values_out: 
 
 
 class AddOne(Stage):
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "adds one"
     source: ClassVar[str]
     target: ClassVar[str]

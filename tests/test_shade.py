@@ -15,7 +15,7 @@ from tests.test_visibility import GENERAL, World
 from warp_ar.kernels import structs
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
-from warp_ar.kernels.reflect import Room, RoomConfig
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
@@ -24,7 +24,7 @@ SIZE = (48, 64)
 FOCAL = 60.0
 LEVEL_HEIGHT = 16
 EVERYTHING = ShadeConfig(
-    room=RoomConfig(
+    distant=DistantLightConfig(
         trace=GENERAL,
         models=(LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR),
         textures=True,
@@ -35,8 +35,8 @@ EVERYTHING = ShadeConfig(
     lights=(structs.POINT, structs.SPOT, structs.DIRECTIONAL),
     edge_samples=4,
 )
-DARK = dataclasses.replace(EVERYTHING.room, diffuse="none", specular=False)
-"""A room without light."""
+DARK = dataclasses.replace(EVERYTHING.distant, diffuse="none", specular=False)
+"""An environment without light."""
 
 # Nine coefficients and the packed levels each hold a constant to a few roundings.
 FURNACE_TOLERANCE = 1e-5
@@ -48,20 +48,20 @@ TWIN_OUTLIERS = 4e-3
 CONTRACTION_ULPS = {"cpu": 0, "cuda": 4}
 
 
-def make_room(models, device, radiance=1.0):
-    """A constant room for the given material models."""
-    room = Room()
+def make_distant_light(models, device, radiance=1.0):
+    """A constant environment for the given material models."""
+    surroundings = DistantLight()
     sh = np.zeros((9, 3), np.float32)
     sh[0] = math.pi * radiance / 0.28209479
-    room.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
+    surroundings.irradiance_sh = wp.array(sh, dtype=wp.vec3, device=device)
     levels = np.full((lobe_texels(LEVEL_HEIGHT), 3), radiance, np.float32)
-    room.levels = wp.array(levels, dtype=wp.vec3, device=device)
-    room.level_height = LEVEL_HEIGHT
+    surroundings.levels = wp.array(levels, dtype=wp.vec3, device=device)
+    surroundings.level_height = LEVEL_HEIGHT
     if METALLIC_ROUGHNESS in models:
         table = wp.zeros((32, 32), dtype=wp.vec2, device=device)
         integrate_dfg(table)
-        room.dfg = table
-    return room
+        surroundings.dfg = table
+    return surroundings
 
 
 def materials(*fields, device):
@@ -97,7 +97,7 @@ def render(
     device,
     *,
     light_array=None,
-    light_room=1.0,
+    light_environment=1.0,
     rect=(0, 48, 0, 64),
     bands=(None,),
     eye=(0.0, 0.0, 0.0),
@@ -113,16 +113,16 @@ def render(
     depth = wp.zeros(SIZE, dtype=wp.float32, device=device)
     hits = wp.zeros(SIZE, dtype=Hit, device=device)
     virtual = wp.full(SIZE, wp.vec4(9.0), dtype=wp.vec4, device=device)
-    room = make_room(config.room.models, device, light_room)
+    surroundings = make_distant_light(config.distant.models, device, light_environment)
     light_array = lights(device=device) if light_array is None else light_array
-    trace_pixels(config.room.trace, params, rays, scene, found, depth, hits)
+    trace_pixels(config.distant.trace, params, rays, scene, found, depth, hits)
     lists = None
     if listed:
         samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
         count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
         lists = EdgeLists(count, edges, samples)
     for rows in bands:
-        inputs = (params, rays, scene, light_array, room, found, hits)
+        inputs = (params, rays, scene, light_array, surroundings, found, hits)
         shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 
@@ -148,7 +148,8 @@ WHITE = {
 
 
 def test_white_furnace(device):
-    """White things of every material in a white room: radiance equals coverage in every pixel, edges included."""
+    """White objects of every material in a white environment: radiance equals coverage in every pixel, edges
+    included."""
     for kind, fields in WHITE.items():
         image = render(scene_of(ball(device), fields, device=device), EVERYTHING, device)
         assert np.isfinite(image).all()
@@ -162,7 +163,7 @@ def test_lambert_under_a_point_light(device):
     """A white box that faces the light at distance d has radiance I / (pi d^2)."""
     world = World(device).add("box", extent=(5, 5, 0.5), at=(0, 0, 3.5))
     scene = scene_of(world, {"model": LAMBERT, "base_color": 1.0}, device=device)
-    config = dataclasses.replace(EVERYTHING, room=DARK)
+    config = dataclasses.replace(EVERYTHING, distant=DARK)
     light = {"kind": structs.POINT, "position": (1 / FOCAL * 1.5, 1 / FOCAL * 1.5, 1.0), "intensity": (1, 2, 3)}
     image = render(scene, config, device, light_array=lights(light, device=device))
     np.testing.assert_allclose(image[24, 32, :3], np.array([1, 2, 3]) / (math.pi * 4), rtol=1e-4)
@@ -215,7 +216,7 @@ def test_matches_reference(device):
     world.add("box", extent=(3, 3, 0.1), at=(0, 0, 3.2), rotate=(20, 10, 0))
     base = np.array([[0.8, 0.2, 0.1], [0.1, 0.7, 0.2], [0.5, 0.5, 0.5]])
     scene = scene_of(world, *({"model": LAMBERT, "base_color": color} for color in base), device=device)
-    config = dataclasses.replace(EVERYTHING, room=dataclasses.replace(DARK, models=(LAMBERT,), textures=False))
+    config = dataclasses.replace(EVERYTHING, distant=dataclasses.replace(DARK, models=(LAMBERT,), textures=False))
     position, intensity = np.array([-1.2, -0.9, 0.6]), np.array([3.0, 2.0, 1.0])
     light = lights({"kind": structs.POINT, "position": position, "intensity": intensity}, device=device)
     image = render(scene, config, device, light_array=light)
@@ -269,7 +270,7 @@ def test_specialised_equals_general(device, kind):
     spot = {"kind": structs.SPOT, "position": (0, -2, 0), "direction": (0, 0.7, 0.7), "intensity": 4.0}
     spot.update(inner_angle=0.3, outer_angle=0.6)
     light = lights(spot, device=device)
-    forms = RoomConfig(
+    forms = DistantLightConfig(
         trace=TraceConfig((structs.SPHERE,), ()),
         models=(fields["model"],),
         textures=False,
@@ -278,8 +279,8 @@ def test_specialised_equals_general(device, kind):
         probes=False,
     )
     special = ShadeConfig(forms, lights=(structs.SPOT,), edge_samples=4)
-    general = render(scene, EVERYTHING, device, light_array=light, light_room=0.5)
-    image = render(scene, special, device, light_array=light, light_room=0.5)
+    general = render(scene, EVERYTHING, device, light_array=light, light_environment=0.5)
+    image = render(scene, special, device, light_array=light, light_environment=0.5)
     # The compiler may fuse other products in another kernel.
     np.testing.assert_allclose(image, general, atol=1e-6)
 
@@ -314,7 +315,7 @@ def test_lights_in_hard_places(device, kind):
     for at in places:
         for intensity in (0.0, 1e6):
             light = {"kind": structs.POINT, "position": at, "intensity": intensity}
-            image = render(scene, EVERYTHING, device, light_array=lights(light, device=device), light_room=0.0)
+            image = render(scene, EVERYTHING, device, light_array=lights(light, device=device), light_environment=0.0)
             assert np.isfinite(image).all()
             assert (image >= 0).all()
             if at[2] in (2, 9) or intensity == 0.0:
@@ -332,7 +333,7 @@ def test_shadows_do_not_depend_on_scale_or_place(device, scale, far):
     scene = scene_of(world, WHITE["lambert"], device=device)
     light = {"kind": structs.POINT, "position": eye - np.array([0, scale, 0]), "intensity": scale**2}
     config = dataclasses.replace(EVERYTHING, edge_samples=1)
-    image = render(scene, config, device, light_array=lights(light, device=device), light_room=0.0, eye=eye)
+    image = render(scene, config, device, light_array=lights(light, device=device), light_environment=0.0, eye=eye)
     plain = World(device).add("sphere", extent=(0.5,) * 3, at=(0, 0, 2))
     light = {"kind": structs.POINT, "position": (0, -1, 0), "intensity": 1.0}
     expected = render(
@@ -340,7 +341,7 @@ def test_shadows_do_not_depend_on_scale_or_place(device, scale, far):
         config,
         device,
         light_array=lights(light, device=device),
-        light_room=0.0,
+        light_environment=0.0,
     )
     # Relative to the ball, positions are rounded to 6e-8 * far / scale; the outline moves by as much.
     same = image[..., 3] == expected[..., 3]

@@ -271,7 +271,7 @@ def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
     assert (tmp_path / "old.mp4").read_text() == "old"
 
 
-@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full, a disk without room")
+@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full, a disk without environment")
 @pytest.mark.parametrize("name", ["clip.mkv", "clip.mp4"])
 def test_full_disk_is_told(tmp_path: pathlib.Path, name: str) -> None:
     (tmp_path / name).symlink_to("/dev/full")

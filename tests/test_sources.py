@@ -672,9 +672,9 @@ def test_impossible_exposures(tmp_path: pathlib.Path, exposures: tuple[float, ..
 class Exposed(FakeCapture):
     """A camera before a still scene that takes on an exposure ``late`` frames after it was asked."""
 
-    def __init__(self, late: int, *, backend: str = "V4L2", obeys: bool = True, room: float = 1.0) -> None:
+    def __init__(self, late: int, *, backend: str = "V4L2", obeys: bool = True, surroundings: float = 1.0) -> None:
         super().__init__(10**6)
-        self.late, self.backend, self.obeys, self.room = late, backend, obeys, room
+        self.late, self.backend, self.obeys, self.surroundings = late, backend, obeys, surroundings
         self.asked = [8e-3] * (late + 1)
         self.scene = np.linspace(0.02, 1.3, 64 * 48).reshape(48, 64, 1) * np.ones(3)
 
@@ -693,7 +693,7 @@ class Exposed(FakeCapture):
         self.given += 1
         self.asked.append(self.asked[-1])
         now = self.asked.pop(0)
-        linear = np.clip(self.room * self.scene * now / 8e-3, 0, 1)
+        linear = np.clip(self.surroundings * self.scene * now / 8e-3, 0, 1)
         return True, np.rint(255 * np.clip(1.055 * linear ** (1 / 2.4) - 0.055, 0, 1)).astype(np.uint8)
 
 
@@ -723,7 +723,7 @@ def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> 
         frames = iter(source)
         while next(frames).exposure_time != 2e-3:
             pass
-        capture.room = 0.24
+        capture.surroundings = 0.24
         seen = [next(frames).exposure_time for _ in range(40)]
     assert {8e-3, 2e-3} <= set(seen)
 

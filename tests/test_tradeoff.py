@@ -1,4 +1,4 @@
-"""The price of every rung: what is measured, what is told apart, and what the page shows."""
+"""The cost of every method: what is measured, what is told apart, and what the page shows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar import tradeoff
 from warp_ar.accuracy import tradeoff_page
-from warp_ar.accuracy.cost_table import KNOBS, read_errors
+from warp_ar.accuracy.cost_table import SETTINGS, read_errors
 from warp_ar.accuracy.metrics import ArrayError
 from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
 from warp_ar.input.sources import Frame
@@ -29,8 +29,8 @@ pytest.importorskip("flip_evaluator")
 MAP = 3e-3
 
 
-def knob(name):
-    return next(knob for knob in KNOBS if knob.name == name)
+def setting(name):
+    return next(setting for setting in SETTINGS if setting.name == name)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +49,9 @@ def case(frames: Frames) -> tradeoff.Case:
 # ------------------------------------------------------------------------------------------------------- measuring
 
 
-def test_the_last_rung_is_its_own_reference(case, device):
-    rows, pictures = tradeoff.sweep(case, knob("diffuse"), device, PRESETS["low"])
-    assert [row.rung for row in rows] == list(knob("diffuse").rungs)
+def test_the_last_method_is_its_own_reference(case, device):
+    rows, pictures = tradeoff.sweep(case, setting("diffuse"), device, PRESETS["low"])
+    assert [row.method for row in rows] == list(setting("diffuse").methods)
     assert rows[-1].stage_error == ArrayError(0.0, 0.0, 0.0)
     assert rows[-1].flip == 0.0
     assert rows[-1].error == 0.0
@@ -62,25 +62,25 @@ def test_the_last_rung_is_its_own_reference(case, device):
 
 def test_sparse_runs_keep_the_light(case, device):
     """Frames before the one that counts may run at another quality without a trace."""
-    other = PRESETS["low"].with_rungs(diffuse="sh4")
-    full = tradeoff.run(case, PRESETS["low"], device, knob("recover"))
-    sparse = tradeoff.run(case, PRESETS["low"], device, knob("recover"), between=other)
+    other = PRESETS["low"].with_methods(diffuse="sh4")
+    full = tradeoff.run(case, PRESETS["low"], device, setting("recover"))
+    sparse = tradeoff.run(case, PRESETS["low"], device, setting("recover"), between=other)
     np.testing.assert_array_equal(sparse.output, full.output)
     assert np.abs(sparse.images[3].astype(int) - full.images[3]).max() <= 1
 
 
-def test_a_rung_that_leaves_a_stage_out_costs_nothing_of_it(case, device):
-    cheap = dataclasses.replace(knob("room_shadow"), rungs=("none", "coarse"))
-    rows, _ = tradeoff.sweep(case, cheap, device, PRESETS["low"].with_rungs(room_shadow="none"))
-    costs = {row.rung: row.milliseconds for row in rows}
+def test_a_method_that_leaves_a_stage_out_costs_nothing_of_it(case, device):
+    cheap = dataclasses.replace(setting("environment_shadow"), methods=("none", "coarse"))
+    rows, _ = tradeoff.sweep(case, cheap, device, PRESETS["low"].with_methods(environment_shadow="none"))
+    costs = {row.method: row.milliseconds for row in rows}
     assert costs["none"] == 0.0
     assert costs["coarse"] > 0.0
 
 
 def test_what_the_ball_shows_is_compared_with_many_rays(case, device):
-    """Every rung leaves less of it than the one before; left out, all of it."""
-    rows, _ = tradeoff.sweep(case, knob("mirror_ball"), device, PRESETS["low"])
-    assert [row.rung for row in rows] == ["none", "single", "smooth", "brute_force"]
+    """Every method leaves less of it than the one before; left out, all of it."""
+    rows, _ = tradeoff.sweep(case, setting("mirror_ball"), device, PRESETS["low"])
+    assert [row.method for row in rows] == ["none", "single", "smooth", "brute_force"]
     left = [row.stage_error.relative_rmse for row in rows]
     assert left[0] == pytest.approx(1.0)
     assert left[0] > left[1] > left[2] > left[3] == 0.0
@@ -91,15 +91,15 @@ def test_what_the_ball_shows_is_compared_with_many_rays(case, device):
 
 def test_truth_is_what_pictures_are_compared_with(case, device):
     truth = dataclasses.replace(case, truth={3: np.full_like(case.frames[3].image, 250)})
-    rows, _ = tradeoff.sweep(truth, knob("expose"), device, PRESETS["low"])
+    rows, _ = tradeoff.sweep(truth, setting("expose"), device, PRESETS["low"])
     assert {row.against for row in rows} == {"truth"}
     assert all(row.flip > 0.1 for row in rows)
     assert min(row.error for row in rows) == 0.0
 
 
 def test_dominated_means_in_every_respect():
-    def row(rung, ms, flip, rmse):
-        return tradeoff.Row("c", "k", rung, ms, ms, ArrayError(rmse, 0.0, 0.0), flip, "truth", flip, flip)
+    def row(method, ms, flip, rmse):
+        return tradeoff.Row("c", "k", method, ms, ms, ArrayError(rmse, 0.0, 0.0), flip, "truth", flip, flip)
 
     rows = [row("a", 1.0, 0.3, 0.3), row("b", 2.0, 0.4, 0.4), row("c", 3.0, 0.3, 0.1), row("d", 4.0, 0.1, 0.1)]
     assert [tradeoff._is_dominated(one, rows) for one in rows] == [False, True, False, False]
@@ -133,7 +133,7 @@ def test_irradiance_of_both_forms_agrees():
 
 @pytest.fixture
 def report(case) -> tradeoff.CaseReport:
-    """A report of two rungs, made up; names that HTML must escape."""
+    """A report of two methods, made up; names that HTML must escape."""
     rng = np.random.default_rng(0)
     index = case.shown[-1]
     camera = case.frames[index].image
@@ -141,8 +141,8 @@ def report(case) -> tradeoff.CaseReport:
         np.clip(camera.astype(int) + rng.integers(0, add, camera.shape), 0, 255).astype(np.uint8) for add in (60, 5)
     ]
     rows = tuple(
-        tradeoff.Row(case.name, "diffuse", rung, ms, ms + 3.0, error, flip, "last rung", flip, flip, False)
-        for rung, ms, error, flip in (("top_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
+        tradeoff.Row(case.name, "diffuse", method, ms, ms + 3.0, error, flip, "last method", flip, flip, False)
+        for method, ms, error, flip in (("top_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
     )
     wholes = tuple(
         tradeoff.Whole(label, ms, flip, {"diffuse": "sh2"}, {index: image})
@@ -218,10 +218,10 @@ def test_crops_lie_around_what_is_to_be_seen():
     assert tradeoff_page.bounding_box(np.zeros((48, 64), bool), (48, 64)) == (slice(0, 48), slice(0, 64))
 
 
-def test_records_and_tables_hold_every_rung(report):
+def test_records_and_tables_hold_every_method(report):
     device = tradeoff.wp.get_device("cpu")
     lines = [json.loads(json.dumps(record)) for record in tradeoff.records(report, device)]
-    assert [line["kind"] for line in lines] == ["rung", "rung", "whole", "whole"]
+    assert [line["kind"] for line in lines] == ["method", "method", "whole", "whole"]
     assert lines[0]["relative_rmse"] == 0.3
     console = Console(width=120, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
@@ -231,7 +231,7 @@ def test_records_and_tables_hold_every_rung(report):
 
 
 def test_price_list_is_what_ladder_reads(report):
-    made = tradeoff.make_price_list([report, report], tradeoff.wp.get_device("cpu"))
+    made = tradeoff.make_cost_table([report, report], tradeoff.wp.get_device("cpu"))
     errors = read_errors(json.loads(json.dumps(made)))
     assert errors["diffuse"]["top_mip"] == pytest.approx(0.1)
     assert errors["diffuse"]["sh2"] == 0.0
@@ -281,7 +281,7 @@ def test_scaling_codes_is_scaling_radiance(scale):
 
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
-    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_rungs(diffuse="sh4")}
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(diffuse="sh4")}
     times, images = tradeoff.run_in_turn(case, qualities, device, time.perf_counter)
     for label, quality in qualities.items():
         alone = tradeoff.run(case, quality, device)
@@ -300,10 +300,10 @@ def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "tradeoff.html",
         "tradeoff.jsonl",
-        "price_list.json",
+        "cost_table.json",
     }
     lines = (tmp_path / "out" / "tradeoff.jsonl").read_text().splitlines()
-    assert [json.loads(line)["rung"] for line in lines[:4]] == list(knob("expose").rungs)
+    assert [json.loads(line)["method"] for line in lines[:4]] == list(setting("expose").methods)
     assert "expose" in capsys.readouterr().out
 
 

@@ -26,7 +26,7 @@ from tests.test_budget import even_costs
 from tests.test_pipeline import make_scene
 from warp_ar import live
 from warp_ar.accuracy.budget import AIM
-from warp_ar.accuracy.cost_table import KNOBS
+from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError, WarpArError
@@ -82,14 +82,14 @@ def page_scene(**changes: Any) -> Scene:
 GOOD = [
     {"type": "ack", "id": 3},
     {"type": "ping", "sent": 12.5},
-    {"type": "set", "thing": "light", "index": 0, "key": "at", "value": [0.1, 0.2, 0.3]},
-    {"type": "set", "thing": "exposure", "index": 0, "key": "scale", "value": "auto"},
-    {"type": "add", "thing": "object", "kind": "sphere"},
-    {"type": "remove", "thing": "light", "index": 0},
-    {"type": "show", "thing": "object", "index": 1, "on": False},
+    {"type": "set", "part": "light", "index": 0, "key": "at", "value": [0.1, 0.2, 0.3]},
+    {"type": "set", "part": "exposure", "index": 0, "key": "scale", "value": "auto"},
+    {"type": "add", "part": "object", "kind": "sphere"},
+    {"type": "remove", "part": "light", "index": 0},
+    {"type": "show", "part": "object", "index": 1, "on": False},
     {"type": "effect", "name": "relief", "on": False},
     {"type": "quality", "name": "low"},
-    {"type": "rung", "stage": "specular", "rung": "box_mip"},
+    {"type": "method", "stage": "specular", "method": "box_mip"},
     {"type": "budget", "ms": 20.0},
     {"type": "budget", "ms": None},
     {"type": "compare", "other": "camera"},
@@ -127,13 +127,13 @@ def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
         ('{"type": "ping", "sent": NaN}', "NaN is no number"),
         ('{"type": "ping", "sent": 1e999}', "ping: sent"),
         ('{"type": "budget", "ms": 0}', "budget: ms"),
-        ('{"type": "set", "thing": "camera", "index": 0, "key": "fx", "value": 1}', "set: thing"),
-        ('{"type": "set", "thing": "light", "index": 64, "key": "at", "value": [0, 0, 0]}', "set: index"),
-        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
-        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": [1, 2, "x"]}', "set: value"),
-        ('{"type": "set", "thing": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
-        ('{"type": "add", "thing": "object", "kind": "mesh"}', "add: kind"),
-        ('{"type": "add", "thing": "object", "kind": "spot"}', "add: kind"),
+        ('{"type": "set", "part": "camera", "index": 0, "key": "fx", "value": 1}', "set: part"),
+        ('{"type": "set", "part": "light", "index": 64, "key": "at", "value": [0, 0, 0]}', "set: index"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, 3, 4]}', "set: value"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": [1, 2, "x"]}', "set: value"),
+        ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
+        ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),
+        ('{"type": "add", "part": "object", "kind": "spot"}', "add: kind"),
         ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),
         ('{"type": "quality", "name": "' + "x" * 65 + '"}', "quality: name"),
         ('{"type": "quality", "name": "' + "x" * 5000 + '"}', "4096 at most"),
@@ -222,7 +222,7 @@ def test_edits_are_checked_as_the_file_is() -> None:
     assert edits.set_value(scene, "object", 0, "model", "mirror").objects[0].material == MirrorMaterial((0.5, 0.4, 0.3))
     assert isinstance(edits.set_value(scene, "object", 0, "model", "phong").objects[0].material, PhongMaterial)
     assert edits.set_value(scene, "exposure", 0, "scale", "auto").exposure == Exposure("auto")
-    for thing, index, key, value in [
+    for part, index, key, value in [
         ("light", 0, "intensity", -1.0),
         ("light", 0, "at", "here"),
         ("light", 0, "color", 3.0),
@@ -234,11 +234,11 @@ def test_edits_are_checked_as_the_file_is() -> None:
         ("marker", 0, "dictionary", "DICT_9X9"),
     ]:
         with pytest.raises(SceneError):
-            edits.set_value(scene, thing, index, key, value)
+            edits.set_value(scene, part, index, key, value)
 
 
 @pytest.mark.parametrize(
-    ("thing", "key", "value"),
+    ("part", "key", "value"),
     [
         ("object", "file", "secret.ply"),
         ("object", "material", "x"),
@@ -251,9 +251,9 @@ def test_edits_are_checked_as_the_file_is() -> None:
         ("proxy", "file", "secret.ply"),
     ],
 )
-def test_no_edit_names_a_file_or_what_is_no_key(thing: str, key: str, value: Any) -> None:
+def test_no_edit_names_a_file_or_what_is_no_key(part: str, key: str, value: Any) -> None:
     with pytest.raises(UsageError):
-        edits.set_value(page_scene(), thing, 0, key, value)
+        edits.set_value(page_scene(), part, 0, key, value)
     with pytest.raises(UsageError):
         edits.set_value(page_scene(), "light", 5, "at", (0.0, 0.0, 0.0))
 
@@ -261,10 +261,10 @@ def test_no_edit_names_a_file_or_what_is_no_key(thing: str, key: str, value: Any
 def test_what_is_hidden_stays_hidden_when_something_before_it_goes() -> None:
     scene = page_scene(lights=(Light("point", 1.0), Light("point", 2.0), Light("point", 3.0)))
     wanted = Wanted(scene, PRESETS["low"], hidden=frozenset({("light", 0), ("light", 2), ("object", 1)}))
-    after = wanted.without_thing("light", 0)
+    after = wanted.without_part("light", 0)
     assert after.hidden == {("light", 1), ("object", 1)}
     assert [light.intensity for light in after.shown_scene().lights] == [2.0]
-    assert [thing.shape for thing in after.shown_scene().objects] == ["sphere"]
+    assert [part.shape for part in after.shown_scene().objects] == ["sphere"]
 
 
 def test_effects_are_left_out_of_what_is_shown() -> None:
@@ -274,13 +274,13 @@ def test_effects_are_left_out_of_what_is_shown() -> None:
         assert getattr(shown, empty) == ()
         assert getattr(wanted.with_effect(name, False).with_effect(name, True).shown_scene(), empty) != ()
     assert wanted.with_effect("exposure", False).shown_scene().exposure == Exposure()
-    assert wanted.with_effect("relief", False).shown_quality().rung("relight") == "flat"
-    assert wanted.with_effect("room_shadow", False).shown_quality().rung("room_shadow") == "none"
-    assert wanted.with_rung("specular", "box_mip").shown_quality().rung("specular") == "box_mip"
-    assert wanted.with_rung("specular", "box_mip").with_rung("specular", "").shown_quality() == PRESETS["low"]
-    for stage, rung in [("specular", "best"), ("nonsense", "box_mip")]:
+    assert wanted.with_effect("relief", False).shown_quality().method("relight") == "flat"
+    assert wanted.with_effect("environment_shadow", False).shown_quality().method("environment_shadow") == "none"
+    assert wanted.with_method("specular", "box_mip").shown_quality().method("specular") == "box_mip"
+    assert wanted.with_method("specular", "box_mip").with_method("specular", "").shown_quality() == PRESETS["low"]
+    for stage, method in [("specular", "best"), ("nonsense", "box_mip")]:
         with pytest.raises(UsageError):
-            wanted.with_rung(stage, rung)
+            wanted.with_method(stage, method)
 
 
 @pytest.mark.parametrize("name", sorted(bundled_scenes()))
@@ -291,19 +291,21 @@ def test_every_bundled_scene_is_told_to_the_page_without_a_path(name: str) -> No
 
 @pytest.mark.parametrize("kind", [kind for kinds in protocol.KINDS.values() for kind in kinds])
 def test_what_can_be_added_can_be_read_back(kind: str) -> None:
-    thing = "object" if kind in protocol.KINDS["object"] else "light"
-    scene = edits.add_thing(page_scene(), thing, kind)
+    part = "object" if kind in protocol.KINDS["object"] else "light"
+    scene = edits.add_part(page_scene(), part, kind)
     assert edits.checked(scene) == scene
     for _ in range(edits.MOST_THINGS):
         with contextlib.suppress(UsageError):
-            scene = edits.add_thing(scene, thing, kind)
-    assert len(scene.objects if thing == "object" else scene.lights) == edits.MOST_THINGS
+            scene = edits.add_part(scene, part, kind)
+    assert len(scene.objects if part == "object" else scene.lights) == edits.MOST_THINGS
 
 
 # ----------------------------------------------------------------------------------------------------------------- dial
 
-# What the price list may hold; the test's own, for that in the package may be made anew.
-ERRORS = {knob.name: {rung: 0.1 / (1 + place) for place, rung in enumerate(knob.rungs)} for knob in KNOBS}
+# What the cost table may hold; the test's own, for that in the package may be made anew.
+ERRORS = {
+    setting.name: {method: 0.1 / (1 + place) for place, method in enumerate(setting.methods)} for setting in SETTINGS
+}
 
 
 @pytest.fixture
@@ -312,28 +314,28 @@ def known_errors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def measured_steps(scene: Scene, image: Any, pose: Any, device: str, size: Any, knobs: Any) -> Any:
-    """What ``measure_steps`` gives on a device that has time for one rung more than the base's, and for no other."""
+def measured_steps(scene: Scene, image: Any, pose: Any, device: str, size: Any, settings: Any) -> Any:
+    """What ``measure_steps`` gives on a device that has time for one method more than the base's, and for no other."""
     yield 0.5
-    even = even_costs(knobs, base=20.0)
+    even = even_costs(settings, base=20.0)
     return Costs(
-        20.0, {name: {r: ms if ms <= 1.0 else 1e6 for r, ms in own.items()} for name, own in even.rungs.items()}
+        20.0, {name: {r: ms if ms <= 1.0 else 1e6 for r, ms in own.items()} for name, own in even.methods.items()}
     )
 
 
 def test_what_the_dial_offers_is_what_it_chooses(known_errors: None, tmp_path: Path) -> None:
     scene = page_scene()
     told: list[dict[str, Any]] = []
-    knob = Dial(told.append, tmp_path)
+    setting = Dial(told.append, tmp_path)
     with Pipeline(scene, device="cpu", quality="low") as pipeline, ThreadPoolExecutor(1) as helper:
         frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        knob.look(pipeline, frame, None, helper)
+        setting.look(pipeline, frame, None, helper)
         assert told[-1] == {"type": "dial", "measuring": None, "known": False}, "nothing is measured while it is off"
-        knob.switch(50.0)
-        assert knob.choose(10.0, 0.0) is None, "nothing is known yet"
+        setting.switch(50.0)
+        assert setting.choose(10.0, 0.0) is None, "nothing is known yet"
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(dial, "measure_steps", measured_steps)
-            knob.look(pipeline, frame, None, helper)
+            setting.look(pipeline, frame, None, helper)
             deadline = time.monotonic() + PATIENCE
             while not told[-1]["known"]:
                 assert time.monotonic() < deadline
@@ -347,18 +349,18 @@ def test_what_the_dial_offers_is_what_it_chooses(known_errors: None, tmp_path: P
         assert "brute_force" in record["ladders"]["diffuse"]
         assert "reference" not in record["presets"], "brute force is not measured"
         for budget in (0.1, 18.0, 25.0, 500.0):
-            knob.switch(budget)
-            quality = knob.choose(None, 0.0)
+            setting.switch(budget)
+            quality = setting.choose(None, 0.0)
             assert quality is not None
             assert quality.name == "auto"
             fitting = [c for c in record["choices"] if record["base"] + c["ms"] <= AIM * budget]
             best = fitting[-1] if fitting else record["choices"][0]
-            for (name, ladder), place in zip(record["ladders"].items(), best["rungs"], strict=True):
-                assert knob.state()["settings"][name] == ladder[place]
-            assert knob.state()["expected_error"] == pytest.approx(best["error"], abs=1e-4)
-        knob.switch(None)
-        assert knob.choose(1.0, 0.0) is None
-        assert knob.state() is None
+            for (name, ladder), place in zip(record["ladders"].items(), best["methods"], strict=True):
+                assert setting.state()["settings"][name] == ladder[place]
+            assert setting.state()["expected_error"] == pytest.approx(best["error"], abs=1e-4)
+        setting.switch(None)
+        assert setting.choose(1.0, 0.0) is None
+        assert setting.state() is None
         # Another dial finds the costs where they were kept.
         again = Dial(told.append, tmp_path)
         again.look(pipeline, frame, None, helper)
@@ -375,7 +377,7 @@ def test_the_dial_turns_the_picture(known_errors: None, monkeypatch: pytest.Monk
         assert running.host.wanted().quality.name == "auto"
         running.edit(type="budget", ms=1.0)
         running.until(lambda: running.host.state_message()["auto"]["expected_error"] > best["expected_error"])
-        running.until(lambda: dict(running.host.wanted().quality.rungs)["diffuse"] == "top_mip")
+        running.until(lambda: dict(running.host.wanted().quality.methods)["diffuse"] == "top_mip")
         # Undoing edits is not undoing the dial; choosing a preset is.
         running.edit(type="reset")
         assert running.host.wanted().quality.name == "auto"
@@ -551,7 +553,7 @@ def test_numbers_are_edited_in_place_and_structure_is_swapped_in() -> None:
     with Running(page_scene()) as running:
         first = running.next()
         assert first.plan == 1
-        running.edit(type="set", thing="object", index=0, key="at", value=[0.0, -0.08, 0.03])
+        running.edit(type="set", part="object", index=0, key="at", value=[0.0, -0.08, 0.03])
         moved = running.next()
         assert moved.plan == 1, "moving an object built a new pipeline"
         running.edit(type="effect", name="objects", on=False)
@@ -569,7 +571,7 @@ def test_pipelines_are_built_while_frames_flow(device: str) -> None:
         running.edit(type="compare", other="paper")
         for index in range(6):
             running.edit(type="effect", name=("objects", "lights", "exposure")[index % 3], on=index > 2)
-            running.edit(type="rung", stage="diffuse", rung=("sh4", "sh2")[index % 2])
+            running.edit(type="method", stage="diffuse", method=("sh4", "sh2")[index % 2])
             running.until(lambda: not running.host.state_message()["building"])
             assert running.next().image.any()
         assert not [message for message in running.messages if message["type"] == "notice"]
@@ -578,10 +580,10 @@ def test_pipelines_are_built_while_frames_flow(device: str) -> None:
 def test_an_edited_scene_gives_the_picture_of_its_file() -> None:
     """Saved and opened anew, the scene gives the same picture, bit for bit, of the same frames."""
     with Running(page_scene()) as running:
-        running.edit(type="set", thing="object", index=0, key="at", value=[0.0, -0.08, 0.03])
-        running.edit(type="set", thing="object", index=0, key="base_color", value=[0.9, 0.1, 0.1])
-        running.edit(type="add", thing="light", kind="spot")
-        running.edit(type="show", thing="object", index=1, on=False)
+        running.edit(type="set", part="object", index=0, key="at", value=[0.0, -0.08, 0.03])
+        running.edit(type="set", part="object", index=0, key="base_color", value=[0.9, 0.1, 0.1])
+        running.edit(type="add", part="light", kind="spot")
+        running.edit(type="show", part="object", index=1, on=False)
         text = running.host.scene_toml(full_paths=True)
         saved = loads_scene(text)
         target = running.host._target()
@@ -600,7 +602,7 @@ def test_a_bad_edit_changes_nothing_and_says_why() -> None:
     with Running(page_scene()) as running:
         before = running.host.wanted()
         with pytest.raises(SceneError, match="intensity"):
-            running.edit(type="set", thing="light", index=0, key="intensity", value=-1)
+            running.edit(type="set", part="light", index=0, key="intensity", value=-1)
         with pytest.raises(UsageError, match="preset"):
             running.edit(type="quality", name="best")
         with pytest.raises(UsageError, match="bundled"):
@@ -616,7 +618,7 @@ def test_a_held_frame_follows_edits() -> None:
         running.next()
         running.edit(type="play", on=False)
         held = running.next(2)
-        running.edit(type="set", thing="object", index=0, key="base_color", value=[0.0, 1.0, 0.0])
+        running.edit(type="set", part="object", index=0, key="base_color", value=[0.0, 1.0, 0.0])
         edited = running.next(2)
         np.testing.assert_array_equal(held.frame, edited.frame)
         assert (held.image != edited.image).any()
@@ -856,7 +858,7 @@ async def test_a_page_is_told_all_and_sees_frames() -> None:
                 assert image.shape == (header["camera"][1], header["camera"][0], 3)
                 assert len(header["pose"]) == 12
             if header["type"] == "plan":
-                assert {"stage", "reason", "rungs"} == set(header["left_out"][0])
+                assert {"stage", "reason", "methods"} == set(header["left_out"][0])
         await page.say(type="ping", sent=5.0)
         header, _ = await page.until("pong")
         assert header["sent"] == 5.0
@@ -1005,7 +1007,7 @@ async def test_an_address_that_comes_too_often_waits_and_keeps_no_other_out() ->
 @run
 async def test_bad_edits_are_answered_and_not_punished() -> None:
     async with served() as site, site.page() as page:
-        await page.say(type="set", thing="light", index=0, key="intensity", value=-1)
+        await page.say(type="set", part="light", index=0, key="intensity", value=-1)
         header, _ = await page.until("notice")
         assert "intensity" in header["text"]
         assert "/" not in header["text"]

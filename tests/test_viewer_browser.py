@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from tests.test_budget import even_costs
-from warp_ar.accuracy.cost_table import relevant_knobs
+from warp_ar.accuracy.cost_table import relevant_settings
 from warp_ar.accuracy.costs import cost_key, write_costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.input.sources import open_source
@@ -42,14 +42,16 @@ THRESHOLD = 128
 UNCHANGED = 6.0
 
 
-# The command, with a price list that does not change when that of the package is made anew.
+# The command, with a cost table that does not change when that of the package is made anew.
 LIVE = """
 import faulthandler
 import sys
 faulthandler.enable()
-from warp_ar.accuracy import cost_table as ladder
-errors = {knob.name: {rung: 0.1 / (1 + i) for i, rung in enumerate(knob.rungs)} for knob in ladder.KNOBS}
-ladder.load_errors = lambda: errors
+from warp_ar.accuracy import cost_table
+errors = {
+    setting.name: {method: 0.1 / (1 + i) for i, method in enumerate(setting.methods)} for setting in cost_table.SETTINGS
+}
+cost_table.load_errors = lambda: errors
 from warp_ar.live import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -107,12 +109,12 @@ def camera_file(clip: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture(scope="module")
 def cache(scene_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Costs of all rungs on a device that takes a millisecond for each rung more, measured beforehand."""
+    """Costs of all methods on a device that takes a millisecond for each method more, measured beforehand."""
     folder = tmp_path_factory.mktemp("cache")
     with Pipeline(load_scene(scene_file), device="cpu") as pipeline:
-        knobs = relevant_knobs(pipeline.scene, pipeline.size)
-        key = cost_key(pipeline.plan, pipeline.device, knobs)
-    write_costs(folder / "warp_ar", key, even_costs(knobs, base=20.0))
+        settings = relevant_settings(pipeline.scene, pipeline.size)
+        key = cost_key(pipeline.plan, pipeline.device, settings)
+    write_costs(folder / "warp_ar", key, even_costs(settings, base=20.0))
     return folder
 
 
@@ -277,7 +279,7 @@ def test_dragging_switching_and_the_dial(open_tab: Callable[..., Tab], artefacts
     page.keyboard.press("PageUp")
     tab.until(f"warpAr.scene.lights[0].at[2] > {low}")
 
-    # Without virtual things the picture is the camera's.
+    # Without virtual parts the picture is the camera's.
     lit = tab.pixels(320, 240, 200)
     for name in ("objects", "lights"):
         page.click(f"#effect-{name}")
@@ -312,14 +314,14 @@ def test_dragging_switching_and_the_dial(open_tab: Callable[..., Tab], artefacts
     # The dial says at once what a time buys and how far off that is; the picture follows.
     set_dial = "v => { const r = document.getElementById('budget'); r.value = v; r.dispatchEvent(new Event('input')); }"
     page.evaluate(set_dial, 900)
-    tab.until("document.querySelectorAll('#buys li').length > 5", "the rungs that it buys")
+    tab.until("document.querySelectorAll('#buys li').length > 5", "the methods that it buys")
     dear = page.inner_text("#buys")
     page.evaluate(set_dial, 0)
-    assert page.inner_text("#buys") != dear, "the rungs do not follow the hand"
+    assert page.inner_text("#buys") != dear, "the methods do not follow the hand"
     assert re.search(r"This buys about [\d.]+ ms a frame, [\d.]+ FLIP off the best", page.inner_text("#budget-note"))
     tab.until("warpAr.scene.quality === 'auto' && warpAr.state.budget === 1", "the dial's own quality")
-    tab.until("warpAr.state.auto.settings.room_shadow === 'none'", "the cheapest rungs")
-    tab.until("document.querySelector('#stages li[data-stage=room_shadow]').classList.contains('out')")
+    tab.until("warpAr.state.auto.settings.environment_shadow === 'none'", "the cheapest methods")
+    tab.until("document.querySelector('#stages li[data-stage=environment_shadow]').classList.contains('out')")
     page.evaluate(set_dial, 600)
     page.wait_for_timeout(1000)
     page.screenshot(path=artefacts / "dial.png")

@@ -1,6 +1,6 @@
 """Consistent light for augmented reality, in NVIDIA Warp kernels.
 
-A mirror ball beside a printed marker captures the room's light; that light shades virtual objects, and virtual lights
+A mirror ball beside a printed marker captures the environment; that light shades virtual objects, and virtual lights
 fall on the real desk. ``Session`` opens a scene and lights its frames; ``Pipeline`` lights frames of one's own; the
 launchers of single steps are in ``warp_ar.kernels``. Importing this package does not initialise Warp.
 """

@@ -242,7 +242,7 @@ def _print_choice(pipeline: AutoPipeline) -> None:
     if not status["changes"]:
         print(f"{AUTO}: too few frames to choose by")
         return
-    chosen = ", ".join(f"{knob} {rung}" for knob, rung in status["settings"].items())
+    chosen = ", ".join(f"{setting} {method}" for setting, method in status["settings"].items())
     print(
         f"{AUTO}: {chosen}; {status['expected_ms']:.1f} of {status['budget_ms']:g} ms, expected error "
         f"{status['expected_error']:.4f} FLIP above the best, changed {len(status['changes']) - 1} times"

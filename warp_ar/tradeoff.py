@@ -1,19 +1,20 @@
-"""``python -m warp_ar.tradeoff [SCENE ...]`` shows what accuracy costs: errors and milliseconds of every rung.
+"""``python -m warp_ar.tradeoff [SCENE ...]`` shows what accuracy costs: errors and milliseconds of every method.
 
-Every knob of a scene (see ``ladder``) is turned through its rungs, all others staying on ``BASE``. Per rung it notes
+Every setting of a scene (see ``methods``) is turned through its methods, all others staying on ``BASE``. Per method it
+notes
 
-- how far what the stage writes is from what the knob's last rung writes: relative RMSE, worst texel, energy drift;
+- how far what the stage writes is from what the setting's last method writes: relative RMSE, worst texel, energy drift;
 - how far the picture is from the truth (a path tracer's: bundled scenes come with one frame of it), and from the
-  picture at the knob's last rung: FLIP, summed over the picture and divided by the pixels that anything virtual
-  changes, so that errors of different knobs are on one scale;
-- the milliseconds per frame of the knob's own stages, and of those that run only for this rung.
+  picture at the setting's last method: FLIP, summed over the picture and divided by the pixels that anything virtual
+  changes, so that errors of different settings are on one scale;
+- the milliseconds per frame of the setting's own stages, and of those that run only for this method.
 
-**A rung's error.** Where the rungs approximate one thing that the last of them gives (``converges``), it is the
+**A method's error.** Where the methods approximate one object that the last of them gives (``converges``), it is the
 distance from the last: nearer to the truth than the exact light would be is luck, for something else is wrong then.
-Where rungs are models of their own, the distance from the truth, less that of the best.
+Where methods are models of their own, the distance from the truth, less that of the best.
 
 Then presets, and the best choices for the paper's time and for the paper's error, are run as a whole, frame by frame in
-turn. Those choices are made from the committed price list, not from the errors of the case that they are scored on, and
+turn. Those choices are made from the committed cost table, not from the errors of the case that they are scored on, and
 a choice in the paper's time must be measured to take no more of it.
 
 ``--processor-time`` runs frames on one thread and counts what it works instead of the time by the clock: other programs
@@ -47,19 +48,19 @@ from rich.table import Table
 
 from warp_ar.accuracy import tradeoff_page
 from warp_ar.accuracy.cost_table import (
-    KNOBS,
+    SETTINGS,
     Choice,
-    Knob,
+    Setting,
     choose,
-    frontier,
+    chosen,
     light_only,
     load_errors,
-    relevant_knobs,
-    setting,
+    pareto_front,
+    relevant_settings,
     turn,
 )
 from warp_ar.accuracy.costs import BASE as COST_BASE
-from warp_ar.accuracy.costs import NOW_AND_THEN, WORK, make_prices, measure_costs, open_profiled, worked_ms
+from warp_ar.accuracy.costs import NOW_AND_THEN, WORK, make_method_costs, measure_costs, open_profiled, worked_ms
 from warp_ar.accuracy.metrics import ArrayError, array_error, changed_region, clipped_region, flip_map, latlong_weights
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
 from warp_ar.engine.graph import make_plan
@@ -77,12 +78,12 @@ Mask = npt.NDArray[np.bool_]
 Clock = Callable[[], float]
 
 BASE = PRESETS["high"]
-"""What the other knobs stay on while one is turned."""
+"""What the other settings stay on while one is turned."""
 WARM_UP = 3
 """Frames that are not timed: modules load, caches fill."""
 DEFAULT_FRAMES = 12
 TIMED = 5
-"""Last frames that are run at a rung, the first of them not timed; those before only bring the light."""
+"""Last frames that are run at a method, the first of them not timed; those before only bring the light."""
 LAMP_RADIUS = 0.02
 """Metres, of ``sized_lamp``: a light bulb."""
 SIZED = ", sized lamp"
@@ -108,8 +109,11 @@ NORMALS = (24, 48)
 VERSIONS = ("both", "object", "light", "dark_50", "dark_25")
 """Kinds of truth that a case may have; ``object`` and ``light`` are swept only where there is no ``both``."""
 
-_FAIR = {"unwrap": {"environment_height": "32"}, "environment_height": {"room_shadow": "none", "recover": "white_card"}}
-"""Other rungs at which a knob is turned: footprints on the ball matter where texels are coarse; what few rays of
+_FAIR = {
+    "unwrap": {"environment_height": "32"},
+    "environment_height": {"environment_shadow": "none", "recover": "white_card"},
+}
+"""Other methods at which a setting is turned: footprints on the ball matter where texels are coarse; what few rays of
 another map happen to meet, and how its energy is shared among lamps, would hide what the map's own size does."""
 _OUTPUT = {
     "unwrap": "probe_radiance",
@@ -117,14 +121,14 @@ _OUTPUT = {
     "diffuse": "irradiance",
     "specular": "specular_levels",
     "relight": "physical_added",
-    "room_shadow": "physical_ratio",
+    "environment_shadow": "shadow_ratio",
     "shade": "virtual",
     "mirror_ball": "mirrored",
     "edge_samples": "virtual",
     "light_shadow": "physical_added",
     "expose": "image",
 }
-"""What a knob's stage writes; knobs that are not here change the size of what is written."""
+"""What a setting's stage writes; settings that are not here change the size of what is written."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,7 +164,7 @@ class Outcome:
     stages: Mapping[str, float]
     """Median milliseconds of every stage, the marker's tracking left out."""
     output: npt.NDArray[Any] | None
-    """What the knob's stage had written at the end."""
+    """What the setting's stage had written at the end."""
 
     @property
     def milliseconds(self) -> float:
@@ -170,25 +174,26 @@ class Outcome:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One rung of one knob in one case."""
+    """One method of one setting in one case."""
 
     case: str
-    knob: str
-    rung: str
+    setting: str
+    method: str
     milliseconds: float
     frame_milliseconds: float
     stage_error: ArrayError | None
-    """Against the last rung; None where sizes differ."""
+    """Against the last method; None where sizes differ."""
     flip: float
     """Mean FLIP of the picture per changed pixel."""
     against: str
-    """``truth`` or ``last rung``."""
+    """``truth`` or ``last method``."""
     apart: float = 0.0
-    """The same against the picture at the last rung."""
+    """The same against the picture at the last method."""
     error: float = 0.0
-    """What counts: ``apart`` where the knob converges or no truth is known, else ``flip`` above the best rung's."""
+    """What counts: ``apart`` where the setting converges or no truth is known, else ``flip`` above the best
+    method's."""
     dominated: bool = False
-    """Another rung costs no more and errs no more."""
+    """Another method costs no more and errs no more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +219,7 @@ class CaseReport:
     """Pictures that others are compared with: the truth, or the best there is."""
     rows: tuple[Row, ...]
     pictures: Mapping[tuple[str, str], Image]
-    """The last picture of every rung."""
+    """The last picture of every method."""
     wholes: tuple[Whole, ...]
     region: npt.NDArray[np.bool_]
     """Pixels of the last picture that anything virtual changes."""
@@ -263,7 +268,7 @@ def load_case(
         first: Number of the first frame.
     """
     if scene.source is None or scene.source.path is None:
-        raise UsageError(f"scene {scene.name!r} has no clip to compare rungs on; expected [source] path")
+        raise UsageError(f"scene {scene.name!r} has no clip to compare methods on; expected [source] path")
     with open_source(scene.source.path, fps=scene.source.fps) as source:
         whole = tuple(itertools.islice(source, first, first + count))
         width, height = source.size
@@ -381,7 +386,7 @@ def run(
     case: Case,
     quality: Quality,
     device: str,
-    knob: Knob | None = None,
+    setting: Setting | None = None,
     *,
     between: Quality | None = None,
     timed: int = TIMED,
@@ -393,7 +398,7 @@ def run(
         case: Frames, and which pictures are wanted.
         quality: What to run at.
         device: Where.
-        knob: What was turned: what its stage wrote is kept.
+        setting: What was turned: what its stage wrote is kept.
         between: Frames that are neither wanted nor timed run at this, which keeps the light; None runs all alike.
         timed: Last frames that run at ``quality`` whatever is wanted; the first that does is not timed.
         clock: Seconds, on CPU.
@@ -428,7 +433,7 @@ def run(
                     skip -= 1
                 else:
                     note(result)
-        output = None if knob is None else _read_output(pipeline, knob)
+        output = None if setting is None else _read_output(pipeline, setting)
         if len(wanted) == 1 and sum(own[0] for own in times.values() if own) < REPEAT_BELOW:
             times.clear()
             pipeline.scheduler.forget()
@@ -464,9 +469,9 @@ def run_in_turn(
     return times, images
 
 
-def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
-    """What the knob's stage has written, in a form that all its rungs share."""
-    name = _OUTPUT.get(knob.name)
+def _read_output(pipeline: Pipeline, setting: Setting) -> npt.NDArray[Any] | None:
+    """What the setting's stage has written, in a form that all its methods share."""
+    name = _OUTPUT.get(setting.name)
     if name is None:
         return None
     arrays = pipeline.arrays
@@ -476,7 +481,7 @@ def _read_output(pipeline: Pipeline, knob: Knob) -> npt.NDArray[Any] | None:
         if "irradiance_sh" in arrays:
             return irradiance_from_sh(arrays["irradiance_sh"].numpy())
         return resample(arrays["irradiance_map"].numpy(), NORMALS)
-    neutral = {"physical_ratio": 1.0, "mirrored": 0.0}
+    neutral = {"shadow_ratio": 1.0, "mirrored": 0.0}
     if name in neutral and name not in arrays:
         width, height = pipeline.size
         return np.full((height, width, 3), neutral[name], np.float32)
@@ -530,7 +535,7 @@ def picture_error(case: Case, reference: Mapping[int, Image], images: Mapping[in
 
 
 def _apart(case: Case, reference: Mapping[int, Image], last: Mapping[int, Image], images: Mapping[int, Image]) -> float:
-    """FLIP between two rungs' pictures, divided as ``picture_error`` divides."""
+    """FLIP between two methods' pictures, divided as ``picture_error`` divides."""
     return statistics.fmean(
         _flip_per_pixel(case, last[index], images[index], region_of(case, index, picture))
         for index, picture in reference.items()
@@ -549,70 +554,70 @@ def region_of(case: Case, index: int, reference: Image) -> Mask:
 
 def sweep(
     case: Case,
-    knob: Knob,
+    setting: Setting,
     device: str,
     base: Quality = BASE,
     *,
-    rungs: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
     clock: Clock = time.perf_counter,
 ) -> tuple[list[Row], dict[str, Image]]:
-    """Every rung of one knob, or those named: its row, and its last picture."""
+    """Every method of one setting, or those named: its row, and its last picture."""
     outcomes: dict[str, Outcome] = {}
-    for rung in rungs or knob.rungs:
-        turned = turn(base, {**_FAIR.get(knob.name, {}), knob.name: rung})
-        timed = 1 if rung == "brute_force" else TIMED
-        outcomes[rung] = run(case, turned, device, knob, between=light_only(turned), timed=timed, clock=clock)
-    if knob.name == NOW_AND_THEN and wp.get_device(device).is_cpu:
+    for method in methods or setting.methods:
+        turned = turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
+        timed = 1 if method == "brute_force" else TIMED
+        outcomes[method] = run(case, turned, device, setting, between=light_only(turned), timed=timed, clock=clock)
+    if setting.name == NOW_AND_THEN and wp.get_device(device).is_cpu:
         count_work(case, outcomes, device, clock)
     last = list(outcomes.values())[-1]
-    common = set.intersection(*(set(outcome.stages) for outcome in outcomes.values())) - set(knob.stages)
+    common = set.intersection(*(set(outcome.stages) for outcome in outcomes.values())) - set(setting.stages)
     reference = case.truth or last.images
     rows = []
-    for rung, outcome in outcomes.items():
+    for method, outcome in outcomes.items():
         own = {name: ms for name, ms in outcome.stages.items() if name not in common}
         rows.append(
             Row(
                 case.name,
-                knob.name,
-                rung,
+                setting.name,
+                method,
                 sum(own.values()),
                 outcome.milliseconds,
                 _stage_error(outcome, last),
                 picture_error(case, reference, outcome.images),
-                "truth" if case.truth else "last rung",
+                "truth" if case.truth else "last method",
                 _apart(case, reference, last.images, outcome.images),
             )
         )
     best = min(row.flip for row in rows)
-    own_scale = knob.converges or not case.truth
+    own_scale = setting.converges or not case.truth
     rows = [dataclasses.replace(row, error=row.apart if own_scale else row.flip - best) for row in rows]
     rows = [dataclasses.replace(row, dominated=_is_dominated(row, rows)) for row in rows]
-    return rows, {rung: outcome.images[case.shown[-1]] for rung, outcome in outcomes.items()}
+    return rows, {method: outcome.images[case.shown[-1]] for method, outcome in outcomes.items()}
 
 
 def count_work(case: Case, outcomes: dict[str, Outcome], device: str, clock: Clock) -> None:
-    """Charge rungs that work on a thread of their own with what the process works more than for the cheapest.
+    """Charge methods that work on a thread of their own with what the process works more than for the cheapest.
 
     Frames only bring the light meanwhile, and follow each other as fast as they can: times between are the clip's.
     """
     work: dict[str, float] = {}
-    for rung, outcome in outcomes.items():
+    for method, outcome in outcomes.items():
         with open_profiled(case.scene, device, light_only(outcome.quality), None, clock) as pipeline:
             for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
                 if index == min(WARM_UP, len(case.frames) - 1):
                     begun = time.process_time()
                 pipeline(frame.image, time_seconds=frame.time, pose=pose)
         # Outside: what was begun beside the frames has ended then.
-        work[rung] = worked_ms((time.process_time() - begun) / max(len(case.frames) - WARM_UP, 1), clock)
-    for rung, outcome in outcomes.items():
-        stages = {**outcome.stages, NOW_AND_THEN: work[rung] - min(work.values())}
-        outcomes[rung] = dataclasses.replace(outcome, stages=stages)
+        work[method] = worked_ms((time.process_time() - begun) / max(len(case.frames) - WARM_UP, 1), clock)
+    for method, outcome in outcomes.items():
+        stages = {**outcome.stages, NOW_AND_THEN: work[method] - min(work.values())}
+        outcomes[method] = dataclasses.replace(outcome, stages=stages)
 
 
 def _is_dominated(row: Row, rows: Sequence[Row]) -> bool:
-    """Whether another rung costs no more and errs no more, in the picture and in what the stage writes.
+    """Whether another method costs no more and errs no more, in the picture and in what the stage writes.
 
-    What measurements cannot tell apart counts as equal; of equals the first in the ladder stays.
+    What measurements cannot tell apart counts as equal; of equals the first in the methods stays.
     """
 
     def better(a: Row, b: Row) -> bool:
@@ -640,18 +645,18 @@ def _stage_error(outcome: Outcome, last: Outcome) -> ArrayError | None:
 def measure_case(
     case: Case,
     device: str,
-    knobs: Sequence[Knob],
+    settings: Sequence[Setting],
     progress: Any = None,
     *,
     quick: bool = False,
     clock: Clock = time.perf_counter,
 ) -> CaseReport:
-    """Sweep every knob, then run presets and the best choices.
+    """Sweep every setting, then run presets and the best choices.
 
     Args:
         case: Frames, and their truth if it is known.
         device: Where.
-        knobs: What to turn.
+        settings: What to turn.
         progress: Told what comes next.
         quick: Leave brute force out.
         clock: Seconds, on CPU.
@@ -663,30 +668,30 @@ def measure_case(
         if progress is not None:
             progress(f"{case.name}: {text}")
 
-    for knob in knobs:
-        advance(knob.name)
-        rungs = [rung for rung in knob.rungs if not (quick and rung == "brute_force")]
-        own, shown = sweep(case, knob, device, rungs=rungs, clock=clock)
+    for setting in settings:
+        advance(setting.name)
+        methods = [method for method in setting.methods if not (quick and method == "brute_force")]
+        own, shown = sweep(case, setting, device, methods=methods, clock=clock)
         rows += own
-        pictures.update({(knob.name, rung): image for rung, image in shown.items()})
+        pictures.update({(setting.name, method): image for method, image in shown.items()})
     if case.name.endswith(SIZED):
-        last = pictures[knobs[-1].name, rows[-1].rung]
+        last = pictures[settings[-1].name, rows[-1].method]
         region = region_of(case, case.shown[-1], last)
         return CaseReport(case, {case.shown[-1]: last}, tuple(rows), pictures, (), region)
     advance("presets")
     qualities = {name: PRESETS[name] for name in RUNS}
     best = None
     if not case.truth:
-        quality = PRESETS["reference"] if not quick else turn(PRESETS["reference"], {"room_shadow": "bounce"})
+        quality = PRESETS["reference"] if not quick else turn(PRESETS["reference"], {"environment_shadow": "bounce"})
         best = run(case, quality, device, between=light_only(quality), timed=1)
     reference = case.truth or (best.images if best is not None else {})
-    everything = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
-    if {knob.name for knob in everything} == {knob.name for knob in knobs} and "paper" in qualities:
+    everything = relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
+    if {setting.name for setting in everything} == {setting.name for setting in settings} and "paper" in qualities:
         advance("equal time, equal error")
         # As --quality auto does: costs measured here, errors from the list.
         frame, size = case.frames[-1], (case.scene.camera.width, case.scene.camera.height)
-        costs = measure_costs(case.scene, frame.image, case.poses[-1], device, size, knobs, clock)
-        front = frontier(make_prices(costs, listed_errors(rows)), costs.scales)
+        costs = measure_costs(case.scene, frame.image, case.poses[-1], device, size, settings, clock)
+        front = pareto_front(make_method_costs(costs, listed_errors(rows)), costs.scales)
         qualities |= {
             "ours in the paper's time": _find_same_time(case, front, costs.base - costs.track, device, clock),
             "ours at the paper's error": _find_same_error(case, front, device, reference),
@@ -697,7 +702,7 @@ def measure_case(
             label,
             statistics.fmean(times[label]),
             picture_error(case, reference, images[label]),
-            {knob.name: setting(quality, knob) for knob in everything},
+            {setting.name: chosen(quality, setting) for setting in everything},
             images[label],
             statistics.median(a / b for a, b in zip(times[label], times["paper"], strict=True))
             if "paper" in times
@@ -710,11 +715,14 @@ def measure_case(
 
 
 def listed_errors(rows: Sequence[Row]) -> Mapping[str, Mapping[str, float]]:
-    """Errors by knob and rung, from the committed price list; while that is empty, as measured here."""
+    """Errors by setting and method, from the committed cost table; while that is empty, as measured here."""
     listed = load_errors()
     if any(any(own.values()) for own in listed.values()):
         return listed
-    return {knob: {row.rung: row.error for row in own} for knob, own in itertools.groupby(rows, lambda row: row.knob)}
+    return {
+        setting: {row.method: row.error for row in own}
+        for setting, own in itertools.groupby(rows, lambda row: row.setting)
+    }
 
 
 def _find_same_time(case: Case, front: Sequence[Choice], base_ms: float, device: str, clock: Clock) -> Quality:
@@ -804,17 +812,18 @@ _FIGURES = (
         ("light",),
         "relight",
         ("flat", "paper", "reflectance"),
-        "The same against the room's lamp: what the frame shows bright now lies in shadow.",
+        "The same against the environment's lamp: what the frame shows bright now lies in shadow.",
     ),
 )
-"""Title, bundled scene, versions of cases that show the same with its truth, knob, its plain, paper's and best rung."""
+"""Title, bundled scene, versions of cases that show the same with its truth, setting, its plain, paper's and best
+method."""
 
 
 def make_figures(
     device: str, count: int, truth: Path | None, times: int = 1, clock: Clock = time.perf_counter
 ) -> Iterator[Figure]:
     """Figures 7, 8 and 9 of the paper: plain, the paper's way, ours, each against the truth where that is known."""
-    for title, bundled, versions, knob, rungs, text in _FIGURES:
+    for title, bundled, versions, setting, methods, text in _FIGURES:
         cases = [(f"{title}: {bundled.replace('_', ' ')}", open_scene(bundled, count, times))]
         for folder in truth_folders(truth) if truth is not None else ():
             version = next((name for name in versions if (folder / f"scene_{name}.toml").is_file()), None)
@@ -826,53 +835,55 @@ def make_figures(
             index = case.shown[-1]
             camera = case.frames[index].image
             outcomes = []
-            for rung in rungs:
-                turned = turn(BASE, {knob: rung})
+            for method in methods:
+                turned = turn(BASE, {setting: method})
                 outcomes.append(run(case, turned, device, between=light_only(turned), timed=1, clock=clock))
             images = [outcome.images[index] for outcome in outcomes]
             reference = case.truth.get(index)
-            labels = (f"plain ({rungs[0]})", f"the paper ({rungs[1]})", f"ours ({rungs[2]})")
+            labels = (f"plain ({methods[0]})", f"the paper ({methods[1]})", f"ours ({methods[2]})")
             columns = (("camera", camera), *zip(labels, images, strict=True))
             if reference is not None:
                 columns = (*columns, ("truth", reference))
-            region = clipped_region(camera) if knob == "expose" else region_of(case, index, images[-1])
+            region = clipped_region(camera) if setting == "expose" else region_of(case, index, images[-1])
             yield Figure(name, text if number == 0 else "", columns, reference, region)
 
 
 # ------------------------------------------------------------------------------------------------------------ reporting
 
 
-def make_price_list(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
-    """Errors of every rung, and the rungs that another beats in every case.
+def make_cost_table(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
+    """Errors of every method, and the methods that another beats in every case.
 
-    ``errors`` is FLIP per changed pixel as a rung's error counts (see above), mean over the cases in which the knob
-    matters. ``stage_errors`` is the relative RMSE of what the stage writes against its last rung, mean likewise.
-    Both depend on the device only by rounding; costs do not, so they are not kept here.
+    ``errors`` is FLIP per changed pixel as a method's error counts (see above), mean over the cases in which the
+    setting matters. ``stage_errors`` is the relative RMSE of what the stage writes against its last method, mean
+    likewise. Both depend on the device only by rounding; costs do not, so they are not kept here.
     """
     errors: dict[str, dict[str, float]] = {}
     stage_errors: dict[str, dict[str, float]] = {}
     dominated: dict[str, list[str]] = {}
-    for knob in KNOBS:
-        rows = [row for report in reports for row in report.rows if row.knob == knob.name]
+    for setting in SETTINGS:
+        rows = [row for report in reports for row in report.rows if row.setting == setting.name]
         if not rows:
             continue
-        measured = {row.rung for row in rows}
-        by_rung = {rung: [row for row in rows if row.rung == rung] for rung in knob.rungs if rung in measured}
-        means = {rung: statistics.fmean(row.error for row in own) for rung, own in by_rung.items()}
-        best = min(means.values())
-        errors[knob.name] = {rung: round(mean - best, 5) for rung, mean in means.items()}
-        arrays = {
-            rung: [row.stage_error.relative_rmse for row in own if row.stage_error is not None]
-            for rung, own in by_rung.items()
+        measured = {row.method for row in rows}
+        by_method = {
+            method: [row for row in rows if row.method == method] for method in setting.methods if method in measured
         }
-        stage_errors[knob.name] = {rung: round(statistics.fmean(own), 5) for rung, own in arrays.items() if own}
-        kept = {row.rung for row in rows if not row.dominated}
-        dominated[knob.name] = [rung for rung in by_rung if rung not in kept]
+        means = {method: statistics.fmean(row.error for row in own) for method, own in by_method.items()}
+        best = min(means.values())
+        errors[setting.name] = {method: round(mean - best, 5) for method, mean in means.items()}
+        arrays = {
+            method: [row.stage_error.relative_rmse for row in own if row.stage_error is not None]
+            for method, own in by_method.items()
+        }
+        stage_errors[setting.name] = {method: round(statistics.fmean(own), 5) for method, own in arrays.items() if own}
+        kept = {row.method for row in rows if not row.dominated}
+        dominated[setting.name] = [method for method in by_method if method not in kept]
     return {
         "made": _made(reports, device) | {"base": BASE.name},
         "errors": errors,
         "stage_errors": stage_errors,
-        "dominated": {knob: rungs for knob, rungs in dominated.items() if rungs},
+        "dominated": {setting: methods for setting, methods in dominated.items() if methods},
     }
 
 
@@ -894,7 +905,7 @@ def _made(reports: Sequence[CaseReport], device: Any) -> dict[str, Any]:
         "by": f"python -m warp_ar.tradeoff {' '.join(report.case.name for report in reports)}",
         "device": device_name(device),
         "warp": wp.__version__,
-        "against": "truth" if all(report.case.truth for report in reports) else "the last rung where no truth is",
+        "against": "truth" if all(report.case.truth for report in reports) else "the last method where no truth is",
     }
 
 
@@ -915,14 +926,14 @@ def device_name(device: Any) -> str:
 
 def print_report(report: CaseReport, console: Console) -> None:
     """The tables of one case."""
-    against = "the truth" if report.case.truth else "the last rung"
-    table = Table(title=f"{report.case.name}: every rung, FLIP against {against}")
-    for column in ("knob", "rung"):
+    against = "the truth" if report.case.truth else "the last method"
+    table = Table(title=f"{report.case.name}: every method, FLIP against {against}")
+    for column in ("setting", "method"):
         table.add_column(column)
     for column in ("ms", "rel. RMSE", "worst", "drift", "FLIP", "error"):
         table.add_column(column, justify="right")
     table.add_column("")
-    for _, group in itertools.groupby(report.rows, lambda row: row.knob):
+    for _, group in itertools.groupby(report.rows, lambda row: row.setting):
         for position, row in enumerate(group):
             error = row.stage_error
             numbers = (
@@ -931,8 +942,8 @@ def print_report(report: CaseReport, console: Console) -> None:
                 else (f"{error.relative_rmse:.2%}", f"{error.worst:.2f}", f"{error.energy_drift:+.2%}")
             )
             table.add_row(
-                row.knob if position == 0 else "",
-                row.rung,
+                row.setting if position == 0 else "",
+                row.method,
                 f"{row.milliseconds:.3f}",
                 *numbers,
                 f"{row.flip:.4f}",
@@ -953,12 +964,12 @@ def print_report(report: CaseReport, console: Console) -> None:
 
 
 def records(report: CaseReport, device: Any) -> Iterator[dict[str, Any]]:
-    """One plain record per rung and per whole, ready for JSON lines."""
+    """One plain record per method and per whole, ready for JSON lines."""
     common = {"device": device_name(device), "warp": wp.__version__}
     for row in report.rows:
         error = {} if row.stage_error is None else dataclasses.asdict(row.stage_error)
         plain = {key: value for key, value in dataclasses.asdict(row).items() if key != "stage_error"}
-        yield {"kind": "rung", **plain, **error, **common}
+        yield {"kind": "method", **plain, **error, **common}
     for whole in report.wholes:
         yield {
             "kind": "whole",
@@ -975,7 +986,7 @@ def records(report: CaseReport, device: Any) -> Iterator[dict[str, Any]]:
 def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
-        prog="python -m warp_ar.tradeoff", description="What accuracy costs: errors and milliseconds of every rung."
+        prog="python -m warp_ar.tradeoff", description="What accuracy costs: errors and milliseconds of every method."
     )
     add = parser.add_argument
     add(
@@ -984,7 +995,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="SCENE",
         help="scene files or bundled scenes' names, or all for every bundled one (default: desk, or --truth)",
     )
-    add("--stage", metavar="NAME", help=f"turn only this: {', '.join(knob.name for knob in KNOBS)}")
+    add("--stage", metavar="NAME", help=f"turn only this: {', '.join(setting.name for setting in SETTINGS)}")
     add("--presets", action="store_true", help="turn nothing: run whole presets only, and write presets.json")
     add("--truth", type=Path, metavar="DIR", help="a case with pictures of the truth, or a folder of cases")
     add(
@@ -1003,20 +1014,20 @@ def make_parser() -> argparse.ArgumentParser:
         "--out",
         type=Path,
         metavar="DIR",
-        help="write tradeoff.jsonl, price_list.json and tradeoff.html here (or presets.json)",
+        help="write tradeoff.jsonl, cost_table.json and tradeoff.html here (or presets.json)",
     )
     add("--extra", type=Path, metavar="FILE", help="JSON lines of python -m bench precision, for the page")
     return parser
 
 
-def chosen_knobs(case: Case, name: str | None) -> tuple[Knob, ...]:
-    """Knobs of a case that the command line asks for."""
-    knobs = relevant_knobs(case.scene, (case.scene.camera.width, case.scene.camera.height))
+def chosen_settings(case: Case, name: str | None) -> tuple[Setting, ...]:
+    """Settings of a case that the command line asks for."""
+    settings = relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
     if name is None:
-        return knobs
-    if name not in {knob.name for knob in KNOBS}:
-        raise UsageError(f"--stage {name}: expected one of {', '.join(knob.name for knob in KNOBS)}")
-    return tuple(knob for knob in knobs if knob.name == name)
+        return settings
+    if name not in {setting.name for setting in SETTINGS}:
+        raise UsageError(f"--stage {name}: expected one of {', '.join(setting.name for setting in SETTINGS)}")
+    return tuple(setting for setting in settings if setting.name == name)
 
 
 def tradeoff(options: argparse.Namespace) -> int:
@@ -1038,28 +1049,28 @@ def tradeoff(options: argparse.Namespace) -> int:
     reports = []
     with Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), console=console) as progress:
         for case in open_cases(options):
-            knobs = () if options.presets else chosen_knobs(case, options.stage)
+            settings = () if options.presets else chosen_settings(case, options.stage)
             if case.name.endswith(SIZED):
-                knobs = tuple(knob for knob in knobs if knob.name == "light_shadow")
+                settings = tuple(setting for setting in settings if setting.name == "light_shadow")
                 if options.presets:
                     continue
-            if not knobs and not options.presets:
+            if not settings and not options.presets:
                 console.print(f"{case.name}: nothing to turn", highlight=False)
                 continue
-            task = progress.add_task(case.name, total=len(knobs) + 2)
+            task = progress.add_task(case.name, total=len(settings) + 2)
 
             def advance(text: str, task: Any = task) -> None:
                 progress.update(task, advance=1, description=text)
 
-            reports.append(measure_case(case, str(device), knobs, advance, quick=options.quick, clock=clock))
+            reports.append(measure_case(case, str(device), settings, advance, quick=options.quick, clock=clock))
             progress.remove_task(task)
             print_report(reports[-1], console)
     if not reports:
         raise UsageError("nothing to turn in any scene that was named")
-    price_list = make_price_list(reports, device)
-    for knob, rungs in price_list["dominated"].items():
-        if rungs:
-            console.print(f"dominated in every case: {knob} {', '.join(rungs)}", highlight=False)
+    cost_table = make_cost_table(reports, device)
+    for setting, methods in cost_table["dominated"].items():
+        if methods:
+            console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         lines = (json.dumps(record) for report in reports for record in records(report, device))
@@ -1069,14 +1080,14 @@ def tradeoff(options: argparse.Namespace) -> int:
             (options.out / "presets.json").write_text(json.dumps(presets, indent=1) + "\n", encoding="utf-8")
             console.print(f"written to {options.out}", highlight=False)
             return EXIT_DONE
-        (options.out / "price_list.json").write_text(json.dumps(price_list, indent=1) + "\n", encoding="utf-8")
+        (options.out / "cost_table.json").write_text(json.dumps(cost_table, indent=1) + "\n", encoding="utf-8")
         figures = (
             list(make_figures(str(device), options.frames, options.truth, options.shrink, clock))
             if options.stage is None
             else []
         )
         extra = [json.loads(line) for line in options.extra.read_text().splitlines()] if options.extra else []
-        made = price_list["made"] | {"clock": "processor time" if options.processor_time else "time"}
+        made = cost_table["made"] | {"clock": "processor time" if options.processor_time else "time"}
         page = tradeoff_page.render(reports, figures, made, extra)
         (options.out / "tradeoff.html").write_text(page, encoding="utf-8")
         console.print(f"written to {options.out}", highlight=False)

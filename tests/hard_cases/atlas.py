@@ -1,9 +1,9 @@
 """The atlas of numerically hard cases: its rows, the stages that each concerns, and the tests that cover them.
 
-A test says what it covers by ``@pytest.mark.atlas(row, stage, rung)``. ``stage`` and ``rung`` may be left out where the
-test is parametrised by them; ``rung="*"`` says that the test exercises what all rungs of the stage share. Tests that
-stand beside the kernel they test are listed in ``ELSEWHERE`` instead. ``tests/hard_cases/test_atlas.py`` sees to it
-that no cell is empty.
+A test says what it covers by ``@pytest.mark.atlas(row, stage, method)``. ``stage`` and ``method`` may be left out where
+the test is parametrised by them; ``method="*"`` says that the test exercises what all methods of the stage share. Tests
+that stand beside the kernel they test are listed in ``ELSEWHERE`` instead. ``tests/hard_cases/test_atlas.py`` sees to
+it that no cell is empty.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any
 
-from tests.hard_cases.rig import RUNGS
+from tests.hard_cases.rig import METHODS
 
 ROWS = {
     1: "straight back through the ball, the blind cone behind it, the silhouette",
@@ -33,22 +33,22 @@ ROWS = {
     15: "marker edge-on, tiny, cut, mirrored, doubled, flipping, lost and found",
     16: "frames of wrong size, type or content; sources that break",
     17: "same answer: bands, replayed graphs, run to run, CPU and CUDA",
-    18: "energy: constant under any mask, kept at every level and rung",
+    18: "energy: constant under any mask, kept at every level and method",
 }
 
 TRACK, SOURCE, PIPELINE = "track", "source", "pipeline"
 """What is no stage of a plan: finding the marker, reading frames, and the frame's way as a whole."""
 
-_RAYS = ("visibility", "shade", "relight", "room_shadow", "object_light", "mirror_ball")
+_RAYS = ("visibility", "shade", "relight", "environment_shadow", "object_light", "mirror_ball")
 CONCERNS: dict[int, tuple[str, ...]] = {
     1: ("unwrap", "recover", "mirror_ball", "declip"),
     2: ("unwrap", "declip"),
     3: ("unwrap", "fill", "recover", "mirror_ball"),
-    4: ("unwrap", "bracket", "fill", "recover", "key_lights", "diffuse", "specular", "room_samples"),
+    4: ("unwrap", "bracket", "fill", "recover", "key_lights", "diffuse", "specular", "environment_samples"),
     5: ("unwrap", "recover", "diffuse", "specular", *_RAYS, "declip"),
-    6: (*(stage for stage in RUNGS if stage != "visibility"), PIPELINE),
+    6: (*(stage for stage in METHODS if stage != "visibility"), PIPELINE),
     7: ("bracket", "accumulate", "recover", "expose", PIPELINE),
-    8: ("specular", "shade", "room_shadow", "object_light", "mirror_ball"),
+    8: ("specular", "shade", "environment_shadow", "object_light", "mirror_ball"),
     9: ("relight", "shade", "mirror_ball"),
     10: ("key_lights", "relight"),
     11: ("summed_area", "expose"),
@@ -57,7 +57,7 @@ CONCERNS: dict[int, tuple[str, ...]] = {
     14: ("unwrap", "recover", *_RAYS, "declip"),
     15: (TRACK, PIPELINE),
     16: (SOURCE, PIPELINE),
-    17: (*RUNGS, PIPELINE),
+    17: (*METHODS, PIPELINE),
     18: (
         "unwrap",
         "bracket",
@@ -66,8 +66,8 @@ CONCERNS: dict[int, tuple[str, ...]] = {
         "recover",
         "diffuse",
         "specular",
-        "room_samples",
-        "room_shadow",
+        "environment_samples",
+        "environment_shadow",
         "object_light",
         "shade",
         "mirror_ball",
@@ -88,17 +88,17 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_probe.py::test_furnace_to_the_bit": ((18, "unwrap", ""),),
     "test_environment.py::test_a_hole_in_a_ramp_is_bridged_without_shift": ((3, "fill", "*"), (4, "fill", "*")),
     "test_environment.py::test_nothing_known_is_no_light": ((3, "fill", "*"),),
-    "test_environment.py::test_rotating_the_room_rotates_the_fill": ((4, "fill", "*"),),
+    "test_environment.py::test_rotating_the_environment_rotates_the_fill": ((4, "fill", "*"),),
     "test_environment.py::test_every_size_gives_finite_lights": ((4, "key_lights", "*"),),
     "test_environment.py::test_not_a_number_never_enters": ((6, "accumulate", "*"), (7, "accumulate", "*")),
     "test_environment.py::test_extreme_values_stay_finite_and_not_negative": ((6, "fill", "*"),),
     "test_environment.py::test_no_drift_over_ten_thousand_frames": ((7, "accumulate", "*"),),
     "test_environment.py::test_one_corrupt_frame_neither_enters_fast_nor_stays": ((7, "accumulate", "*"),),
     "test_environment.py::test_two_opposite_lights": ((10, "key_lights", "*"),),
-    "test_environment.py::test_a_uniform_room_has_no_key_light": ((10, "key_lights", "*"),),
-    "test_environment.py::test_a_constant_room_stays_constant_under_any_mask": ((18, "fill", "*"),),
+    "test_environment.py::test_a_uniform_environment_has_no_key_light": ((10, "key_lights", "*"),),
+    "test_environment.py::test_a_constant_environment_stays_constant_under_any_mask": ((18, "fill", "*"),),
     "test_irradiance.py::test_a_white_furnace_stays_white": ((18, "diffuse", ""),),
-    "test_irradiance.py::test_turning_the_room_turns_the_irradiance": ((4, "diffuse", ""),),
+    "test_irradiance.py::test_turning_the_environment_turns_the_irradiance": ((4, "diffuse", ""),),
     "test_irradiance.py::test_bad_texels_are_contained": ((6, "diffuse", ""),),
     "test_irradiance.py::test_a_small_lamp_gives_no_negative_light": ((6, "diffuse", "sh2"),),
     "test_prefilter.py::test_a_white_furnace_stays_white": ((18, "specular", ""),),
@@ -136,16 +136,16 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_declip.py::test_modelled_surface_is_no_lamp": ((13, "declip", "*"),),
     "test_reflect.py::test_points_of_the_desk_are_where_they_project_at_any_scale": (
         (14, "object_light", "*"),
-        (14, "room_shadow", "bounce"),
-        (14, "room_shadow", "brute_force"),
+        (14, "environment_shadow", "bounce"),
+        (14, "environment_shadow", "brute_force"),
     ),
     "test_reflect.py::test_a_face_turned_away_is_not_in_the_picture": ((13, "object_light", "*"),),
     "test_reflect.py::test_what_a_proxy_hides_is_not_in_the_picture": ((13, "object_light", "*"),),
     "test_reflect.py::test_what_a_ball_hides_is_not_in_the_picture": ((13, "object_light", "*"),),
     "test_object_light.py::test_white_furnace": ((18, "object_light", "*"),),
-    "test_object_light.py::test_garbage_in_the_room_stays_finite": ((6, "object_light", "*"),),
+    "test_object_light.py::test_garbage_in_the_environment_stays_finite": ((6, "object_light", "*"),),
     "test_object_light.py::test_averages_stop_at_the_edges_of_objects": ((6, "object_light", "*"),),
-    "test_room_shadow.py::test_nothing_virtual_changes_nothing_to_the_bit": ((18, "room_shadow", "*"),),
+    "test_environment_shadow.py::test_nothing_virtual_changes_nothing_to_the_bit": ((18, "environment_shadow", "*"),),
     "test_mirror_ball.py::test_grazing_the_silhouette": ((1, "mirror_ball", "*"),),
     "test_mirror_ball.py::test_partly_outside_the_frame": ((3, "mirror_ball", "*"),),
     "test_mirror_ball.py::test_a_ball_behind_a_proxy_is_not_changed": ((3, "mirror_ball", "*"),),
@@ -154,7 +154,7 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_mirror_ball.py::test_a_ball_behind_what_is_mirrored_hides_nothing": ((13, "mirror_ball", "*"),),
     "test_mirror_ball.py::test_a_broken_shadow_reaches_only_what_mirrors_its_place": ((6, "mirror_ball", "*"),),
     "test_mirror_ball.py::test_a_pixel_of_the_frame_changes_itself_alone": ((6, "mirror_ball", "*"),),
-    "test_mirror_ball.py::test_broken_light_reaches_only_what_mirrors_a_thing": ((6, "mirror_ball", "*"),),
+    "test_mirror_ball.py::test_broken_light_reaches_only_what_mirrors_a_item": ((6, "mirror_ball", "*"),),
     "test_materials.py::test_ends_of_every_range_are_finite": ((8, "shade", "*"),),
     "test_materials.py::test_white_furnace": ((8, "shade", "*"), (18, "shade", "*")),
     "test_relight.py::test_hard_lights_stay_finite": ((9, "relight", ""),),
@@ -162,7 +162,7 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_shadow.py::test_cone_angles_at_their_ends": ((9, "relight", "*"), (9, "shade", "*")),
     "test_relight.py::test_paper_is_exact_at_its_three_cases": ((10, "relight", "paper"),),
     "test_relight.py::test_responses_are_continuous_and_never_negative": ((10, "relight", "*"),),
-    "test_relight.py::test_ambient_room_says_nothing_about_relief": ((10, "relight", ""),),
+    "test_relight.py::test_ambient_environment_says_nothing_about_relief": ((10, "relight", ""),),
     "test_summed_area.py::test_large_frames_are_exact": ((11, "summed_area", "*"),),
     "test_summed_area.py::test_empty_and_outside_boxes_are_zero": ((11, "summed_area", "*"),),
     "test_exposure.py::test_scale_one_is_the_identity": ((12, "expose", ""),),
@@ -189,43 +189,46 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_sources.py::test_truncated_video_gives_what_is_whole_and_names_the_frame": ((16, SOURCE, "*"),),
     "test_sources.py::test_device_drops_to_the_newest_and_reports_being_unplugged": ((16, SOURCE, "*"),),
     "test_pipeline.py::test_wrong_frames_are_refused_and_the_next_one_works": ((16, PIPELINE, "*"),),
-    "test_desk_cells.py::test_garbage_in_the_room": ((6, "relight", "bounce"), (6, "relight", "brute_force")),
-    "test_desk_cells.py::test_a_mesh_hides_as_the_box_that_it_is": (
+    "test_receiver_cells.py::test_garbage_in_the_environment": (
+        (6, "relight", "bounce"),
+        (6, "relight", "brute_force"),
+    ),
+    "test_receiver_cells.py::test_a_mesh_hides_as_the_box_that_it_is": (
         (13, "relight", "bounce"),
         (13, "relight", "brute_force"),
     ),
-    "test_desk_cells.py::test_the_end_of_a_long_box_is_not_passed_by": (
+    "test_receiver_cells.py::test_the_end_of_a_long_box_is_not_passed_by": (
         (13, "relight", "bounce"),
         (13, "relight", "brute_force"),
     ),
-    "test_desk_cells.py::test_eager_equals_replayed": ((17, "relight", ""),),
-    "test_desk_cells.py::test_bands_and_runs_give_the_same_bits": (
+    "test_receiver_cells.py::test_eager_equals_replayed": ((17, "relight", ""),),
+    "test_receiver_cells.py::test_bands_and_runs_give_the_same_bits": (
         (17, "relight", "bounce"),
         (17, "relight", "brute_force"),
     ),
-    "test_desk_cells.py::test_nothing_of_an_earlier_frame_is_read": ((17, "relight", ""),),
+    "test_receiver_cells.py::test_nothing_of_an_earlier_frame_is_read": ((17, "relight", ""),),
     "test_pipeline.py::test_bands_give_the_same_bits": ((17, PIPELINE, "*"),),
     "test_pipeline.py::test_captured_graph_equals_eager": ((17, PIPELINE, "*"),),
 }
-"""(row, stage, rung) of tests beside their kernels; an empty rung is the test's own ``rung`` parameter."""
+"""(row, stage, method) of tests beside their kernels; an empty method is the test's own ``method`` parameter."""
 
 Cell = tuple[int, str, str]
 
 
-def rungs_of(stage: str) -> tuple[str, ...]:
-    """Rungs of a stage on which it does something; ``default`` for what is no stage."""
-    return RUNGS.get(stage, ("default",))
+def methods_of(stage: str) -> tuple[str, ...]:
+    """Methods of a stage on which it does something; ``default`` for what is no stage."""
+    return METHODS.get(stage, ("default",))
 
 
 def cells() -> list[Cell]:
-    """Every (row, stage, rung) that must be covered; stages that do not exist yet concern no row."""
-    known = {*RUNGS, TRACK, SOURCE, PIPELINE}
+    """Every (row, stage, method) that must be covered; stages that do not exist yet concern no row."""
+    known = {*METHODS, TRACK, SOURCE, PIPELINE}
     return [
-        (row, stage, rung)
+        (row, stage, method)
         for row, stages in CONCERNS.items()
         for stage in stages
         if stage in known
-        for rung in rungs_of(stage)
+        for method in methods_of(stage)
     ]
 
 
@@ -235,20 +238,22 @@ def cells_of(item: Any) -> list[Cell]:
     function = getattr(item, "originalname", None) or item.name
     claims: list[tuple[int, str | None, str | None]] = []
     for mark in item.iter_markers("atlas"):
-        claims.append((mark.kwargs["row"], mark.kwargs.get("stage"), mark.kwargs.get("rung")))
-    claims += [(row, stage, rung or None) for row, stage, rung in ELSEWHERE.get(f"{item.path.name}::{function}", ())]
+        claims.append((mark.kwargs["row"], mark.kwargs.get("stage"), mark.kwargs.get("method")))
+    claims += [
+        (row, stage, method or None) for row, stage, method in ELSEWHERE.get(f"{item.path.name}::{function}", ())
+    ]
     found: list[Cell] = []
-    for row, stage, rung in claims:
+    for row, stage, method in claims:
         stage = stage or parameters.get("stage")
         if stage not in CONCERNS[row]:
             if "stage" in parameters:
                 continue  # a test over all stages, of a row that does not concern this one
             raise ValueError(f"{item.nodeid}: row {row} of the atlas does not concern {stage!r}")
-        rungs = rungs_of(stage)
-        rung = rung or parameters.get("rung") or (rungs[0] if len(rungs) == 1 else None)
-        if rung is None:
-            raise ValueError(f"{item.nodeid}: say which rung of {stage} it covers, or '*' for what all share")
-        found += [(row, stage, one) for one in rungs if rung in ("*", one)]
+        methods = methods_of(stage)
+        method = method or parameters.get("method") or (methods[0] if len(methods) == 1 else None)
+        if method is None:
+            raise ValueError(f"{item.nodeid}: say which method of {stage} it covers, or '*' for what all share")
+        found += [(row, stage, one) for one in methods if method in ("*", one)]
     return found
 
 
@@ -257,11 +262,11 @@ collected: list[Any] = []
 
 
 def coverage(items: Iterable[Any]) -> dict[str, list[str]]:
-    """Which tests cover which cells: {"row/stage/rung": [test, ...]}."""
+    """Which tests cover which cells: {"row/stage/method": [test, ...]}."""
     table: dict[str, list[str]] = {}
     for item in items:
-        for row, stage, rung in cells_of(item):
-            table.setdefault(f"{row}/{stage}/{rung}", []).append(item.nodeid)
+        for row, stage, method in cells_of(item):
+            table.setdefault(f"{row}/{stage}/{method}", []).append(item.nodeid)
     return table
 
 

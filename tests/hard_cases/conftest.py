@@ -1,4 +1,4 @@
-"""Rigs that tests of hard cases share: built once per stage and rung, put back into their first state every time."""
+"""Rigs that tests of hard cases share: built once per stage and method, put back into their first state every time."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _RIGS: dict[tuple[str, str, str], tuple[Rig, dict[str, np.ndarray]]] = {}
 
 @pytest.fixture
 def rig_for(device: str) -> Callable[[str, str], Rig]:
-    """A rig whose plan holds a stage on a rung, as it was after two frames of noise."""
+    """A rig whose plan holds a stage on a method, as it was after two frames of noise."""
 
-    def made(stage: str, rung: str) -> Rig:
-        key = device, stage, rung
+    def made(stage: str, method: str) -> Rig:
+        key = device, stage, method
         if key not in _RIGS:
-            rig = Rig(device, stage, rung)
+            rig = Rig(device, stage, method)
             for name in ("noise", "torn"):  # two: the first has no time step
                 rig.frame(frames(SIZE[1], SIZE[0])[name])
             _RIGS[key] = rig, rig.state()

@@ -48,7 +48,7 @@ def frames(rows: int, columns: int) -> dict[str, np.ndarray]:
 
 
 def finite_maps(rows: int, columns: int) -> dict[str, np.ndarray]:
-    """Radiance maps, finite and not negative, that a room can have: float32 (rows, columns, 3)."""
+    """Radiance maps, finite and not negative, that an environment can have: float32 (rows, columns, 3)."""
     rng = np.random.default_rng(1)
     sky = np.full((rows, columns, 3), SKY, np.float32)
 

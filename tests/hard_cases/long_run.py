@@ -71,7 +71,7 @@ def looped_clip(rig: Rig, count: int) -> Iterator[np.ndarray]:
 
 
 def switching_lights(rig: Rig, count: int) -> Iterator[np.ndarray]:
-    """The room's light and the virtual ones on and off every frame, and the virtual ones moving."""
+    """The environment and the virtual ones on and off every frame, and the virtual ones moving."""
     frames = generators.frames(SIZE[1], SIZE[0])
     scene = rig.pipeline.scene
     dark = dataclasses.replace(scene, lights=tuple(dataclasses.replace(light, intensity=0.0) for light in scene.lights))

@@ -1,7 +1,7 @@
 """A pipeline of every effect at a small size, whose stages can be fed by hand: what the hard cases are tried on.
 
-The pose is given, not tracked, so that any picture can be a frame. Stages and rungs come from ``warp_ar.stages``: a new
-one is tried without a line here.
+The pose is given, not tracked, so that any picture can be a frame. Stages and methods come from ``warp_ar.stages``: a
+new one is tried without a line here.
 """
 
 from __future__ import annotations
@@ -113,17 +113,17 @@ def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any)
     return dataclasses.replace(scene, **changes)
 
 
-def make_quality(**rungs: str) -> Quality:
-    """The default preset at a small size, with every stage that a rung can switch off switched on."""
+def make_quality(**methods: str) -> Quality:
+    """The default preset at a small size, with every stage that a method can switch off switched on."""
     base = dataclasses.replace(PRESETS["medium"], environment_height=ENVIRONMENT_HEIGHT, edge_samples=4)
-    switched = {stage.name: stage.rungs[1] for stage in STAGES if stage.rungs[0] == "none"}
-    return base.with_rungs(**{**switched, **rungs})
+    switched = {stage.name: stage.methods[1] for stage in STAGES if stage.methods[0] == "none"}
+    return base.with_methods(**{**switched, **methods})
 
 
 BRACKET = (1.0, 1.0 / 16.0)
 """Exposure times between which frames alternate, where a stage calls for it."""
 SOFT = "soft"
-"""A way of two stages, tried as one more rung of each: lights with a size, and the most samples along edges."""
+"""A way of two stages, tried as one more method of each: lights with a size, and the most samples along edges."""
 LIGHT_RADIUS = 0.02
 """Metres, at scale 1."""
 
@@ -136,19 +136,19 @@ def with_sized_lights(scene: Scene, scale: float = 1.0) -> Scene:
 
 
 @functools.cache
-def request_for(stage: str, rung: str) -> Request | None:
-    """A request whose plan holds ``stage`` on ``rung``; None if that rung means that the stage does not run."""
-    if rung == SOFT:
-        request = request_for(stage, next(one.rungs[-1] for one in STAGES if one.name == stage))
+def request_for(stage: str, method: str) -> Request | None:
+    """A request whose plan holds ``stage`` on ``method``; None if that method means that the stage does not run."""
+    if method == SOFT:
+        request = request_for(stage, next(one.methods[-1] for one in STAGES if one.name == stage))
         assert request is not None
-        quality = dataclasses.replace(request.quality.with_rungs(light_shadow=SOFT), edge_samples=16)
+        quality = dataclasses.replace(request.quality.with_methods(light_shadow=SOFT), edge_samples=16)
         return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
-    rungs = {} if rung == "default" else {stage: rung}
-    # Some stages run only where another one is on its best rung, some only without a change of exposure, one only
+    methods = {} if method == "default" else {stage: method}
+    # Some stages run only where another one is on its best method, some only without a change of exposure, one only
     # where the frames alternate between exposure times.
-    best = {one.name: one.rungs[-1] for one in STAGES if len(one.rungs) > 1}
+    best = {one.name: one.methods[-1] for one in STAGES if len(one.methods) > 1}
     for others, scale, times in itertools.product(({}, best), (0.7, 1.0), ((), BRACKET)):
-        quality = make_quality(**{**others, **rungs})
+        quality = make_quality(**{**others, **methods})
         request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment"), times)
         if stage in plan_names(make_plan(request)):
             return request
@@ -160,16 +160,16 @@ def plan_names(plan: Plan) -> tuple[str, ...]:
     return tuple(stage.name for stage, _ in plan.stages)
 
 
-RUNGS: dict[str, tuple[str, ...]] = {
+METHODS: dict[str, tuple[str, ...]] = {
     stage.name: tuple(
-        rung
-        for rung in (*stage.rungs, *((SOFT,) if stage.name in ("relight", "shade") else ()))
-        if request_for(stage.name, rung) is not None
+        method
+        for method in (*stage.methods, *((SOFT,) if stage.name in ("relight", "shade") else ()))
+        if request_for(stage.name, method) is not None
     )
     for stage in STAGES
 }
-"""Every rung on which a stage does something, by stage; ``none`` of a stage is that it is left out."""
-STAGE_RUNGS = [(stage, rung) for stage, rungs in RUNGS.items() for rung in rungs]
+"""Every method on which a stage does something, by stage; ``none`` of a stage is that it is left out."""
+STAGE_METHODS = [(stage, method) for stage, methods in METHODS.items() for method in methods]
 
 
 class FixedPose:
@@ -191,13 +191,13 @@ class Rig:
         self,
         device: str,
         stage: str | None = None,
-        rung: str = "default",
+        method: str = "default",
         *,
         bands: int = 1,
         pose: Pose = POSE,
         **changes: Any,
     ) -> None:
-        request = request_for(stage, rung) if stage is not None else None
+        request = request_for(stage, method) if stage is not None else None
         if request is None:
             request = Request(make_scene(), make_quality(), SIZE)
         if changes:
@@ -341,10 +341,10 @@ def _spec_of(name: str, request: Request) -> ArraySpec:
 
 
 class LoneStage:
-    """A stage of the room's light by itself, with an environment of any height."""
+    """A stage of the environment by itself, with an environment of any height."""
 
-    def __init__(self, device: str, name: str, rung: str, height: int) -> None:
-        request = request_for(name, rung)
+    def __init__(self, device: str, name: str, method: str, height: int) -> None:
+        request = request_for(name, method)
         assert request is not None
         request = dataclasses.replace(request, quality=dataclasses.replace(request.quality, environment_height=height))
         kind = next(stage for stage in STAGES if stage.name == name)

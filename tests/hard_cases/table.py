@@ -5,7 +5,7 @@
 
 Reports may be one for each test file: they add up. A report of a machine with a CUDA device holds the tests of both
 devices: their names say which (``[cuda:0-...]``). A column that no report fills keeps what stands there. A cell says
-how many of a stage's rungs passed, and in how many tests.
+how many of a stage's methods passed, and in how many tests.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ def read_reports(paths: list[pathlib.Path]) -> dict[str, Results]:
     found: dict[str, Results] = {"CPU": collections.defaultdict(list), "CUDA": collections.defaultdict(list)}
     for (_, name), (good, cells) in outcomes.items():
         for cell in cells:
-            row, stage, rung = cell.split("/")
-            found["CUDA" if "cuda" in name else "CPU"][int(row), stage, rung].append(good)
+            row, stage, method = cell.split("/")
+            found["CUDA" if "cuda" in name else "CPU"][int(row), stage, method].append(good)
     return found
 
 
 def cell_text(results: Results, row: int, stage: str) -> str:
-    """What one stage's cell says: rungs passed of all, or who failed."""
-    rungs = atlas.rungs_of(stage)
-    tried = {rung: results.get((row, stage, rung), []) for rung in rungs}
+    """What one stage's cell says: methods passed of all, or who failed."""
+    methods = atlas.methods_of(stage)
+    tried = {method: results.get((row, stage, method), []) for method in methods}
     if not any(tried.values()):
         return ""
-    failed = [rung for rung, outcomes in tried.items() if not all(outcomes)]
+    failed = [method for method, outcomes in tried.items() if not all(outcomes)]
     if failed:
         return "FAILED: " + ", ".join(failed)
     count = sum(bool(outcomes) for outcomes in tried.values())
-    return f"{count}/{len(rungs)} ({sum(map(len, tried.values()))} tests)"
+    return f"{count}/{len(methods)} ({sum(map(len, tried.values()))} tests)"
 
 
 def make_table(results: dict[str, Results], before: str) -> str:
     """The table, one line per row and stage, columns of devices that no report fills taken over from ``before``."""
     old = {tuple(line.split("|")[1:3]): line.split("|")[4:6] for line in before.splitlines() if line.startswith("| ")}
-    lines = ["| row | stage | rungs | CPU | CUDA |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| row | stage | methods | CPU | CUDA |", "| --- | --- | --- | --- | --- |"]
     known = {stage for _, stage, _ in atlas.cells()}
     for row, stages in atlas.CONCERNS.items():
         for stage in (stage for stage in stages if stage in known):
@@ -71,7 +71,7 @@ def make_table(results: dict[str, Results], before: str) -> str:
             ]
             if stage in ON_HOST:
                 columns[1] = "on the host"
-            lines.append(f"| {row} | {stage} | {' '.join(atlas.rungs_of(stage))} | {' | '.join(columns)} |")
+            lines.append(f"| {row} | {stage} | {' '.join(atlas.methods_of(stage))} | {' | '.join(columns)} |")
     return "\n".join(lines)
 
 

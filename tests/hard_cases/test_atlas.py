@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 from tests.hard_cases import atlas, measure_errors, mutations, table
-from tests.hard_cases.rig import RUNGS, SIZE, make_quality, make_scene
+from tests.hard_cases.rig import METHODS, SIZE, make_quality, make_scene
 from warp_ar import explain
 from warp_ar.engine.graph import make_plan
 from warp_ar.stages import STAGES
@@ -29,7 +29,7 @@ def collect_all(folder: pathlib.Path) -> dict[str, list[str]]:
     return dict(json.loads(file.read_text()))
 
 
-def test_every_row_is_covered_at_every_rung_of_every_stage(request, tmp_path: pathlib.Path) -> None:
+def test_every_row_is_covered_at_every_method_of_every_stage(request, tmp_path: pathlib.Path) -> None:
     options = request.config.option
     whole = request.config.args in (["tests"], [str(ROOT)], [str(ROOT / "tests")])
     # A run of everything has collected everything already.
@@ -61,12 +61,12 @@ def test_every_stage_is_compared_with_its_twin() -> None:
     assert checked == set(NUMERICS) == {stage.name for stage in STAGES}
 
 
-def test_a_stage_on_a_rung_that_has_no_row_does_not_run() -> None:
-    """Rungs without cells mean that the stage is left out, with a reason; what is left out has no hard cases."""
+def test_a_stage_on_a_method_that_has_no_row_does_not_run() -> None:
+    """Methods without cells mean that the stage is left out, with a reason; what is left out has no hard cases."""
     for stage in STAGES:
-        for rung in set(stage.rungs) - set(RUNGS[stage.name]):
-            plan = make_plan(Request(make_scene(), make_quality(**{stage.name: rung}), SIZE))
-            assert dict(plan.left_out)[stage.name], f"{stage.name} on {rung}"
+        for method in set(stage.methods) - set(METHODS[stage.name]):
+            plan = make_plan(Request(make_scene(), make_quality(**{stage.name: method}), SIZE))
+            assert dict(plan.left_out)[stage.name], f"{stage.name} on {method}"
 
 
 def test_tests_that_stand_elsewhere_exist() -> None:

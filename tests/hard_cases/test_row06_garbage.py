@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, RUNGS, SIZE, STAGE_RUNGS, assert_finite, numbers
+from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, METHODS, SIZE, STAGE_METHODS, assert_finite, numbers
 from warp_ar.kernels.probe import RIM_START
 
 MAP = (ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT)
@@ -21,10 +21,12 @@ BROKEN = generators.broken_maps(*MAP)
 # Light that a stage may read as a whole map.
 MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environment")
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
-GUARDED = ("accumulate", "fill", "diffuse", "specular", "room_samples")
+GUARDED = ("accumulate", "fill", "diffuse", "specular", "environment_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
 SIGNED = ("irradiance_sh", "mirrored")
-MAP_READERS = [(stage, rung) for stage, rung in STAGE_RUNGS if stage not in ("unwrap", "summed_area", "visibility")]
+MAP_READERS = [
+    (stage, method) for stage, method in STAGE_METHODS if stage not in ("unwrap", "summed_area", "visibility")
+]
 
 
 def assert_light(outputs, cause):
@@ -36,13 +38,14 @@ def assert_light(outputs, cause):
 
 
 @pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(("stage", "rung"), MAP_READERS)
-def test_any_map_gives_finite_light(rig_for, stage, rung):
-    """Maps that a room can have, into every stage that reads one; what no room can have, into those that guard."""
-    rig = rig_for(stage, rung)
+@pytest.mark.parametrize(("stage", "method"), MAP_READERS)
+def test_any_map_gives_finite_light(rig_for, stage, method):
+    """Maps that an environment can have, into every stage that reads one; what no environment can have, into those
+    that guard."""
+    rig = rig_for(stage, method)
     reads = [name for name in MAPS if name in rig.stage(stage)[0].wiring.reads]
     # A stage that reads no map itself gets what the stages before it make of one.
-    upstream = [] if reads else [name for name in RUNGS if name in before(rig, stage)]
+    upstream = [] if reads else [name for name in METHODS if name in before(rig, stage)]
     maps = FINITE if not reads or stage not in GUARDED else {**FINITE, **BROKEN}
     for name, values in maps.items():
         for target in reads or ["environment"]:
@@ -63,10 +66,10 @@ def before(rig, stage):
 
 
 @pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
-def test_any_frame_gives_finite_light(rig_for, stage, rung):
+@pytest.mark.parametrize(("stage", "method"), STAGE_METHODS)
+def test_any_frame_gives_finite_light(rig_for, stage, method):
     """Frames as corrupt as 8 bits can be, through the whole pipeline."""
-    rig = rig_for(stage, rung)
+    rig = rig_for(stage, method)
     for name, image in FRAMES.items():
         rig.frame(image)
         outputs = {key: rig.get(key) for one, _ in rig.pipeline._scheduler._stages for key in one.wiring.writes}
@@ -77,7 +80,7 @@ def test_any_frame_gives_finite_light(rig_for, stage, rung):
 @pytest.mark.parametrize("name", [*FINITE, *BROKEN])
 def test_garbage_in_the_accumulated_light_is_a_picture_still(rig_for, name):
     """Whatever stands in the accumulated map, the complete one is light, and everything behind it finite."""
-    rig = rig_for("shade", RUNGS["shade"][-1])
+    rig = rig_for("shade", METHODS["shade"][-1])
     rig.poke("environment_radiance", {**FINITE, **BROKEN}[name])
     rig.poke("environment_confidence", 1.0)
     names = [one.name for one, _ in rig.pipeline._scheduler._stages]
@@ -93,9 +96,9 @@ def changed(rig, name, before_values, output):
 
 
 @pytest.mark.atlas(row=6, stage="unwrap")
-@pytest.mark.parametrize("rung", RUNGS["unwrap"])
-def test_a_pixel_reaches_only_the_texels_that_look_at_it(rig_for, rung):
-    rig = rig_for("unwrap", rung)
+@pytest.mark.parametrize("method", METHODS["unwrap"])
+def test_a_pixel_reaches_only_the_texels_that_look_at_it(rig_for, method):
+    rig = rig_for("unwrap", method)
     rig.poke("frame", FRAMES["grey"])
     clean = rig.run("unwrap")
     corners = rig.get("unwrap_corners")[:, :, 0]
@@ -150,12 +153,12 @@ def test_what_is_no_light_is_gone_with_its_frame(rig_for, bad, where):
 def test_a_broken_texel_is_completed_from_its_neighbours(rig_for, bad):
     """Filled like a hole: within the neighbours' range, and texels that are trusted stay as they are to the bit."""
     rig = rig_for("fill", "default")
-    room = np.random.default_rng(5).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
-    rig.poke("environment_radiance", room)
+    surroundings = np.random.default_rng(5).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
+    rig.poke("environment_radiance", surroundings)
     rig.poke("environment_confidence", 1.0)
     (clean,) = rig.run("fill").values()
-    room[5, 6] = bad
-    rig.poke("environment_radiance", room)
+    surroundings[5, 6] = bad
+    rig.poke("environment_radiance", surroundings)
     (filled,) = rig.run("fill").values()
     other = np.ones(MAP, bool)
     other[5, 6] = False
@@ -165,27 +168,29 @@ def test_a_broken_texel_is_completed_from_its_neighbours(rig_for, bad):
 
 @pytest.mark.atlas(row=6)
 @pytest.mark.parametrize(
-    ("stage", "rung"), [(stage, rung) for stage in ("diffuse", "specular") for rung in RUNGS[stage]]
+    ("stage", "method"), [(stage, method) for stage in ("diffuse", "specular") for method in METHODS[stage]]
 )
-def test_a_broken_texel_counts_as_no_light(rig_for, stage, rung):
+def test_a_broken_texel_counts_as_no_light(rig_for, stage, method):
     """NaN and negative texels act as black ones, to the bit: no neighbour is poisoned."""
-    rig = rig_for(stage, rung)
-    room = np.random.default_rng(6).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
-    room[4, 5] = 0.0
-    rig.poke("environment", room)
+    rig = rig_for(stage, method)
+    surroundings = np.random.default_rng(6).uniform(0.2, 0.8, (*MAP, 3)).astype(np.float32)
+    surroundings[4, 5] = 0.0
+    rig.poke("environment", surroundings)
     clean = rig.run(stage)
     for bad in (np.nan, -np.inf, -3281.0):
-        room[4, 5] = bad
-        rig.poke("environment", room)
+        surroundings[4, 5] = bad
+        rig.poke("environment", surroundings)
         for name, values in rig.run(stage).items():
             np.testing.assert_array_equal(values, clean[name])
 
 
 @pytest.mark.atlas(row=6)
-@pytest.mark.parametrize(("stage", "rung"), [("composite", "default"), *(("expose", rung) for rung in RUNGS["expose"])])
+@pytest.mark.parametrize(
+    ("stage", "method"), [("composite", "default"), *(("expose", method) for method in METHODS["expose"])]
+)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -1.0, 3e38])
-def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, rung, bad):
-    rig = rig_for(stage, rung)
+def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, method, bad):
+    rig = rig_for(stage, method)
     clean = rig.run(stage)["image"]
     added = rig.get("physical_added")
     row, column = np.argwhere(added.sum(-1) > 0)[10]
@@ -197,10 +202,10 @@ def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, rung, bad):
 
 
 @pytest.mark.atlas(row=6, stage="relight")
-@pytest.mark.parametrize("rung", RUNGS["relight"])
-def test_a_frame_pixel_changes_relighting_only_around_it(rig_for, rung):
+@pytest.mark.parametrize("method", METHODS["relight"])
+def test_a_frame_pixel_changes_relighting_only_around_it(rig_for, method):
     """Its own light, and the surroundings of those within half a box of it."""
-    rig = rig_for("relight", rung)
+    rig = rig_for("relight", method)
     rig.poke("frame", FRAMES["grey"])
     if "summed_area" in rig.arrays:
         rig.run("summed_area")
@@ -216,7 +221,7 @@ def test_a_frame_pixel_changes_relighting_only_around_it(rig_for, rung):
     reach = round(SIZE[1] / 8 / 2) + 1
     assert (np.abs(rows - row) <= reach).all()
     assert (np.abs(columns - column) <= reach).all()
-    assert touched[row, column] == (rung != "flat")
+    assert touched[row, column] == (method != "flat")
 
 
 @pytest.mark.atlas(row=6, stage="summed_area")
@@ -237,24 +242,24 @@ def test_a_frame_pixel_changes_only_boxes_that_hold_it(rig_for):
 
 @pytest.mark.atlas(row=6)
 @pytest.mark.parametrize(
-    ("stage", "rung"),
+    ("stage", "method"),
     [
         ("fill", "default"),
         ("key_lights", "default"),
-        ("room_samples", "default"),
-        *((s, r) for s in ("diffuse", "specular") for r in RUNGS[s]),
+        ("environment_samples", "default"),
+        *((s, r) for s in ("diffuse", "specular") for r in METHODS[s]),
     ],
 )
 @given(
     exponent=st.floats(-8, 8), spread=st.floats(0, 8), row=st.integers(0, MAP[0] - 1), column=st.integers(0, MAP[1] - 1)
 )
-def test_finite_at_any_magnitude(rig_for, stage, rung, exponent, spread, row, column):
+def test_finite_at_any_magnitude(rig_for, stage, method, exponent, spread, row, column):
     """A lamp of any radiance over a sky of any other."""
-    rig = rig_for(stage, rung)
-    room = np.full((*MAP, 3), 10.0**exponent, np.float32)
-    room[row, column] = min(10.0 ** (exponent + spread), 1e8)
+    rig = rig_for(stage, method)
+    surroundings = np.full((*MAP, 3), 10.0**exponent, np.float32)
+    surroundings[row, column] = min(10.0 ** (exponent + spread), 1e8)
     source = "environment_radiance" if stage == "fill" else "environment"
-    rig.poke(source, room)
+    rig.poke(source, surroundings)
     if stage == "fill":
         rig.poke("environment_confidence", 1.0)
-    assert_light(rig.run(stage), f"for a lamp of {room.max():g} over {room.min():g}")
+    assert_light(rig.run(stage), f"for a lamp of {environment.max():g} over {environment.min():g}")

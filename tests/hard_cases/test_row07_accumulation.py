@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.hard_cases import generators, long_run
-from tests.hard_cases.rig import RUNGS, SIZE, Rig, solid_angles
+from tests.hard_cases.rig import METHODS, SIZE, Rig, solid_angles
 from warp_ar.scene import Exposure
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -33,11 +33,11 @@ def test_long_runs(device, case, request):
 
 
 @pytest.mark.atlas(row=7, stage="expose")
-@pytest.mark.parametrize("rung", RUNGS["expose"])
+@pytest.mark.parametrize("method", METHODS["expose"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0, 0.0])
-def test_an_automatic_exposure_that_was_spoilt_heals(device, rung, bad):
+def test_an_automatic_exposure_that_was_spoilt_heals(device, method, bad):
     """Whatever stands in the scale, a second of good frames brings it back to where it belongs."""
-    with Rig(device, "expose", rung, exposure=Exposure("auto")) as rig:
+    with Rig(device, "expose", method, exposure=Exposure("auto")) as rig:
         for _ in range(5):
             image = rig.frame(FRAMES["ramp"])
         expected = rig.get("expose_scale")
@@ -49,11 +49,11 @@ def test_an_automatic_exposure_that_was_spoilt_heals(device, rung, bad):
 
 
 @pytest.mark.atlas(row=7, stage="recover")
-@pytest.mark.parametrize("rung", RUNGS["recover"])
+@pytest.mark.parametrize("method", METHODS["recover"])
 @pytest.mark.parametrize("bad", ["white", "black", "noise"])
-def test_recovered_light_forgets_a_corrupt_frame(device, rung, bad):
+def test_recovered_light_forgets_a_corrupt_frame(device, method, bad):
     """What is remembered on the host, too: two seconds later the map is what it is where that frame never was."""
-    with Rig(device, "recover", rung) as rig, Rig(device, "recover", rung) as clean:
+    with Rig(device, "recover", method) as rig, Rig(device, "recover", method) as clean:
         for index in range(90):
             for one in (rig, clean):
                 one.frame(FRAMES[bad] if one is rig and index == 25 else FRAMES["top half saturated"])

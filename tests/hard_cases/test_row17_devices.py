@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import SIZE, STAGE_RUNGS, Rig, numbers
+from tests.hard_cases.rig import SIZE, STAGE_METHODS, Rig, numbers
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 CUDA = [str(device) for device in wp.get_cuda_devices()[:1]]
@@ -41,8 +41,8 @@ BOUNDS = {
     "visibility": Bound(1e-5, "a dozen roundings of a hit", 0.005),
     "summed_area": Bound(0.0, "integers"),
     "relight": Bound(1e-4, "shadow edges, powers of distances", 0.005),
-    "room_samples": Bound(1e-4, "cumulative sums inverted: a sample may fall into the neighbouring texel", 0.02),
-    "room_shadow": Bound(2e-3, "one of 64 rays may fall on the other side of an edge", 0.02),
+    "environment_samples": Bound(1e-4, "cumulative sums inverted: a sample may fall into the neighbouring texel", 0.02),
+    "environment_shadow": Bound(2e-3, "one of 64 rays may fall on the other side of an edge", 0.02),
     "object_light": Bound(2e-3, "one of 32 rays may fall on the other side of an edge", 0.05),
     "shade": Bound(5e-4, "powers, and edges of silhouettes and shadows", 0.02),
     "mirror_ball": Bound(5e-4, "as relight and shade, turned by the ball; edges of what it mirrors", 0.02),
@@ -67,9 +67,9 @@ def differences(one: np.ndarray, other: np.ndarray, relative: float) -> float:
     return float((~((one == other) | (both & near))).mean())
 
 
-def compare(stage: str, rung: str, device: str) -> None:
+def compare(stage: str, method: str, device: str) -> None:
     bound = BOUNDS.get(stage, DEFAULT)
-    with Rig("cpu", stage, rung) as cpu, Rig(device, stage, rung) as other:
+    with Rig("cpu", stage, method) as cpu, Rig(device, stage, method) as other:
         for name in ("noise", "torn"):
             cpu.frame(FRAMES[name])
             other.frame(FRAMES[name])
@@ -88,10 +88,10 @@ def compare(stage: str, rung: str, device: str) -> None:
 
 
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
+@pytest.mark.parametrize(("stage", "method"), STAGE_METHODS)
 @pytest.mark.skipif(not CUDA, reason="needs a CUDA device")
-def test_cuda_agrees_with_cpu(stage, rung):
-    compare(stage, rung, CUDA[0])
+def test_cuda_agrees_with_cpu(stage, method):
+    compare(stage, method, CUDA[0])
 
 
 @pytest.mark.parametrize("stage", ["fill", "visibility", "summed_area"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import SIZE, STAGE_RUNGS, Rig, assert_same_bits
+from tests.hard_cases.rig import SIZE, STAGE_METHODS, Rig, assert_same_bits
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 
@@ -16,12 +16,12 @@ REMEMBERS = ("recover",)
 
 
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "rung"), [case for case in STAGE_RUNGS if case[0] in REMEMBERS])
-def test_from_the_first_frame_on(device, stage, rung):
+@pytest.mark.parametrize(("stage", "method"), [case for case in STAGE_METHODS if case[0] in REMEMBERS])
+def test_from_the_first_frame_on(device, stage, method):
     """A whole sequence again, from the start and in other bands."""
     found = []
     for bands in (1, 1, 3, 16):
-        with Rig(device, stage, rung, bands=bands) as rig:
+        with Rig(device, stage, method, bands=bands) as rig:
             for name in ("noise", "white", "ramp", "torn", "noise"):
                 rig.frame(FRAMES[name])
             found.append(rig.written(stage))
@@ -30,10 +30,10 @@ def test_from_the_first_frame_on(device, stage, rung):
 
 
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "rung"), [case for case in STAGE_RUNGS if case[0] not in REMEMBERS])
-def test_run_to_run_and_in_any_bands(rig_for, stage, rung):
+@pytest.mark.parametrize(("stage", "method"), [case for case in STAGE_METHODS if case[0] not in REMEMBERS])
+def test_run_to_run_and_in_any_bands(rig_for, stage, method):
     """What a stage writes is a function of what it reads and of its own state before."""
-    rig = rig_for(stage, rung)
+    rig = rig_for(stage, method)
     state = rig.state()
     first = rig.run(stage)
     for bands in range(1, 17):
@@ -42,12 +42,12 @@ def test_run_to_run_and_in_any_bands(rig_for, stage, rung):
 
 
 @pytest.mark.atlas(row=17)
-@pytest.mark.parametrize(("stage", "rung"), STAGE_RUNGS)
-def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, rung):
+@pytest.mark.parametrize(("stage", "method"), STAGE_METHODS)
+def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, method):
     """Stages without a memory of their own write every element that a reader may look at."""
     if stage in ("accumulate", "expose", "recover"):
         pytest.skip("keeps a state from frame to frame")
-    rig = rig_for(stage, rung)
+    rig = rig_for(stage, method)
     state = rig.state()
     first = rig.run(stage)
     rig.restore(state)

@@ -1,4 +1,5 @@
-"""Row 18: a constant room is constant under any mask, and filtering keeps total energy at every level and rung.
+"""Row 18: a constant environment is constant under any mask, and filtering keeps total energy at every level and
+method.
 
 Bound: the best anchor's 0.05 %.
 """
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, RUNGS, SIZE, LoneStage, solid_angles
+from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, METHODS, SIZE, LoneStage, solid_angles
 from warp_ar.kernels import prefilter
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
@@ -27,8 +28,9 @@ BOX_MIP = 0.35
 @pytest.mark.atlas(row=18, stage="accumulate")
 @pytest.mark.atlas(row=18, stage="fill")
 @given(seed=st.integers(0, 99), hidden=st.floats(0, 1), exponent=st.floats(-6, 6))
-def test_a_constant_room_under_any_mask(rig_for, seed, hidden, exponent):
-    """Whatever is hidden in whichever frame: what is known has the room's radiance to the bit, and so has the rest."""
+def test_a_constant_environment_under_any_mask(rig_for, seed, hidden, exponent):
+    """Whatever is hidden in whichever frame: what is known has the environment's radiance to the bit, and so has the
+    rest."""
     rig = rig_for("fill", "default")
     rng = np.random.default_rng(seed)
     radiance = np.float32(10.0**exponent)
@@ -47,48 +49,51 @@ def test_a_constant_room_under_any_mask(rig_for, seed, hidden, exponent):
 
 @pytest.mark.atlas(row=18)
 @pytest.mark.parametrize(
-    ("stage", "rung"), [(stage, rung) for stage in ("diffuse", "specular") for rung in RUNGS[stage]]
+    ("stage", "method"), [(stage, method) for stage in ("diffuse", "specular") for method in METHODS[stage]]
 )
 @given(row=st.integers(0, HEIGHT - 1), column=st.integers(0, 2 * HEIGHT - 1), sky=st.sampled_from([0.0, 1e-4, 1.0]))
-def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, rung, row, column, sky):
+def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, method, row, column, sky):
     """The integral over all directions, wherever the lamp stands: pi times the flux, each level the flux."""
-    room = np.full((*MAP, 3), sky, np.float32)
-    room[row, column] = 1e6
-    flux = float((solid_angles(*MAP)[..., None] * room.astype(float)).sum((0, 1))[0])
-    (values,) = make_lone(device, stage, rung, HEIGHT).run(environment=room).values()
+    surroundings = np.full((*MAP, 3), sky, np.float32)
+    surroundings[row, column] = 1e6
+    flux = float((solid_angles(*MAP)[..., None] * surroundings.astype(float)).sum((0, 1))[0])
+    (values,) = make_lone(device, stage, method, HEIGHT).run(environment=surroundings).values()
     if values.shape == (9, 3):  # coefficients: the constant one holds the mean
         assert values[0, 0] * 0.28209479 * 4 * np.pi == pytest.approx(np.pi * flux, rel=FURNACE)
         return
     if stage == "diffuse":
         total = float((solid_angles(*values.shape[:2]) * values[..., 0]).sum())
         # A series of order 4 is cut at zero: what is cut is at most its lobes' 4 %. Maps are sums of point samples.
-        assert total == pytest.approx(np.pi * flux, rel=0.05 if rung == "sh4" else 3e-3)
+        assert total == pytest.approx(np.pi * flux, rel=0.05 if method == "sh4" else 3e-3)
         return
     for level in range(prefilter.lobe_count(HEIGHT)):
         rows, columns = prefilter.lobe_size(HEIGHT, level)
         start = prefilter.lobe_offset(HEIGHT, level)
         texels = values[start : start + rows * columns, 0].reshape(rows, columns)
         total = float((solid_angles(rows, columns) * texels.astype(float)).sum())
-        bound = BOX_MIP if rung == "box_mip" else FURNACE
-        if rung == "brute_force":
+        bound = BOX_MIP if method == "box_mip" else FURNACE
+        if method == "brute_force":
             bound = 0.12  # normalised texel by texel: exact for a constant, not for a lamp between two texels
         assert total == pytest.approx(flux, rel=bound), f"level {level}"
 
 
-@pytest.mark.atlas(row=18, stage="room_samples")
+@pytest.mark.atlas(row=18, stage="environment_samples")
 @given(row=st.integers(0, HEIGHT - 1), column=st.integers(0, 2 * HEIGHT - 1), exponent=st.floats(-4, 8))
 def test_samples_of_a_lamp_hold_its_flux(device, row, column, exponent):
     """Half the samples follow the light: a lamp of any radiance is neither lost nor counted twice."""
-    room = np.full((*MAP, 3), 1e-4, np.float32)
-    room[row, column] = 10.0**exponent
-    samples = make_lone(device, "room_samples", "default", HEIGHT).run(environment=room)["room_samples"]
-    flux = float((solid_angles(*MAP) * room[..., 0].astype(float)).sum())
+    surroundings = np.full((*MAP, 3), 1e-4, np.float32)
+    surroundings[row, column] = 10.0**exponent
+    samples = make_lone(device, "environment_samples", "default", HEIGHT).run(environment=surroundings)[
+        "environment_samples"
+    ]
+    flux = float((solid_angles(*MAP) * surroundings[..., 0].astype(float)).sum())
     found = float((samples["measure"] * samples["radiance"][:, 0].astype(float)).sum())
     # A stratified sum: a lamp's share of 1,024 samples is right to one of them, or two where it crosses strata.
     assert found == pytest.approx(flux, rel=0.02)
 
 
-# --- White things in a white room -------------------------------------------------------------------------------------
+# --- White objects in a white environment
+# -------------------------------------------------------------------------------------
 
 WHITE = {
     "lambert": {"model": LAMBERT, "base_color": 1.0},
@@ -98,7 +103,7 @@ WHITE = {
 }
 # A rough metal's lobe is looked up in two tables of 32 x 32, and its lost energy given back by a fit.
 TABLES = 0.02
-# What an object receives is a sum over one set of the room's samples, averaged over its neighbours: see
+# What an object receives is a sum over one set of the environment's samples, averaged over its neighbours: see
 # tests/test_object_light.py.
 SAMPLED, SAMPLED_MEAN = 0.25, 0.03
 # Share of the light that dies out between white objects and the desk.
@@ -107,14 +112,14 @@ LOST = 0.3
 
 @pytest.fixture
 def furnace_for(rig_for):
-    """A rig in which the room, the desk's picture and every object are white, and no lamp shines.
+    """A rig in which the environment, the desk's picture and every object are white, and no lamp shines.
 
     The ball and the box lie far below: where they hide the desk from the camera, nobody knows what it looks like.
     """
     used = []
 
-    def made(stage, rung, material):
-        rig = rig_for(stage, rung)
+    def made(stage, method, material):
+        rig = rig_for(stage, method)
         scene = rig.pipeline._host_scene.ray_scene
         for array in (scene.materials, scene.proxies):
             used.append((array, array.numpy().copy()))
@@ -134,12 +139,12 @@ def furnace_for(rig_for):
         rig.arrays["light_array"].assign(lights)
         if "lamps" in rig.arrays:
             rig.arrays["lamps"].zero_()
-        for name, value in (("physical_ratio", 1.0), ("physical_added", 0.0)):
+        for name, value in (("shadow_ratio", 1.0), ("physical_added", 0.0)):
             if name in rig.arrays:
                 rig.poke(name, value)
         names = [one.name for one, _ in rig.pipeline._scheduler._stages]
         for name in names[min(map(names.index, {"key_lights", "diffuse"} & set(names))) : names.index(stage)]:
-            if name not in ("room_shadow", "relight"):
+            if name not in ("environment_shadow", "relight"):
                 rig.run(name)
         return rig
 
@@ -149,13 +154,13 @@ def furnace_for(rig_for):
 
 
 @pytest.mark.atlas(row=18, stage="shade")
-@pytest.mark.parametrize("rung", RUNGS["shade"])
+@pytest.mark.parametrize("method", METHODS["shade"])
 @pytest.mark.parametrize("name", WHITE)
-def test_white_objects_cannot_be_told_from_a_white_room(furnace_for, rung, name):
-    virtual = furnace_for("shade", rung, WHITE[name]).run("shade")["virtual"]
+def test_white_objects_cannot_be_told_from_a_white_environment(furnace_for, method, name):
+    virtual = furnace_for("shade", method, WHITE[name]).run("shade")["virtual"]
     covered = virtual[..., 3] > 0
     ratio = virtual[covered][:, :3] / virtual[covered][:, 3:]
-    near = rung != "environment" and name != "mirror"
+    near = method != "environment" and name != "mirror"
     assert covered.any()
     np.testing.assert_allclose(ratio.mean(0), 1.0, atol=SAMPLED_MEAN if near else TABLES)
     np.testing.assert_allclose(ratio, 1.0, atol=SAMPLED if near else TABLES)
@@ -177,13 +182,13 @@ def test_what_surrounds_a_white_object_is_white(furnace_for, name):
         np.testing.assert_allclose(received / np.pi, 1.0, atol=SAMPLED)
 
 
-@pytest.mark.atlas(row=18, stage="room_shadow")
-@pytest.mark.parametrize("rung", RUNGS["room_shadow"])
-def test_white_objects_give_back_the_light_that_they_take(furnace_for, rung):
+@pytest.mark.atlas(row=18, stage="environment_shadow")
+@pytest.mark.parametrize("method", METHODS["environment_shadow"])
+def test_white_objects_give_back_the_light_that_they_take(furnace_for, method):
     """Black ones only take; white ones give it back but for what dies out between them and the desk."""
-    black = furnace_for("room_shadow", rung, {**WHITE["lambert"], "base_color": 0.0}).run("room_shadow")
-    white = furnace_for("room_shadow", rung, WHITE["lambert"]).run("room_shadow")
-    taken, left = 1.0 - black["physical_ratio"], 1.0 - white["physical_ratio"]
+    black = furnace_for("environment_shadow", method, {**WHITE["lambert"], "base_color": 0.0}).run("environment_shadow")
+    white = furnace_for("environment_shadow", method, WHITE["lambert"]).run("environment_shadow")
+    taken, left = 1.0 - black["shadow_ratio"], 1.0 - white["shadow_ratio"]
     assert taken.min() >= 0.0
     assert taken.max() > 0.2, "the objects throw shadows"
     assert abs(left).mean() < LOST * taken.mean()
@@ -191,21 +196,21 @@ def test_white_objects_give_back_the_light_that_they_take(furnace_for, rung):
 
 
 @pytest.mark.atlas(row=18, stage="mirror_ball")
-@pytest.mark.parametrize("rung", RUNGS["mirror_ball"])
+@pytest.mark.parametrize("method", METHODS["mirror_ball"])
 @pytest.mark.parametrize("name", WHITE)
-def test_white_objects_in_a_white_ball_change_nothing(furnace_for, rig_for, rung, name):
-    """A perfect mirror among white things: what it shows of them is what it showed of the room behind them."""
-    ball = rig_for("mirror_ball", rung).arrays["probes"].numpy().copy()
+def test_white_objects_in_a_white_ball_change_nothing(furnace_for, rig_for, method, name):
+    """A perfect mirror among white objects: what it shows of them is what it showed of the environment behind them."""
+    ball = rig_for("mirror_ball", method).arrays["probes"].numpy().copy()
     ball["reflectance"] = 1.0
     found = {}
     for color, colors in ((0.0, {"base_color": 0.0, "specular": 0.0}), (1.0, {})):
-        rig = furnace_for("mirror_ball", rung, {**WHITE[name], **colors})
+        rig = furnace_for("mirror_ball", method, {**WHITE[name], **colors})
         rig.arrays["probes"].assign(ball)
         found[color] = rig.run("mirror_ball")["mirrored"]
     black = found[0.0].max(-1) < 0.0
     assert black.any(), "the ball must show the objects"
     if name in ("lambert", "mirror"):
         assert found[0.0].min() >= -1.0, "nothing is darker than black"
-        assert found[0.0].min() < -0.5, "black things are black in it, where they fill a pixel"
+        assert found[0.0].min() < -0.5, "black objects are black in it, where they fill a pixel"
     np.testing.assert_allclose(found[1.0], 0.0, atol=FURNACE if name in ("lambert", "mirror") else TABLES)
     np.testing.assert_array_equal(found[1.0][~black & (found[0.0] == 0.0).all(-1)], 0.0)

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import RUNGS, SIZE, assert_finite, look_at
+from tests.hard_cases.rig import METHODS, SIZE, assert_finite, look_at
 from warp_ar.kernels.color import decode_table
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -43,11 +43,11 @@ def assert_sane(outputs, low=0.0, high=1.0):
 @pytest.mark.atlas(row=1, stage="unwrap")
 @pytest.mark.atlas(row=4, stage="unwrap")
 @pytest.mark.atlas(row=5, stage="unwrap")
-@pytest.mark.parametrize("rung", RUNGS["unwrap"])
+@pytest.mark.parametrize("method", METHODS["unwrap"])
 @pytest.mark.parametrize("axis", AXES, ids=str)
-def test_light_straight_back_along_an_axis(rig_for, rung, axis):
+def test_light_straight_back_along_an_axis(rig_for, method, axis):
     """The camera where R = -view falls exactly on a pole, the seam or a texel's corner; the proxies out of the way."""
-    rig = rig_for("unwrap", rung)
+    rig = rig_for("unwrap", method)
     hide_proxies(rig)
     rig.poke("frame", FRAMES["ramp"])
     outputs = see_ball(rig, CENTER + 0.2 * np.array(axis))
@@ -73,8 +73,8 @@ def hide_proxies(rig):
 @pytest.fixture(autouse=True)
 def _proxies_back(request, rig_for):
     yield
-    for rung in RUNGS["unwrap"]:
-        rig = rig_for("unwrap", rung)
+    for method in METHODS["unwrap"]:
+        rig = rig_for("unwrap", method)
         records = rig.pipeline._host_scene._proxies
         rig.pipeline._host_scene.ray_scene.proxies.assign(records)
 
@@ -82,7 +82,7 @@ def _proxies_back(request, rig_for):
 @pytest.mark.atlas(row=1, stage="unwrap")
 @pytest.mark.atlas(row=2, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="unwrap")
-@pytest.mark.parametrize("rung", RUNGS["unwrap"])
+@pytest.mark.parametrize("method", METHODS["unwrap"])
 @given(
     log_distance=st.floats(-8, 8),
     direction=st.sampled_from(list(map(tuple, generators.directions().tolist()))),
@@ -91,9 +91,9 @@ def _proxies_back(request, rig_for):
 @example(log_distance=0.0, direction=(0.0, 0.0, 1.0), name="noise")
 @example(log_distance=1e-6, direction=(0.0, -1.0, 0.0), name="white")
 @example(log_distance=3.0, direction=(1.0, 0.0, 0.0), name="checkers")
-def test_from_anywhere(rig_for, rung, log_distance, direction, name):
+def test_from_anywhere(rig_for, method, log_distance, direction, name):
     """From the ball's centre to far away, from every direction, touching it, whatever the frame shows."""
-    rig = rig_for("unwrap", rung)
+    rig = rig_for("unwrap", method)
     rig.poke("frame", FRAMES[name])
     linear = decode_table("srgb")[FRAMES[name].reshape(-1, 3), [0, 1, 2]]
     assert_sane(see_ball(rig, CENTER + RADIUS * 10.0**log_distance * np.array(direction)), linear.min(), linear.max())
@@ -101,14 +101,14 @@ def test_from_anywhere(rig_for, rung, log_distance, direction, name):
 
 @pytest.mark.atlas(row=18, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="unwrap")
-@pytest.mark.parametrize("rung", RUNGS["unwrap"])
+@pytest.mark.parametrize("method", METHODS["unwrap"])
 @pytest.mark.parametrize(
     "eye", [(0.02, -0.3, 0.35), (-0.09, 0.02, 0.1), (0.3, 0.02, 0.04), (-0.09, -2.0, 0.5)], ids=str
 )
 @pytest.mark.parametrize("code", [1, 128, 255])
-def test_a_constant_frame_is_a_constant_map(rig_for, rung, eye, code):
+def test_a_constant_frame_is_a_constant_map(rig_for, method, eye, code):
     """Near, far, cut by the frame and hidden in part: what is seen at all has the frame's radiance."""
-    rig = rig_for("unwrap", rung)
+    rig = rig_for("unwrap", method)
     rig.poke("frame", np.full((SIZE[1], SIZE[0], 3), code, np.uint8))
     outputs = see_ball(rig, eye)
     expected = decode_table("srgb")[code] / REFLECTANCE
@@ -120,10 +120,10 @@ def test_a_constant_frame_is_a_constant_map(rig_for, rung, eye, code):
 
 @pytest.mark.atlas(row=3, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="fill")
-@pytest.mark.parametrize("rung", RUNGS["unwrap"])
-def test_a_ball_that_is_not_to_be_seen_leaves_the_light_alone(rig_for, rung):
+@pytest.mark.parametrize("method", METHODS["unwrap"])
+def test_a_ball_that_is_not_to_be_seen_leaves_the_light_alone(rig_for, method):
     """Documented fallback: no confidence, and the map stays as it was."""
-    rig = rig_for("unwrap", rung)
+    rig = rig_for("unwrap", method)
     rig.run("fill")
     before = rig.written("fill")
     outputs = see_ball(rig, CENTER + 0.5 * RADIUS)  # from inside the ball

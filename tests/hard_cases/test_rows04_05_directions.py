@@ -14,46 +14,57 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.hard_cases.generators import directions, frames
-from tests.hard_cases.rig import RUNGS, SIZE, LoneStage, assert_finite, solid_angles
+from tests.hard_cases.rig import METHODS, SIZE, LoneStage, assert_finite, solid_angles
 from warp_ar.kernels import irradiance, latlong, materials, prefilter, sampling, visibility
 from warp_ar.scene import Pose
 
 FURNACE = 5e-4
 LIGHT_STAGES = [
-    (stage, rung) for stage in ("fill", "key_lights", "diffuse", "specular", "room_samples") for rung in RUNGS[stage]
+    (stage, method)
+    for stage in ("fill", "key_lights", "diffuse", "specular", "environment_samples")
+    for method in METHODS[stage]
 ]
-AXIS_STAGES = ("recover", "visibility", "relight", "room_shadow", "object_light", "shade", "mirror_ball", "declip")
+AXIS_STAGES = (
+    "recover",
+    "visibility",
+    "relight",
+    "environment_shadow",
+    "object_light",
+    "shade",
+    "mirror_ball",
+    "declip",
+)
 make_lone = functools.lru_cache(maxsize=64)(LoneStage)
 
 
-def tolerance(rung, height):
+def tolerance(method, height):
     """The furnace's; a block of texels wider than 13 degrees is more than its mean direction and spread can tell."""
-    return max(FURNACE, 0.12 / height**2) if rung in ("clusters", "brute_force") else FURNACE
+    return max(FURNACE, 0.12 / height**2) if method in ("clusters", "brute_force") else FURNACE
 
 
-def inputs_of(stage, room):
+def inputs_of(stage, surroundings):
     if stage != "fill":
-        return {"environment": room}
-    return {"environment_radiance": room, "environment_confidence": np.ones(room.shape[:2])}
+        return {"environment": surroundings}
+    return {"environment_radiance": surroundings, "environment_confidence": np.ones(surroundings.shape[:2])}
 
 
 @pytest.mark.atlas(row=4)
 @pytest.mark.atlas(row=18)
-@pytest.mark.parametrize(("stage", "rung"), LIGHT_STAGES)
+@pytest.mark.parametrize(("stage", "method"), LIGHT_STAGES)
 @given(height=st.integers(1, 24), exponent=st.floats(-8, 7.9))
 @example(height=1, exponent=0.0)
 @example(height=2, exponent=0.0)
 @example(height=3, exponent=-8.0)
 @example(height=13, exponent=4.0)
-def test_a_white_furnace_at_any_size(device, stage, rung, height, exponent):
+def test_a_white_furnace_at_any_size(device, stage, method, height, exponent):
     """Sizes from 1x2 up, odd and prime; radiance from 1e-8 to 1e8."""
     radiance = np.float32(10.0**exponent)
-    out = make_lone(device, stage, rung, height).run(**inputs_of(stage, np.full((height, 2 * height, 3), radiance)))
+    out = make_lone(device, stage, method, height).run(**inputs_of(stage, np.full((height, 2 * height, 3), radiance)))
     assert_finite(out)
     if stage == "key_lights":
-        assert out["key_lights"]["dominance"].max() < 1e-3
-    elif stage == "room_samples":
-        samples = out["room_samples"]
+        assert out["key_lights"]["directionality"].max() < 1e-3
+    elif stage == "environment_samples":
+        samples = out["environment_samples"]
         np.testing.assert_allclose(samples["radiance"], radiance, rtol=FURNACE)
         assert (samples["measure"] > 0).all()
         # Stratified by weight, not by solid angle: the sum of measures is an estimate of 4 pi.
@@ -65,30 +76,30 @@ def test_a_white_furnace_at_any_size(device, stage, rung, height, exponent):
     else:
         (values,) = out.values()
         expected = radiance * (np.pi if stage == "diffuse" else 1.0)
-        np.testing.assert_allclose(values, expected, rtol=tolerance(rung, height))
+        np.testing.assert_allclose(values, expected, rtol=tolerance(method, height))
 
 
 @pytest.mark.atlas(row=4)
-@pytest.mark.parametrize(("stage", "rung"), [case for case in LIGHT_STAGES if case[0] != "key_lights"])
+@pytest.mark.parametrize(("stage", "method"), [case for case in LIGHT_STAGES if case[0] != "key_lights"])
 @given(height=st.sampled_from([1, 2, 3, 5, 7, 8, 13, 16]), turn=st.integers(0, 31), seed=st.integers(0, 3))
-def test_no_answer_leaves_the_maps_range(device, stage, rung, height, turn, seed):
+def test_no_answer_leaves_the_maps_range(device, stage, method, height, turn, seed):
     """Whatever stands at the poles and across the seam is blended, never extrapolated."""
-    room = np.random.default_rng(seed).uniform(0.5, 2.0, (height, 2 * height, 3))
-    room = np.roll(room, turn, axis=1).astype(np.float32)
-    out = make_lone(device, stage, rung, height).run(**inputs_of(stage, room))
+    surroundings = np.random.default_rng(seed).uniform(0.5, 2.0, (height, 2 * height, 3))
+    surroundings = np.roll(surroundings, turn, axis=1).astype(np.float32)
+    out = make_lone(device, stage, method, height).run(**inputs_of(stage, surroundings))
     assert_finite(out)
-    if stage == "room_samples":
-        values = out["room_samples"]["radiance"]
+    if stage == "environment_samples":
+        values = out["environment_samples"]["radiance"]
     elif "irradiance_sh" in out:
-        mean = (solid_angles(height, 2 * height)[..., None] * room).sum((0, 1)) / (4 * np.pi)
+        mean = (solid_angles(height, 2 * height)[..., None] * surroundings).sum((0, 1)) / (4 * np.pi)
         np.testing.assert_allclose(out["irradiance_sh"][0] * 0.28209479, np.pi * mean, rtol=FURNACE)
         return
     else:
         (values,) = out.values()
         values = values / (np.pi if stage == "diffuse" else 1.0)
-    slack = 1.1 if rung == "sh4" else 1 + tolerance(rung, height)  # a truncated series rings
-    slack = 1.2 if stage == "specular" and rung not in ("box_mip", "brute_force") else slack  # scaled to the energy
-    assert room.min() / slack <= values.min() <= values.max() <= room.max() * slack
+    slack = 1.1 if method == "sh4" else 1 + tolerance(method, height)  # a truncated series rings
+    slack = 1.2 if stage == "specular" and method not in ("box_mip", "brute_force") else slack  # scaled to the energy
+    assert surroundings.min() / slack <= values.min() <= values.max() <= surroundings.max() * slack
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -123,8 +134,8 @@ def evaluate_kernel(
     )
 
 
-@pytest.mark.atlas(row=5, stage="specular", rung="*")
-@pytest.mark.atlas(row=5, stage="diffuse", rung="*")
+@pytest.mark.atlas(row=5, stage="specular", method="*")
+@pytest.mark.atlas(row=5, stage="diffuse", method="*")
 def test_directions_an_ulp_beyond_unit_length(device):
     """Look-ups and lobes along axes, poles, seam and diagonals, and a few ulp beside them."""
     height = 8
@@ -158,13 +169,13 @@ def test_directions_an_ulp_beyond_unit_length(device):
 
 @pytest.mark.atlas(row=5)
 @pytest.mark.parametrize(
-    ("stage", "rung"),
-    [(stage, rung) for stage in AXIS_STAGES for rung in RUNGS[stage]],
+    ("stage", "method"),
+    [(stage, method) for stage in AXIS_STAGES for method in METHODS[stage]],
 )
 @pytest.mark.parametrize("up", [1.0, -1.0])
-def test_looking_exactly_along_the_axis(rig_for, stage, rung, up):
+def test_looking_exactly_along_the_axis(rig_for, stage, method, up):
     """A camera straight above or below: view, desk's normal, ball's normal and mirror direction all exactly +/-z."""
-    rig = rig_for(stage, rung)
+    rig = rig_for(stage, method)
     rotation = np.diag([1.0, -up, -up])
     pose = Pose(rotation, -rotation @ np.array([0.09, 0.0, up * 0.5]))
     names = [one.name for one, _ in rig.pipeline._scheduler._stages]

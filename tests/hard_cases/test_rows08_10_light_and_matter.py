@@ -1,7 +1,7 @@
 """Rows 8 to 10: materials at their ends, lights in hard places, relief without a light that dominates.
 
-Bounds: finite, not negative; lights that cannot reach the desk add exactly nothing; a room without a direction says
-nothing about relief.
+Bounds: finite, not negative; lights that cannot reach the desk add exactly nothing; an environment without a direction
+says nothing about relief.
 """
 
 from __future__ import annotations
@@ -14,14 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import RUNGS, SIZE, assert_finite, look_at
+from tests.hard_cases.rig import METHODS, SIZE, assert_finite, look_at
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 LIGHTS = generators.lights()
 WHOLE = (0, SIZE[1], 0, SIZE[0])
-SHADING = [(stage, rung) for stage in ("shade", "room_shadow", "object_light", "mirror_ball") for rung in RUNGS[stage]]
-LIT = [(stage, rung) for stage in ("relight", "shade", "mirror_ball") for rung in RUNGS[stage]]
+SHADING = [
+    (stage, method)
+    for stage in ("shade", "environment_shadow", "object_light", "mirror_ball")
+    for method in METHODS[stage]
+]
+LIT = [(stage, method) for stage in ("relight", "shade", "mirror_ball") for method in METHODS[stage]]
 # A change of what the camera saw.
 SIGNED = ("mirrored",)
 ENDS = (
@@ -52,8 +56,8 @@ def rig_of(rig_for):
     """``rig_for``, with the materials of the scene put back afterwards."""
     used = {}
 
-    def made(stage, rung):
-        rig = rig_for(stage, rung)
+    def made(stage, method):
+        rig = rig_for(stage, method)
         used[id(rig)] = rig, rig.pipeline._host_scene.ray_scene.materials.numpy().copy()
         return rig
 
@@ -84,22 +88,22 @@ def assert_light(outputs, cause):
 
 
 @pytest.mark.atlas(row=8)
-@pytest.mark.parametrize(("stage", "rung"), SHADING)
+@pytest.mark.parametrize(("stage", "method"), SHADING)
 @pytest.mark.parametrize("eye", [(0.02, -0.3, 0.35), (0.0, -0.5, 1e-4)], ids=["above", "grazing"])
-def test_materials_at_their_ends(rig_of, stage, rung, eye):
+def test_materials_at_their_ends(rig_of, stage, method, eye):
     """Every end of every model, from above and along the desk, under lights from above and along the desk."""
-    rig = rig_of(stage, rung)
+    rig = rig_of(stage, method)
     inverse = look_at(eye).inverse()
     rig.set_params(camera_position=inverse.translation, world_from_camera=inverse.rotation, shadow_rect=WHOLE)
     for light in ({"direction": (0, 0, -1)}, {"direction": (0.0, 1.0, 0.0), "position": (0.3, 0.0, 0.0)}):
         set_lights(rig, **light)
-        for ends in ENDS if rung != "brute_force" else ENDS[1:9:3]:
+        for ends in ENDS if method != "brute_force" else ENDS[1:9:3]:
             set_materials(rig, **ends)
             assert_light(run_until(rig, stage), f"for {ends}")
 
 
 @pytest.mark.atlas(row=8, stage="shade")
-@pytest.mark.parametrize("rung", RUNGS["shade"])
+@pytest.mark.parametrize("method", METHODS["shade"])
 @given(
     shininess=st.floats(0, 1e5),
     roughness=st.floats(0, 1),
@@ -107,18 +111,18 @@ def test_materials_at_their_ends(rig_of, stage, rung, eye):
     model=st.sampled_from([PHONG, METALLIC_ROUGHNESS]),
     turn=st.floats(0, math.pi),
 )
-def test_materials_anywhere_between(rig_of, rung, shininess, roughness, metallic, model, turn):
-    rig = rig_of("shade", rung)
+def test_materials_anywhere_between(rig_of, method, shininess, roughness, metallic, model, turn):
+    rig = rig_of("shade", method)
     set_lights(rig, direction=(math.sin(turn), 0.0, math.cos(turn)), position=(-math.sin(turn), 0.0, -math.cos(turn)))
     set_materials(rig, model=model, shininess=shininess, roughness=roughness, metallic=metallic)
     assert_light(rig.run("shade"), "")
 
 
 @pytest.mark.atlas(row=9)
-@pytest.mark.parametrize(("stage", "rung"), LIT)
+@pytest.mark.parametrize(("stage", "method"), LIT)
 @pytest.mark.parametrize("name", LIGHTS)
-def test_lights_in_hard_places(rig_for, stage, rung, name):
-    rig = rig_for(stage, rung)
+def test_lights_in_hard_places(rig_for, stage, method, name):
+    rig = rig_for(stage, method)
     for content in ("noise", "black", "white"):
         rig.poke("frame", FRAMES[content])
         set_lights(rig, **LIGHTS[name])
@@ -130,16 +134,16 @@ def test_lights_in_hard_places(rig_for, stage, rung, name):
 
 
 @pytest.mark.atlas(row=10, stage="relight")
-@pytest.mark.parametrize("rung", RUNGS["relight"])
-def test_a_room_without_direction_says_nothing_about_relief(rig_for, rung):
-    """No dominance: whichever way the key light looks, the desk answers the same."""
-    rig = rig_for("relight", rung)
+@pytest.mark.parametrize("method", METHODS["relight"])
+def test_a_environment_without_direction_says_nothing_about_relief(rig_for, method):
+    """No directionality: whichever way the key light looks, the desk answers the same."""
+    rig = rig_for("relight", method)
     if "key_lights" not in rig.stage("relight")[0].wiring.reads:
-        return  # a rung that does not ask
+        return  # a method that does not ask
     key = rig.get("key_lights")
     found = []
     for direction in ((0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 0, 0)):
-        key["direction"], key["dominance"] = direction, 0.0
+        key["direction"], key["directionality"] = direction, 0.0
         rig.arrays["key_lights"].assign(key)
         found.append(rig.run("relight")["physical_added"])
     for other in found[1:]:
@@ -147,19 +151,19 @@ def test_a_room_without_direction_says_nothing_about_relief(rig_for, rung):
 
 
 @pytest.mark.atlas(row=10, stage="relight")
-@pytest.mark.parametrize("rung", RUNGS["relight"])
-def test_relief_from_one_end_of_alpha_to_the_other(rig_for, rung):
+@pytest.mark.parametrize("method", METHODS["relight"])
+def test_relief_from_one_end_of_alpha_to_the_other(rig_for, method):
     """The key light turned from along the virtual one to against it: bounded, continuous, and the ends differ."""
-    rig = rig_for("relight", rung)
+    rig = rig_for("relight", method)
     if "key_lights" not in rig.stage("relight")[0].wiring.reads:
-        return  # a rung that does not ask
+        return  # a method that does not ask
     rig.poke("frame", FRAMES["noise"])
     if "summed_area" in rig.arrays:
         rig.run("summed_area")
     set_lights(rig, **{**LIGHTS["grazing sun"], "direction": (0.0, 0.0, -1.0), "intensity": (1.0, 1.0, 1.0)})
     key, found = rig.get("key_lights"), []
     for alpha in np.linspace(-1, 1, 41):
-        key["direction"], key["dominance"] = (math.sqrt(max(1 - alpha**2, 0)), 0.0, alpha), 1.0
+        key["direction"], key["directionality"] = (math.sqrt(max(1 - alpha**2, 0)), 0.0, alpha), 1.0
         rig.arrays["key_lights"].assign(key)
         found.append(rig.run("relight")["physical_added"])
         assert_light({"physical_added": found[-1]}, f"at alpha = {alpha}")
@@ -169,12 +173,12 @@ def test_relief_from_one_end_of_alpha_to_the_other(rig_for, rung):
 
 
 @pytest.mark.atlas(row=10, stage="key_lights")
-@pytest.mark.parametrize("room", ["uniform", "two equal opposite suns", "black", "denormal"])
-def test_no_single_light_dominates(rig_for, room):
-    """A uniform room, two equal opposite lights, no light: none has a say, all directions are unit."""
+@pytest.mark.parametrize("surroundings", ["uniform", "two equal opposite suns", "black", "denormal"])
+def test_no_single_light_dominates(rig_for, surroundings):
+    """A uniform environment, two equal opposite lights, no light: none has a say, all directions are unit."""
     rig = rig_for("key_lights", "default")
     height = rig.get("environment").shape[0]
-    rig.poke("environment", generators.finite_maps(height, 2 * height)[room])
+    rig.poke("environment", generators.finite_maps(height, 2 * height)[surroundings])
     key = rig.run("key_lights")["key_lights"]
-    assert key["dominance"].max() <= 0.01
+    assert key["directionality"].max() <= 0.01
     np.testing.assert_allclose(np.linalg.norm(key["direction"], axis=-1), 1.0, atol=1e-5)

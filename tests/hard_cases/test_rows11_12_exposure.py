@@ -15,7 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import RUNGS, SIZE
+from tests.hard_cases.rig import METHODS, SIZE
 from warp_ar.kernels import color, composite, exposure, summed_area
 from warp_ar.kernels.structs import FrameParams
 
@@ -90,7 +90,7 @@ def tables(device):
     )
 
 
-def expose(rung, image, scale, device):
+def expose(method, image, scale, device):
     """The frame at another exposure, without layers."""
     decode, encode = tables(device)
     frame = wp.array(np.ascontiguousarray(image), dtype=wp.vec3ub)
@@ -103,45 +103,54 @@ def expose(rung, image, scale, device):
     exposure.read_scale(params, factor)
     exposure.expose_codes(decode, encode, factor, codes)
     exposure.expose(
-        exposure.ExposureConfig(rung), params, frame, decode, encode, composite.make_layers(), table, factor, codes, out
+        exposure.ExposureConfig(method),
+        params,
+        frame,
+        decode,
+        encode,
+        composite.make_layers(),
+        table,
+        factor,
+        codes,
+        out,
     )
     return out.numpy()
 
 
-KERNEL_RUNGS = [rung for rung in RUNGS["expose"] if rung in ("plain", "box")]
+KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", "box")]
 
 
 @pytest.mark.atlas(row=11, stage="expose")
-@pytest.mark.parametrize("rung", KERNEL_RUNGS)
+@pytest.mark.parametrize("method", KERNEL_METHODS)
 @given(rows=st.integers(1, 70), columns=st.integers(1, 70), scale=st.floats(0, 1))
 @example(rows=1, columns=1, scale=0.5)
 @example(rows=70, columns=1, scale=JUST_BELOW_1)
-def test_a_white_frame_of_any_size_fades_evenly(device, rung, rows, columns, scale):
+def test_a_white_frame_of_any_size_fades_evenly(device, method, rows, columns, scale):
     """Boxes that reach beyond the frame count what is inside it: no dark borders, no corners."""
-    out = expose(rung, np.full((rows, columns, 3), 255, np.uint8), scale, device)
+    out = expose(method, np.full((rows, columns, 3), 255, np.uint8), scale, device)
     assert (out == out[0, 0]).all()
 
 
 @pytest.mark.atlas(row=12, stage="expose")
-@pytest.mark.parametrize("rung", KERNEL_RUNGS)
+@pytest.mark.parametrize("method", KERNEL_METHODS)
 @pytest.mark.parametrize("name", FRAMES)
-def test_exposures_at_their_ends(device, rung, name):
+def test_exposures_at_their_ends(device, method, name):
     frame = FRAMES[name]
-    np.testing.assert_array_equal(expose(rung, frame, 1.0, device), frame)
+    np.testing.assert_array_equal(expose(method, frame, 1.0, device), frame)
     for black in (0.0, -1.0, np.nan, 1e-8):
-        assert (expose(rung, frame, black, device) == 0).all()
-    np.testing.assert_array_equal(expose(rung, frame, JUST_BELOW_1, device), frame)
-    brighter = expose(rung, frame, 1e8, device)
+        assert (expose(method, frame, black, device) == 0).all()
+    np.testing.assert_array_equal(expose(method, frame, JUST_BELOW_1, device), frame)
+    brighter = expose(method, frame, 1e8, device)
     np.testing.assert_array_equal(brighter, np.where(frame > 0, 255, 0))
     scales = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0, 1.5, 3.0)
-    pictures = np.array([expose(rung, frame, scale, device) for scale in scales]).astype(int)
+    pictures = np.array([expose(method, frame, scale, device) for scale in scales]).astype(int)
     assert (np.diff(pictures, axis=0) >= 0).all(), "darker, yet a pixel got brighter"
 
 
 def untouched_by(rig):
     """Pixels that no layer changes."""
     untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
-    for name, neutral in (("physical_ratio", 1.0), ("mirrored", 0.0)):
+    for name, neutral in (("shadow_ratio", 1.0), ("mirrored", 0.0)):
         if name in rig.arrays:
             untouched &= (rig.get(name) == neutral).all(-1)
     return untouched
@@ -149,13 +158,13 @@ def untouched_by(rig):
 
 @pytest.mark.atlas(row=12)
 @pytest.mark.parametrize(
-    ("stage", "rung"),
-    [("summed_area", "default"), ("composite", "default"), *(("expose", rung) for rung in RUNGS["expose"])],
+    ("stage", "method"),
+    [("summed_area", "default"), ("composite", "default"), *(("expose", method) for method in METHODS["expose"])],
 )
 @pytest.mark.parametrize("name", ["black", "white", "one saturated pixel"])
-def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, rung, name):
+def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, method, name):
     """A black desk stays black where nothing falls on it; a saturated one is no darker for light added to it."""
-    rig = rig_for(stage, rung)
+    rig = rig_for(stage, method)
     picture = rig.frame(FRAMES[name])
     if stage == "summed_area":
         weights = np.array([54, 183, 19])  # Rec. 709 in 256ths
@@ -171,10 +180,10 @@ def test_frames_at_their_ends_in_the_pipeline(rig_for, stage, rung, name):
 
 
 @pytest.mark.atlas(row=11, stage="expose")
-@pytest.mark.parametrize("rung", RUNGS["expose"])
-def test_no_box_beyond_the_frame_darkens_its_border(rig_for, rung):
+@pytest.mark.parametrize("method", METHODS["expose"])
+def test_no_box_beyond_the_frame_darkens_its_border(rig_for, method):
     """On a white frame every pixel, in corners too, is at least as bright as scaling alone makes it."""
-    rig = rig_for("expose", rung)
+    rig = rig_for("expose", method)
     picture = rig.frame(FRAMES["white"])
     untouched = untouched_by(rig)
     scale = rig.get("expose_scale")[0]

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import (
+    METHODS,
     POSE,
-    RUNGS,
     SIZE,
     SOFT,
     Rig,
@@ -36,9 +36,9 @@ from warp_ar.scene.geometry import Mesh, load_mesh, rotation_matrix
 from warp_ar.scene.ray_scene import HostScene, trace_config
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
-RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "room_shadow", "object_light", "mirror_ball", "declip")
+RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "environment_shadow", "object_light", "mirror_ball", "declip")
 """Stages whose outputs are those of the same picture at any scale; ``recover`` rests on a card of the marker's size."""
-RAY_RUNGS = [(stage, rung) for stage in RAY_STAGES for rung in RUNGS[stage]]
+RAY_METHODS = [(stage, method) for stage in RAY_STAGES for method in METHODS[stage]]
 LONG_RAYS, SHORT_RAYS = 10_000_000, 100_000
 BATCH = 500_000
 
@@ -137,9 +137,9 @@ def _cube(device) -> Mesh:
 
 
 @pytest.mark.atlas(row=13)
-@pytest.mark.parametrize(("stage", "rung"), [*RAY_RUNGS, *(("recover", rung) for rung in RUNGS["recover"])])
-def test_broken_meshes_in_the_pipeline(device, stage, rung, tmp_path):
-    """Inside-out, duplicated and zero-area triangles together, an open fan on top: finite pictures at every rung.
+@pytest.mark.parametrize(("stage", "method"), [*RAY_METHODS, *(("recover", method) for method in METHODS["recover"])])
+def test_broken_meshes_in_the_pipeline(device, stage, method, tmp_path):
+    """Inside-out, duplicated and zero-area triangles together, an open fan on top: finite pictures at every method.
 
     Once as an object and once as a proxy, which hides the ball in part.
     """
@@ -147,10 +147,10 @@ def test_broken_meshes_in_the_pipeline(device, stage, rung, tmp_path):
     mesh = generators.spoilt(mesh, "zero area")
     file = write(dataclasses.replace(mesh, faces=mesh.faces[5:]), tmp_path / "broken.ply")
     scene = make_scene()
-    things = (Object("mesh", file=file, scale=0.03, at=(0.05, 0.08, 0.02), material=PhongMaterial()), *scene.objects)
+    items = (Object("mesh", file=file, scale=0.03, at=(0.05, 0.08, 0.02), material=PhongMaterial()), *scene.objects)
     pebble = dataclasses.replace(mesh, vertices=np.float32([-0.07, -0.04, 0.08]) + 0.015 * mesh.vertices)
     proxies = (Proxy("mesh", file=write(pebble, tmp_path / "pebble.ply")), *scene.proxies)
-    with Rig(device, stage, rung, objects=things, proxies=proxies) as rig:
+    with Rig(device, stage, method, objects=items, proxies=proxies) as rig:
         for name in ("noise", "white"):
             picture = rig.frame(FRAMES[name])
             outputs = {key: rig.get(key) for one, _ in rig.pipeline._scheduler._stages for key in one.wiring.writes}
@@ -188,19 +188,19 @@ def test_a_mesh_without_surface_is_an_error_or_nothing(device, faces, tmp_path):
 # --- Offsets ----------------------------------------------------------------------------------------------------------
 
 
-def render(device, stage, rung, scale, shift):
+def render(device, stage, method, scale, shift):
     """One frame of the scene at another scale and place, through the stage; what the stage wrote."""
-    request = request_for(stage, rung)
+    request = request_for(stage, method)
     scene = make_scene(scale, shift, exposure=request.scene.exposure)
-    if rung == SOFT:
+    if method == SOFT:
         scene = with_sized_lights(scene, scale)
     eye = scale * POSE.inverse().translation + np.asarray(shift)
     changes = {name: getattr(scene, name) for name in ("probes", "proxies", "objects", "lights")}
-    with Rig(device, stage, rung, pose=Pose(POSE.rotation, -POSE.rotation @ eye), **changes) as rig:
+    with Rig(device, stage, method, pose=Pose(POSE.rotation, -POSE.rotation @ eye), **changes) as rig:
         rig.frame(FRAMES["ramp"])
         names = [one.name for one, _ in rig.pipeline._scheduler._stages]
         if "recover" in names[: names.index(stage)]:
-            # Recovery rests on a card of decimetres and looks for lamps as near as that: the same room for all.
+            # Recovery rests on a card of decimetres and looks for lamps as near as that: the same environment for all.
             rig.poke("environment", np.random.default_rng(0).uniform(0.1, 2.0, rig.get("environment").shape))
             if "lamps" in rig.arrays:
                 rig.arrays["lamps"].zero_()
@@ -227,7 +227,7 @@ PLACES = pytest.mark.parametrize(
 
 
 def receive(device, scale, shift):
-    """What points on the faces of the proxies receive from the room and from a lamp, per unit of both."""
+    """What points on the faces of the proxies receive from the environment and from a lamp, per unit of both."""
     scene, turn, half = make_scene(scale, shift, objects=()), (10.0, 20.0, 30.0), np.array([0.05, 0.025, 0.03])
     middle = scale * np.array([0.0, 0.13, 0.08]) + shift
     box = Proxy("box", at=tuple(middle), size=tuple(2 * scale * half), rotate=turn)
@@ -249,10 +249,10 @@ def receive(device, scale, shift):
     return straight, mirrored, scale**2 * out.numpy()
 
 
-@pytest.mark.atlas(row=14, stage="recover", rung="*")
+@pytest.mark.atlas(row=14, stage="recover", method="*")
 @PLACES
 def test_surfaces_receive_the_same_light_at_any_scale_and_place(device, scale, shift):
-    """No surface shades itself: the room's light comes from where it comes from on a desk of decimetres."""
+    """No surface shades itself: the environment comes from where it comes from on a desk of decimetres."""
     expected, found = receive(device, 1.0, (0, 0, 0)), receive(device, scale, shift)
     for one, other in zip(expected, found, strict=True):
         # A point that a ray meets may lie on the other side of a cell's edge, as the ball sees it.
@@ -263,13 +263,13 @@ def test_surfaces_receive_the_same_light_at_any_scale_and_place(device, scale, s
 
 
 @pytest.mark.atlas(row=14)
-@pytest.mark.parametrize(("stage", "rung"), RAY_RUNGS)
+@pytest.mark.parametrize(("stage", "method"), RAY_METHODS)
 @PLACES
-def test_the_picture_does_not_depend_on_scale_or_place(device, stage, rung, scale, shift):
+def test_the_picture_does_not_depend_on_scale_or_place(device, stage, method, scale, shift):
     """No acne, no light leaks: a desk of 1 mm, of 1 km, and one of metres a kilometre from the origin."""
-    if rung == "brute_force" and shift != (0, 0, 0):
+    if method == "brute_force" and shift != (0, 0, 0):
         pytest.skip("the reference is tried at one place")
-    expected, found = render(device, stage, rung, 1.0, (0, 0, 0)), render(device, stage, rung, scale, shift)
+    expected, found = render(device, stage, method, 1.0, (0, 0, 0)), render(device, stage, method, scale, shift)
     for name, values in expected.items():
         if name in ("hits", "hit_depth"):
             continue

@@ -1,4 +1,4 @@
-"""Float64 twin of ``warp_ar.kernels.mirror_ball``: Lambertian things, one point light with hard shadows, a pinhole."""
+"""Float64 twin of ``warp_ar.kernels.mirror_ball``: Lambertian objects, one point light with hard shadows, a pinhole."""
 
 from __future__ import annotations
 
@@ -81,15 +81,15 @@ def mirror(world: World, directions, seen, kd: Callable, project: Callable, laye
     rho = world.rho[which]
     label[on] = 1 + first + 10 * which
 
-    thing = first == 1
-    normals = ways[1][2][thing]
-    normals *= -np.sign((normals * outward[thing]).sum(-1, keepdims=True))
-    radiance = np.zeros((thing.sum(), 3))
+    item = first == 1
+    normals = ways[1][2][item]
+    normals *= -np.sign((normals * outward[item]).sum(-1, keepdims=True))
+    radiance = np.zeros((item.sum(), 3))
     if world.light is not None:
-        radiance = lambert(world, met[thing], normals, [*world.proxies, *world.objects])
-        radiance *= world.base[ways[1][1][thing]] / np.pi
-    change[on[thing]] = rho[thing] * radiance - seen[on[thing]]
-    label[on[thing]] += 100 * (radiance.max(-1) > 0) + 1000 * ways[1][1][thing]
+        radiance = lambert(world, met[item], normals, [*world.proxies, *world.objects])
+        radiance *= world.base[ways[1][1][item]] / np.pi
+    change[on[item]] = rho[item] * radiance - seen[on[item]]
+    label[on[item]] += 100 * (radiance.max(-1) > 0) + 1000 * ways[1][1][item]
 
     desk = first == 0
     normals = ways[0][2][desk]

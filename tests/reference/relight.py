@@ -45,9 +45,9 @@ def relief_factor(m, alpha):
     return np.maximum(1.0 + np.clip(alpha, -1.0, 1.0) * (np.minimum(m, 4.0) - 1.0), 0.0)
 
 
-def turned_relief(m, alpha, dominance):
+def turned_relief(m, alpha, directionality):
     x = np.clip((m - 1.0) / 0.6, -1.0, 1.0)
-    e = dominance * (1.0 - x * x) ** 2 * 0.6 * x
+    e = directionality * (1.0 - x * x) ** 2 * 0.6 * x
     return (1.0 + alpha * e) / (1.0 + e)
 
 
@@ -65,17 +65,17 @@ def surrounding_luminance(frame, decode_table, size):
     return np.maximum(np.interp(mean, np.arange(256), grey), 1e-4)
 
 
-def respond(rung, frame, radiance, around, n_dot_l, alpha, dominance, room):
+def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, surroundings):
     """(Kd, response) of one light, equations of the module's docstring."""
     m = (radiance @ LUMINANCE)[..., None]
     kd = np.full(radiance.shape, 0.5)
-    if rung == "flat":
+    if method == "flat":
         return kd, n_dot_l
-    if rung == "paper":
-        return kd, printed_response(n_dot_l, m, alpha * dominance)
+    if method == "paper":
+        return kd, printed_response(n_dot_l, m, alpha * directionality)
     relative = m / around[..., None]
-    if rung == "relief":
+    if method == "relief":
         hue = radiance + 0.01
         kd = np.minimum(around[..., None] / (hue @ LUMINANCE)[..., None] * hue, 1.0)
-        return kd, n_dot_l * relief_factor(relative, alpha * dominance)
-    return reflectance(radiance, room), n_dot_l * turned_relief(relative, alpha, dominance)
+        return kd, n_dot_l * relief_factor(relative, alpha * directionality)
+    return reflectance(radiance, surroundings), n_dot_l * turned_relief(relative, alpha, directionality)

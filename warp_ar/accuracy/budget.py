@@ -1,23 +1,23 @@
-"""``--quality auto``: the rungs that err least within a time budget, and a change of them when the load changes.
+"""``--quality auto``: the methods that err least within a time budget, and a change of them when the load changes.
 
-**Prices.** Errors come from the price list that is part of the package. Costs depend on the device and on the scene,
+**Costs.** Errors come from the cost table that is part of the package. Costs depend on the device and on the scene,
 so they are measured here (``warp_ar.accuracy.costs``), on the first frame that shows the marker.
 
 **Load.** A frame should take what its settings cost times a load, which is what frames took over what they should have
 taken. Costs and load are told apart by when they change: what differs just after other settings are shown is theirs,
 what differs later is the load's.
 
-**Choice.** The settings are the best of the frontier whose cost times the load is at most ``AIM`` budget, to go up
-``RAISE`` budget. Settings that were timed cost what they took; others what the prices say, times the ratio in which the
+**Choice.** The settings are the best of the Pareto front whose cost times the load is at most ``AIM`` budget, to go up
+``RAISE`` budget. Settings that were timed cost what they took; others what the costs say, times the ratio in which the
 timed settings that are most like them departed from it.
 
 **Steadiness.** Nothing is decided before ``WINDOW`` frames ran as they are, and their median counts, or that of up to
 ``LONG_WINDOW`` frames where the budget is not exceeded by much. Over it, the choice is made anew at once. Under it,
 only what errs less by ``GAIN`` is worth a change, and only after it would have fit for ``PATIENCE``. After the first
-choice a knob moves at most one rung in ``KNOB_SECONDS``, and all move until they are where they were to go, or the
-budget is exceeded; of a mixed move that would not fit, what saves goes first.
+choice a setting moves at most one method in ``SETTING_SECONDS``, and all move until they are where they were to go, or
+the budget is exceeded; of a mixed move that would not fit, what saves goes first.
 
-**Switching.** Each set of rungs has a pipeline of its own. It is built on a thread of its own while frames go on, and
+**Switching.** Each set of methods has a pipeline of its own. It is built on a thread of its own while frames go on, and
 lights a few frames there that nobody sees: that loads its kernels, and tells what it costs. If that fits, it takes over
 the light, the clock and the track of the marker between two frames; if not, the choice is made anew.
 """
@@ -38,13 +38,21 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import warp as wp
 
-from warp_ar.accuracy.cost_table import Choice, frontier, load_errors, relevant_knobs, setting, turn, undominated
+from warp_ar.accuracy.cost_table import (
+    Choice,
+    chosen,
+    load_errors,
+    pareto_front,
+    pareto_optimal,
+    relevant_settings,
+    turn,
+)
 from warp_ar.accuracy.costs import (
     BASE,
     Costs,
     cache_folder,
     cost_key,
-    make_prices,
+    make_method_costs,
     measure_costs,
     read_costs,
     time_alone,
@@ -76,9 +84,9 @@ SETTLE = 2
 GAIN = 0.03
 """Share of the predicted error, or over the budget of the time, that a change must save."""
 PATIENCE = 2.0
-"""Seconds for which every frame must leave room for what errs less before it is tried."""
-KNOB_SECONDS = 0.5
-"""Shortest time between two rungs of one knob."""
+"""Seconds for which every frame must leave environment for what errs less before it is tried."""
+SETTING_SECONDS = 0.5
+"""Shortest time between two methods of one setting."""
 MEMORY = 60.0
 """Seconds for which what settings took when they were shown is held against them: a moment's load may have been in it.
 What they took alone is known for good."""
@@ -121,19 +129,24 @@ class Controller:
 
         Args:
             costs: Measured on this device.
-            errors: By knob and rung.
+            errors: By setting and method.
             budget_ms: Milliseconds per frame.
             running: Settings of the frames to come; the first choice is made from what they take. None chooses now.
         """
         self.budget_ms = budget_ms
         self._costs = costs
-        prices = make_prices(costs, errors)
-        self._errors = {(price.knob, price.rung): price.error for price in prices}
+        method_costs = make_method_costs(costs, errors)
+        self._errors = {(method_cost.setting, method_cost.method): method_cost.error for method_cost in method_costs}
         self._ladders = {
-            knob: [price.rung for price in undominated([price for price in prices if price.knob == knob])]
-            for knob in costs.rungs
+            setting: [
+                method_cost.method
+                for method_cost in pareto_optimal(
+                    [method_cost for method_cost in method_costs if method_cost.setting == setting]
+                )
+            ]
+            for setting in costs.methods
         }
-        self._front = frontier(prices, costs.scales)
+        self._front = pareto_front(method_costs, costs.scales)
         self._timed: dict[frozenset[tuple[str, str]], _Timed] = {}
         self._predicted: list[float] | None = None
         self._factor: float | None = None
@@ -158,7 +171,7 @@ class Controller:
 
     @property
     def choices(self) -> list[Choice]:
-        """All that a budget may buy, cheapest first; milliseconds are relative to the base, as the prices have them."""
+        """All that a budget may buy, cheapest first; milliseconds are relative to the base, as the costs have them."""
         return self._front
 
     @property
@@ -182,7 +195,7 @@ class Controller:
 
     @property
     def expected_error(self) -> float:
-        """FLIP above that of the best rungs that the price list expects of the present settings."""
+        """FLIP above that of the best methods that the cost table expects of the present settings."""
         return sum(self._errors[pair] for pair in self.settings.items())
 
     def _cost(self, settings: Mapping[str, str]) -> float:
@@ -193,15 +206,17 @@ class Controller:
         return (self._costs.base + self._costs.excess(settings)) * self._departure(settings)
 
     def _departure(self, settings: Mapping[str, str]) -> float:
-        """What the timed settings that are most like these took, over what the prices say."""
+        """What the timed settings that are most like these took, over what the costs say."""
         # By the milliseconds of what differs; the base itself differs by what it costs less or more, and departs not.
-        nearest = sum(abs(self._costs.rungs[knob][rung]) for knob, rung in settings.items())
+        nearest = sum(abs(self._costs.methods[setting][method]) for setting, method in settings.items())
         found = 1.0
         for key, timed in self._timed.items():
             if timed.milliseconds is None:
                 continue
-            rungs = self._costs.rungs
-            distance = sum(abs(rungs[knob][rung] - rungs[knob][settings[knob]]) for knob, rung in key)
+            methods = self._costs.methods
+            distance = sum(
+                abs(methods[setting][method] - methods[setting][settings[setting]]) for setting, method in key
+            )
             if distance < nearest:
                 nearest, found = distance, timed.milliseconds / (self._costs.base + self._costs.excess(dict(key)))
         return found
@@ -212,7 +227,7 @@ class Controller:
             self._predicted = [self._cost(dict(choice.settings)) for choice in self._front]
         limit = share * self.budget_ms / self.factor
         fitting = [choice for choice, cost in zip(self._front, self._predicted, strict=True) if cost <= limit]
-        # The frontier's errors fall.
+        # The Pareto front's errors fall.
         return fitting[-1] if fitting else self._front[self._predicted.index(min(self._predicted))]
 
     def learn(self, settings: Mapping[str, str], milliseconds: float) -> None:
@@ -235,9 +250,9 @@ class Controller:
 
     def shown(self, now: float) -> None:
         """Frames are lit by the present settings from now on."""
-        for knob, rung in self.settings.items():
-            if rung != self._before[knob]:
-                self._moved[knob] = now
+        for setting, method in self.settings.items():
+            if method != self._before[setting]:
+                self._moved[setting] = now
         self._before = self.settings
         self._chosen = True
         self.restart()
@@ -278,12 +293,12 @@ class Controller:
         step = self._step(now) if self._chosen else self._target
         self._chosen = self._chosen or step == self.settings
         if step == self.settings:
-            if now - max(self._moved.values(), default=-KNOB_SECONDS) >= KNOB_SECONDS:
+            if now - max(self._moved.values(), default=-SETTING_SECONDS) >= SETTING_SECONDS:
                 self._target = self.settings  # no way there fits
             return False
-        for knob, rung in step.items():
-            if rung != self.settings[knob]:
-                self._moved[knob] = now
+        for setting, method in step.items():
+            if method != self.settings[setting]:
+                self._moved[setting] = now
         self._change(dict(step))
         return True
 
@@ -316,20 +331,20 @@ class Controller:
         return self._cost(settings) < (1.0 - GAIN) * self._cost(self.settings)
 
     def _step(self, now: float) -> dict[str, str]:
-        """At most one rung of every knob toward the target."""
+        """At most one method of every setting toward the target."""
         moves: dict[str, str] = {}
         savings: dict[str, str] = {}
-        for knob, rung in self._target.items():
-            ladder = self._ladders[knob]
-            place, aim = ladder.index(self.settings[knob]), ladder.index(rung)
-            if place == aim or now - self._moved.get(knob, -KNOB_SECONDS) < KNOB_SECONDS:
+        for setting, method in self._target.items():
+            ladder = self._ladders[setting]
+            place, aim = ladder.index(self.settings[setting]), ladder.index(method)
+            if place == aim or now - self._moved.get(setting, -SETTING_SECONDS) < SETTING_SECONDS:
                 continue
-            moves[knob] = ladder[place + (1 if aim > place else -1)]
+            moves[setting] = ladder[place + (1 if aim > place else -1)]
             if aim < place:
-                savings[knob] = moves[knob]
+                savings[setting] = moves[setting]
         # Where neither fits, what saves most goes first: not all that should save is known to.
         steps = [{**self.settings, **some} for some in (moves, savings)]
-        steps += [{**self.settings, knob: rung} for knob, rung in savings.items()]
+        steps += [{**self.settings, setting: method} for setting, method in savings.items()]
         fitting = [step for step in steps[:2] if self.expected(step) <= AIM * self.budget_ms]
         best = fitting[0] if fitting else min(steps[1:], key=self._cost)
         return best if fitting or self._saves(best) else self.settings
@@ -398,8 +413,8 @@ class AutoPipeline:
         self._builder = ThreadPoolExecutor(1, "warp_ar-build")
         self._building: Future[tuple[Pipeline, float | None]] | None = None
         self._kept: dict[Quality, Pipeline] = {}
-        self.knobs = relevant_knobs(scene, size or (scene.camera.width, scene.camera.height))
-        self._base = {knob.name: setting(BASE, knob) for knob in self.knobs}
+        self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
+        self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
         self.pipeline = self._open(turn(BASE, self._base))
         """The one that lights the next frame."""
         self._kept[self.quality] = self.pipeline
@@ -467,12 +482,14 @@ class AutoPipeline:
 
     def _start(self, image: Any, pose: Pose | None) -> Controller:
         """Get the costs; the first choice waits for frames that tell the load."""
-        if self._costs is None and self.knobs:
-            key = cost_key(self.plan, self.device, self.knobs)
-            self._costs = read_costs(self._folder, key, self.knobs)
+        if self._costs is None and self.settings:
+            key = cost_key(self.plan, self.device, self.settings)
+            self._costs = read_costs(self._folder, key, self.settings)
             if self._costs is None:
-                print("warp_ar: measuring what each rung costs here; this is done once", file=sys.stderr)
-                self._costs = measure_costs(self._given, _on_host(image), pose, str(self.device), self.size, self.knobs)
+                print("warp_ar: measuring what each method costs here; this is done once", file=sys.stderr)
+                self._costs = measure_costs(
+                    self._given, _on_host(image), pose, str(self.device), self.size, self.settings
+                )
                 write_costs(self._folder, key, self._costs)
         costs = self._costs or Costs(0.0, {})
         return Controller(costs, self._errors, self.budget_ms, self._base)
@@ -505,7 +522,7 @@ class AutoPipeline:
         if costs is None or costs.work <= 0.0:
             pipeline.warm_up()
             return pipeline, None
-        settings = {knob.name: setting(quality, knob) for knob in self.knobs}
+        settings = {setting.name: chosen(quality, setting) for setting in self.settings}
         return pipeline, time_alone(pipeline, image, pose, costs, settings)
 
     def _swap(self) -> None:
@@ -542,7 +559,7 @@ class AutoPipeline:
         if controller is not None and not controller.fits and not self._told:
             self._told = True
             print(
-                f"warp_ar: nothing keeps to {self.budget_ms:g} ms here: the cheapest rungs take "
+                f"warp_ar: nothing keeps to {self.budget_ms:g} ms here: the cheapest methods take "
                 f"{controller.measured_ms:.1f} ms and are used",
                 file=sys.stderr,
             )

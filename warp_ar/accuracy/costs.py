@@ -1,8 +1,8 @@
-"""What every rung costs on this device: measured on one frame, and kept in the user's cache folder.
+"""What every method costs on this device: measured on one frame, and kept in the user's cache folder.
 
-Costs depend on the device and on the scene. They are measured one knob at a time from a base, and hold together by what
-knobs share: a rung's milliseconds more than the base's are multiplied where another knob gives its stage more to do,
-by as much as that knob multiplies the stage's time at the base.
+Costs depend on the device and on the scene. They are measured one setting at a time from a base, and hold together by
+what settings share: a method's milliseconds more than the base's are multiplied where another setting gives its stage
+more to do, by as much as that setting multiplies the stage's time at the base.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any, cast
 
 import warp as wp
 
-from warp_ar.accuracy.cost_table import Knob, Price, Scales, light_only, setting, turn
+from warp_ar.accuracy.cost_table import MethodCost, Scales, Setting, chosen, light_only, turn
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.input.tracking import Tracker
@@ -39,7 +39,7 @@ NOW_AND_THEN = "recover"
 _SPREAD_FRAMES = 12
 """Frames over which that is taken: two of its turns."""
 _ENOUGH_MS = 200.0
-"""Of a rung: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
+"""Of a method: dear ones are measured on fewer frames, for their noise is small beside what they cost."""
 WORK = time.thread_time
 """Clock that counts what a thread works: other programs that are busy at the same time then hardly matter."""
 _CACHE_FILE = "costs.json"
@@ -50,11 +50,11 @@ class Costs:
     """What a device takes for a scene."""
 
     base: float
-    """Milliseconds per frame of the preset that rungs were measured from, tracking included."""
-    rungs: Mapping[str, Mapping[str, float]]
-    """By knob and rung: milliseconds per frame more than the base takes."""
+    """Milliseconds per frame of the preset that methods were measured from, tracking included."""
+    methods: Mapping[str, Mapping[str, float]]
+    """By setting and method: milliseconds per frame more than the base takes."""
     scales: Scales = dataclasses.field(default_factory=dict)
-    """How knobs that stages share multiply what rungs of those stages cost more than the base's."""
+    """How settings that stages share multiply what methods of those stages cost more than the base's."""
     track: float = 0.0
     """Milliseconds of ``base`` that tracking takes."""
     work: float = 0.0
@@ -62,19 +62,21 @@ class Costs:
 
     def excess(self, settings: Mapping[str, str]) -> float:
         """Milliseconds per frame that settings should take more than the base."""
-        shared = [self.scales[knob].get(rung, {}) for knob, rung in settings.items() if knob in self.scales]
+        shared = [
+            self.scales[setting].get(method, {}) for setting, method in settings.items() if setting in self.scales
+        ]
         return sum(
-            self.rungs[knob][rung] * math.prod(scale.get(knob, 1.0) for scale in shared)
-            for knob, rung in settings.items()
+            self.methods[setting][method] * math.prod(scale.get(setting, 1.0) for scale in shared)
+            for setting, method in settings.items()
         )
 
 
-def make_prices(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[Price]:
-    """Costs measured on a device beside errors by knob and rung."""
+def make_method_costs(costs: Costs, errors: Mapping[str, Mapping[str, float]]) -> list[MethodCost]:
+    """Costs measured on a device beside errors by setting and method."""
     return [
-        Price(knob, rung, milliseconds, errors[knob][rung])
-        for knob, own in costs.rungs.items()
-        for rung, milliseconds in own.items()
+        MethodCost(setting, method, milliseconds, errors[setting][method])
+        for setting, own in costs.methods.items()
+        for method, milliseconds in own.items()
     ]
 
 
@@ -84,10 +86,10 @@ def measure_costs(
     pose: Pose | None,
     device: str,
     size: tuple[int, int],
-    knobs: Sequence[Knob],
+    settings: Sequence[Setting],
     clock: Callable[[], float] | None = None,
 ) -> Costs:
-    """Time every rung but brute force on one frame that is shown again and again.
+    """Time every method but brute force on one frame that is shown again and again.
 
     Args:
         scene: What is shown.
@@ -95,11 +97,11 @@ def measure_costs(
         pose: Of the camera in that frame, if the scene needs it.
         device: ``cpu`` or ``cuda:N``.
         size: Width and height.
-        knobs: What may be turned.
+        settings: What may be turned.
         clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
             ratio in which the base's stands to the time that passes.
     """
-    steps = measure_steps(scene, image, pose, device, size, knobs, clock)
+    steps = measure_steps(scene, image, pose, device, size, settings, clock)
     while True:
         try:
             next(steps)
@@ -113,11 +115,11 @@ def measure_steps(
     pose: Pose | None,
     device: str,
     size: tuple[int, int],
-    knobs: Sequence[Knob],
+    settings: Sequence[Setting],
     clock: Callable[[], float] | None = None,
 ) -> Generator[float, None, Costs]:
-    """``measure_costs`` in small steps, for whoever has other things to do; yields the share that is done."""
-    count, done = sum(len(knob.rungs) for knob in knobs) + 2, 2
+    """``measure_costs`` in small steps, for whoever has other objects to do; yields the share that is done."""
+    count, done = sum(len(setting.methods) for setting in settings) + 2, 2
     timed = WORK if clock is None else clock
     passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
     track = passed.pop(TRACK, 0.0)
@@ -127,42 +129,46 @@ def measure_steps(
     yield done / count
     work = sum(base.values())
     pace = sum(passed.values()) / work if clock is None and work > 0.0 else 1.0
-    rungs: dict[str, dict[str, float]] = {}
+    methods: dict[str, dict[str, float]] = {}
     scales: dict[str, dict[str, dict[str, float]]] = {}
     shares: dict[str, float] = {}
-    for knob in knobs:
-        start = setting(BASE, knob)
+    for setting in settings:
+        start = chosen(BASE, setting)
         times: dict[str, dict[str, float]] = {}
-        spread = knob.name == NOW_AND_THEN
-        for rung in knob.rungs:
-            if rung != "brute_force":
-                quality = turn(BASE, {knob.name: rung})
-                known = rung == start and not spread
-                times[rung] = base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
-                times[rung].pop(TRACK, None)
+        spread = setting.name == NOW_AND_THEN
+        for method in setting.methods:
+            if method != "brute_force":
+                quality = turn(BASE, {setting.name: method})
+                known = method == start and not spread
+                times[method] = (
+                    base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
+                )
+                times[method].pop(TRACK, None)
             done += 1
             yield done / count
-        # Stages that run whatever the rung is cost the same: what was measured of them is noise.
-        common = set.intersection(*(set(own) for own in times.values())) - set(knob.stages)
-        own = {rung: sum(ms for name, ms in stages.items() if name not in common) for rung, stages in times.items()}
-        rungs[knob.name] = {rung: pace * (ms - own[start]) for rung, ms in own.items()}
-        # A rung may bring another stage along; what is shared scales the knob's own stage.
-        most = max(own, key=lambda rung: abs(own[rung] - own[start]))
-        part = times[most].get(knob.name, 0.0) - times[start].get(knob.name, 0.0)
-        shares[knob.name] = min(max(part / (own[most] - own[start]), 0.0), 1.0) if own[most] != own[start] else 1.0
+        # Stages that run whatever the method is cost the same: what was measured of them is noise.
+        common = set.intersection(*(set(own) for own in times.values())) - set(setting.stages)
+        own = {method: sum(ms for name, ms in stages.items() if name not in common) for method, stages in times.items()}
+        methods[setting.name] = {method: pace * (ms - own[start]) for method, ms in own.items()}
+        # A method may bring another stage along; what is shared scales the setting's own stage.
+        most = max(own, key=lambda method: abs(own[method] - own[start]))
+        part = times[most].get(setting.name, 0.0) - times[start].get(setting.name, 0.0)
+        shares[setting.name] = min(max(part / (own[most] - own[start]), 0.0), 1.0) if own[most] != own[start] else 1.0
         # What recovery does on its own thread is the same for a map of any size.
         others = [
-            other.name for other in knobs if other.name in knob.stages and other.name not in (knob.name, NOW_AND_THEN)
+            other.name
+            for other in settings
+            if other.name in setting.stages and other.name not in (setting.name, NOW_AND_THEN)
         ]
         if others:
-            scales[knob.name] = {
-                rung: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
-                for rung, stages in times.items()
+            scales[setting.name] = {
+                method: {name: stages[name] / base[name] for name in others if base.get(name) and stages.get(name)}
+                for method, stages in times.items()
             }
     for table in scales.values():
         for scale in table.values():
             scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
-    return Costs(track + pace * work, rungs, scales, track, work)
+    return Costs(track + pace * work, methods, scales, track, work)
 
 
 def _time_stages(
@@ -235,7 +241,7 @@ def time_alone(pipeline: Pipeline, image: Any, pose: Pose | None, costs: Costs, 
             if index > 0 and sum(works) > _ENOUGH_MS:
                 break
     pace = (costs.base - costs.track) / costs.work
-    recovers = {knob: rung for knob, rung in settings.items() if knob == NOW_AND_THEN}
+    recovers = {setting: method for setting, method in settings.items() if setting == NOW_AND_THEN}
     return costs.track + pace * min(works[1:]) + costs.excess(recovers)
 
 
@@ -266,8 +272,8 @@ def cache_folder() -> Path:
     return Path.home() / ".cache" / "warp_ar"
 
 
-def cost_key(plan: Plan, device: Any, knobs: Sequence[Knob]) -> str:
-    """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the rungs."""
+def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
+    """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the methods."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     scene = plan.request.scene
     parts = [
@@ -280,7 +286,7 @@ def cost_key(plan: Plan, device: Any, knobs: Sequence[Knob]) -> str:
         [(item.shape, str(item.file), type(item.material).__name__) for item in scene.objects],
         [(proxy.shape, str(proxy.file)) for proxy in scene.proxies],
         [light.kind for light in scene.lights],
-        [(knob.name, knob.rungs) for knob in knobs],
+        [(setting.name, setting.methods) for setting in settings],
     ]
     return hashlib.sha256(json.dumps(parts, default=str).encode()).hexdigest()[:24]
 
@@ -293,17 +299,24 @@ def package_version() -> str:
         return "checkout"
 
 
-def read_costs(folder: Path, key: str, knobs: Sequence[Knob]) -> Costs | None:
+def read_costs(folder: Path, key: str, settings: Sequence[Setting]) -> Costs | None:
     """Kept costs, or None where there are none that can be used."""
     try:
         kept = json.loads((folder / _CACHE_FILE).read_text(encoding="utf-8"))[key]
-        rungs = {knob.name: {str(rung): float(ms) for rung, ms in kept["rungs"][knob.name].items()} for knob in knobs}
-        known = all(set(rungs[knob.name]) <= set(knob.rungs) and rungs[knob.name] for knob in knobs)
-        scales = {
-            str(knob): {str(rung): {str(name): float(x) for name, x in own.items()} for rung, own in table.items()}
-            for knob, table in kept["scales"].items()
+        methods = {
+            setting.name: {str(method): float(ms) for method, ms in kept["methods"][setting.name].items()}
+            for setting in settings
         }
-        return Costs(float(kept["base"]), rungs, scales, float(kept["track"]), float(kept["work"])) if known else None
+        known = all(
+            set(methods[setting.name]) <= set(setting.methods) and methods[setting.name] for setting in settings
+        )
+        scales = {
+            str(setting): {
+                str(method): {str(name): float(x) for name, x in own.items()} for method, own in table.items()
+            }
+            for setting, table in kept["scales"].items()
+        }
+        return Costs(float(kept["base"]), methods, scales, float(kept["track"]), float(kept["work"])) if known else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None  # not there, or not ours: it is measured anew
 

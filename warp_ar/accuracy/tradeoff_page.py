@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.cost_table import KNOBS, WORDS
+from warp_ar.accuracy.cost_table import SETTINGS, WORDS
 from warp_ar.accuracy.metrics import flip_map
 
 if TYPE_CHECKING:
@@ -270,7 +270,7 @@ def table(head: Sequence[str], rows: Iterable[tuple[Sequence[str], bool]]) -> st
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def _knob_table(rows: Sequence[Row]) -> str:
+def _setting_table(rows: Sequence[Row]) -> str:
     def cells(row: Row) -> list[str]:
         array = row.stage_error
         numbers = (
@@ -278,27 +278,27 @@ def _knob_table(rows: Sequence[Row]) -> str:
             if array is None
             else [f"{array.relative_rmse:.1%}", f"{array.worst:.2f}", f"{array.energy_drift:+.1%}"]
         )
-        return [row.rung, f"{row.milliseconds:.2f}", f"{row.flip:.4f}", f"{row.error:.4f}", *numbers]
+        return [row.method, f"{row.milliseconds:.2f}", f"{row.flip:.4f}", f"{row.error:.4f}", *numbers]
 
     against = "FLIP to the truth" if rows[0].against == "truth" else "FLIP"
-    head = ("rung", "ms", against, "its error", "rel. RMSE", "worst", "drift")
+    head = ("method", "ms", against, "its error", "rel. RMSE", "worst", "drift")
     return table(head, ((cells(row), row.dominated) for row in rows))
 
 
 def _comparisons(rows: Sequence[Row]) -> str:
-    """Equal time and equal error within a ladder, where a rung is beaten by more than a twentieth."""
+    """Equal time and equal error within a methods, where a method is beaten by more than a twentieth."""
     lines = []
     for row in rows:
         faster = [other for other in rows if other.milliseconds <= row.milliseconds and other.error < 0.95 * row.error]
         if faster:
             best = min(faster, key=lambda other: other.error)
-            lines.append(f"In the time of {row.rung}, {best.rung} errs {1 - best.error / row.error:.0%} less.")
+            lines.append(f"In the time of {row.method}, {best.method} errs {1 - best.error / row.error:.0%} less.")
         same = [other for other in rows if other.error <= row.error and other.milliseconds < 0.95 * row.milliseconds]
         if same:
             best = min(same, key=lambda other: other.milliseconds)
             share = _share(best.milliseconds, row.milliseconds)
-            lines.append(f"For the error of {row.rung}, {best.rung} takes {share} the time.")
-    return " ".join(dict.fromkeys(lines)) or "Every rung buys something: none is beaten in both time and error."
+            lines.append(f"For the error of {row.method}, {best.method} takes {share} the time.")
+    return " ".join(dict.fromkeys(lines)) or "Every method buys something: none is beaten in both time and error."
 
 
 def _share(a: float, b: float) -> str:
@@ -404,33 +404,33 @@ def _less(a: float, b: float) -> str:
 
 
 def _settings(whole: Whole) -> str:
-    return ", ".join(f"{knob.replace('_', ' ')} {rung}" for knob, rung in whole.settings.items())
+    return ", ".join(f"{setting.replace('_', ' ')} {method}" for setting, method in whole.settings.items())
 
 
-def _knob_section(report: CaseReport, rows: Sequence[Row]) -> str:
-    knob = rows[0].knob
+def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
+    setting = rows[0].setting
     index = report.case.shown[-1]
-    pictures = [(row.rung, report.pictures[knob, row.rung]) for row in rows]
+    pictures = [(row.method, report.pictures[setting, row.method]) for row in rows]
     reference = report.reference[index] if report.case.truth else pictures[-1][1]
-    # Where the rungs differ is what there is to see.
+    # Where the methods differ is what there is to see.
     difference = np.abs(pictures[0][1].astype(int) - pictures[-1][1].astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = [*pictures, ("truth", reference)] if report.case.truth else pictures
-    points = [(row.rung, row.milliseconds, row.error, row.dominated) for row in rows]
-    about = next((name.converges for name in KNOBS if name.name == knob), True) or not report.case.truth
-    against = f"error: FLIP to {rows[-1].rung}" if about else "error: FLIP to the truth, above the best rung's"
-    what, words = WORDS.get(knob, ("", {}))
+    points = [(row.method, row.milliseconds, row.error, row.dominated) for row in rows]
+    about = next((name.converges for name in SETTINGS if name.name == setting), True) or not report.case.truth
+    against = f"error: FLIP to {rows[-1].method}" if about else "error: FLIP to the truth, above the best method's"
+    what, words = WORDS.get(setting, ("", {}))
     legend = "; ".join(
-        f"<b>{html.escape(row.rung)}</b> {html.escape(words[row.rung])}" for row in rows if row.rung in words
+        f"<b>{html.escape(row.method)}</b> {html.escape(words[row.method])}" for row in rows if row.method in words
     )
     return "".join(
         [
-            f"<h3>{html.escape(knob.replace('_', ' '))}</h3>",
+            f"<h3>{html.escape(setting.replace('_', ' '))}</h3>",
             f'<p class="soft">{html.escape(what.capitalize())}{": " if legend else ""}{legend}.</p>' if what else "",
             '<div class="split"><div class="card">',
             scatter(points, "milliseconds of its stages per frame", against),
             '</div><div class="card">',
-            _knob_table(rows),
+            _setting_table(rows),
             f"<p class=soft>{html.escape(_comparisons(rows))}</p></div></div>",
             strip(columns, reference, box),
         ]
@@ -448,32 +448,32 @@ def _figure_section(shown: Figure) -> str:
 
 
 def _list_section(reports: Sequence[CaseReport]) -> str:
-    """Every rung of every knob over all cases: the price list itself."""
+    """Every method of every setting over all cases: the cost table itself."""
     body = []
-    for knob in KNOBS:
-        rows = [row for report in reports for row in report.rows if row.knob == knob.name]
+    for setting in SETTINGS:
+        rows = [row for report in reports for row in report.rows if row.setting == setting.name]
         if not rows:
             continue
-        what, words = WORDS.get(knob.name, ("", {}))
-        title = f"{knob.name.replace('_', ' ')} <span class=soft>{html.escape(what)}</span>"
+        what, words = WORDS.get(setting.name, ("", {}))
+        title = f"{setting.name.replace('_', ' ')} <span class=soft>{html.escape(what)}</span>"
         body.append(f'<tr class="head"><td colspan="5">{title}</td></tr>')
-        for rung in knob.rungs:
-            own = [row for row in rows if row.rung == rung]
+        for method in setting.methods:
+            own = [row for row in rows if row.method == method]
             if not own:
                 continue
             out = ' class="out"' if all(row.dominated for row in own) else ""
             costs = [row.milliseconds for row in own]
             spread = f"{min(costs):.2f}" if len(costs) == 1 else f"{min(costs):.2f} – {max(costs):.2f}"
             body.append(
-                f'<tr{out}><td>{html.escape(rung)}</td><td class="text">{html.escape(words.get(rung, ""))}</td>'
+                f'<tr{out}><td>{html.escape(method)}</td><td class="text">{html.escape(words.get(method, ""))}</td>'
                 f"<td>{spread}</td><td>{sum(row.error for row in own) / len(own):.4f}</td><td>{len(own)}</td></tr>"
             )
     return (
-        '<section id="list"><h2>The price list</h2><p>Every rung over all scenes. Its error is FLIP per changed pixel: '
-        "where rungs approximate one thing, the distance from the most exact; where they are models of their own, the "
-        "distance from the truth above that of the best. Grey: another rung is no dearer and no worse in every scene."
-        '</p><div class="card"><table><thead><tr><th>rung</th><th style="text-align:left">what it does</th><th>ms per '
-        f"frame</th><th>error</th><th>scenes</th></tr></thead><tbody>{''.join(body)}</tbody></table></div></section>"
+        '<section id="list"><h2>The cost table</h2><p>Every method over all scenes. Its error is FLIP per changed '
+        "pixel: where methods approximate one quantity, the distance from the most exact; where they are models, "
+        "the distance from the truth above that of the best. Grey: another method is no dearer and no worse everywhere."
+        '</p><div class="card"><table><thead><tr><th>method</th><th style="text-align:left">what it does</th>'
+        f"<th>ms per frame</th><th>error</th><th>scenes</th></tr></thead><tbody>{''.join(body)}</tbody></table></div></section>"
     )
 
 
@@ -513,17 +513,17 @@ def render(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width,initial-scale=1"><title>What accuracy costs</title>',
         f"<style>{_STYLE}</style></head><body><main><h1>What accuracy costs</h1>",
-        '<p class="lead">Every stage has rungs, from the paper\'s way to brute force. Here is what each takes and what '
-        "it errs: lower is truer, further left is faster.</p>",
+        '<p class="lead">Every stage has methods, from the paper\'s way to brute force. Here is what each takes and '
+        "what it errs: lower is truer, further left is faster.</p>",
         f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}, '
-        f"marker tracking left out.{counted} Filled points are worth their price; hollow grey ones are beaten by "
-        "another in both time and error. <b>Equal time</b> is the choice that by the price list errs least in the time "
+        f"marker tracking left out.{counted} Filled points are worth their cost; hollow grey ones are beaten by "
+        "another in both time and error. <b>Equal time</b> is the choice that by the cost table errs least in the time "
         "of the paper's way; <b>equal error</b> the cheapest that errs no more than it.</p>",
         f'<p class="soft">Error maps show FLIP: <span class="scale"><img alt="black to yellow" src="{data_uri(ramp)}">'
         f"{marks}</span></p><nav>",
         *(f'<a href="#{anchor}">{html.escape(report.case.name)}</a>' for anchor, report in anchors),
         '<a href="#figures">The paper\'s figures</a>' if figures else "",
-        '<a href="#list">The price list</a>',
+        '<a href="#list">The cost table</a>',
         '<a href="#arithmetic">Arithmetic</a>' if lines else "",
         "</nav>",
         '<div class="many">' if whole else "",
@@ -538,8 +538,8 @@ def render(
     for anchor, report in anchors:
         parts.append(f'<section id="{anchor}"><h2>{html.escape(report.case.name)}</h2>')
         parts.append(_whole_section(report, limit) if report.wholes else "")
-        for _, rows in itertools.groupby(report.rows, lambda row: row.knob):
-            parts.append(_knob_section(report, list(rows)))
+        for _, rows in itertools.groupby(report.rows, lambda row: row.setting):
+            parts.append(_setting_section(report, list(rows)))
         parts.append("</section>")
     if lines:
         parts.append(_arithmetic_section(lines))

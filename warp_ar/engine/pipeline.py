@@ -34,7 +34,7 @@ from warp_ar.stages.base import Arrays, Request, Rows
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
-"""What is remembered of the room's light from frame to frame."""
+"""What is remembered of the environment from frame to frame."""
 
 TRACK = "track"
 """Name of the host's own stage in reports: the marker's pose."""
@@ -61,7 +61,7 @@ class Rendered:
     image: Picture | Image | None = None
     """The picture, or that it is on its way to the host, where it was sent ahead."""
     environment: npt.NDArray[np.float32] | None = None
-    """The room's light where it was kept."""
+    """The environment where it was kept."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Result:
 
     @property
     def environment_array(self) -> Any:
-        """The room's light, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
+        """The environment, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
         return self._rendered.result().environment_array
 
     @property
@@ -118,7 +118,7 @@ class Result:
 
     @functools.cached_property
     def environment(self) -> npt.NDArray[np.float32] | None:
-        """The room's light as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
+        """The environment as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
         rendered = self._rendered.result()
         if rendered.environment is not None or rendered.environment_array is None:
             return rendered.environment
@@ -474,7 +474,7 @@ class Pipeline:
                 self._take_frame(frame)
                 timings = {**timings, **self._scheduler.run()}
             self._has_light = True
-        # A lost marker says nothing about where things are: the frame passes as it came, the last light is kept.
+        # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         return Rendered(self._shown, self._light(), timings, (time.perf_counter() - start) * 1e3)
 
@@ -563,7 +563,7 @@ class Pipeline:
             outlines["light"] = scene.light_outline(bounced=True)
         if "mirrored" in arrays:
             outlines["ball"] = scene.ball_outline()
-        if "physical_ratio" in arrays:
+        if "shadow_ratio" in arrays:
             outlines["shadow"] = scene.shadow_outline()
         return outlines
 

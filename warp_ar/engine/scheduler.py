@@ -121,7 +121,7 @@ class Scheduler:
                 stage.resume(others[stage.name])
 
     def _remembered(self, stage: Stage) -> list[str]:
-        """Arrays of a stage that carry over; a rung need not have all of them."""
+        """Arrays of a stage that carry over; a method need not have all of them."""
         return [name for name in stage.remembers if name in self.arrays]
 
     def warm_up(self) -> None:

@@ -1,4 +1,4 @@
-"""Frames of other exposures than the one that is shown: what they say of the room's light, and nothing else of them.
+"""Frames of other exposures than the one that is shown: what they say of the environment, and nothing else of them.
 
 A source that alternates between exposures gives pictures that must not be shown in turn: they would flicker. The
 longest exposure is the reference: its frames are lit and shown, and all radiance is in its camera values. From the

@@ -115,7 +115,7 @@ class BallFit:
 
 
 class _View:
-    """One frame, prepared for looking things up."""
+    """One frame, prepared for looking objects up."""
 
     def __init__(self, image: Image, pose: Pose, camera: Camera, table: NDArray[np.float32]) -> None:
         self.pose, self.camera = pose, camera
@@ -189,7 +189,7 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
 
 
-class _Desk:
+class _Receiver:
     """Planes and boxes that rays can meet, and the other balls, which hide them."""
 
     def __init__(self, proxies: Sequence[Proxy], others: Sequence[Probe]) -> None:
@@ -237,7 +237,7 @@ class _Task:
 
     views: Sequence[_View]
     probe: Probe
-    desk: _Desk
+    desk: _Receiver
     is_coarse: bool = False
 
     def pixels(self, view: _View, center: Array) -> Array:
@@ -351,7 +351,7 @@ def fit_ball(
     """
     table = decode_table(camera.transfer)
     views = [_View(image, pose, camera, table) for image, pose in frames]
-    coarse = _Task(views, probe, _Desk(proxies, others), is_coarse=True)
+    coarse = _Task(views, probe, _Receiver(proxies, others), is_coarse=True)
     fine = dataclasses.replace(coarse, is_coarse=False)
     start: Array = np.array(probe.center, np.float64)
     before, count = fine.cost(start, SCALES[-1])

@@ -1,6 +1,6 @@
 """Frames in: image folders, video files, capture devices, generated clips and a queue that others push into.
 
-Every source yields the same thing, a `Frame` in 8-bit RGB, and falls into one of two kinds. A recorded source (folder,
+Every source yields the same object, a `Frame` in 8-bit RGB, and falls into one of two kinds. A recorded source (folder,
 video, generated) loses no frame and is decoded a few frames ahead on one thread. A live source (device, queue) holds
 one frame, the newest, because a late frame is worth less than none; what it skips is counted in ``dropped``.
 
@@ -676,7 +676,7 @@ class _Bracketing:
         return seconds
 
     def _give_up(self, now: float) -> None:
-        """The device is late, or the room's light has changed meanwhile: begin anew with the longest exposure."""
+        """The device is late, or the environment has changed meanwhile: begin anew with the longest exposure."""
         self._misses += self._asked != 0
         if self._misses >= MOST_MISSES:
             raise SourceError(
@@ -691,7 +691,7 @@ class _Bracketing:
         assert self._reference is not None
         well = (self._reference > 0.05) & (self._reference < 0.9)
         if well.sum() < 30:
-            return self._waited > SETTLE_FRAMES  # too dark a room to tell
+            return self._waited > SETTLE_FRAMES  # too dark an environment to tell
         ratio = float(sparse[well].sum() / self._reference[well].sum())
         if ratio <= 0.0:
             return self._asked == len(self.exposures) - 1
@@ -904,7 +904,7 @@ def _natural_key(name: str) -> list[tuple[int, int, str]]:
 
 
 def _existing(path: pathlib.Path) -> pathlib.Path:
-    """``path`` if it exists, else an error that names the nearest thing that does."""
+    """``path`` if it exists, else an error that names the nearest object that does."""
     try:
         if path.exists():
             return path

@@ -42,7 +42,7 @@ Image = NDArray[np.uint8]
 
 _WINDOWS = (7, 23)
 """Widths in pixels of the two adaptive thresholds: sharp small markers, and large or blurred ones."""
-_ROOM = 0.6
+_ENVIRONMENT = 0.6
 """Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
 _TAPS = 9
 """Samples across an edge."""
@@ -51,7 +51,8 @@ _REACH = (4.0, 3.0, 2.5, 2.5)
 _LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
 """The same where the pose is only a prediction from earlier frames."""
 _MIN_REACH = 1.0
-"""Pixels: an edge with less room than this to its neighbours is not measured; the blur of one would reach the other."""
+"""Pixels: an edge with less environment than this to its neighbours is not measured; the blur of one would reach the
+other."""
 _DONE = 0.05
 """Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
 a tenth of it."""
@@ -213,7 +214,7 @@ class _Pattern:
     """Unit direction of the border at each point, (m, 3)."""
     normals: Array
     """Unit direction toward white, (m, 3)."""
-    rooms: Array
+    environments: Array
     """Distance to the nearest parallel border, (m,) metres."""
     cells: Array
     """Centres of cells, (c, 3)."""
@@ -221,15 +222,17 @@ class _Pattern:
     """1 where a cell is white, 0 where black, (c,)."""
 
 
-def _cell_edges(cells: NDArray[np.bool_], left: float, top: float, size: float, room: float) -> list[tuple[float, ...]]:
-    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length and room."""
+def _cell_edges(
+    cells: NDArray[np.bool_], left: float, top: float, size: float, environment: float
+) -> list[tuple[float, ...]]:
+    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length, space."""
     edges: list[tuple[float, ...]] = []
     for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
         sign = 1.0 if cells[row, column + 1] else -1.0
-        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, room))
+        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, environment))
     for row, column in np.argwhere(cells[1:] != cells[:-1]):
         sign = -1.0 if cells[row + 1, column] else 1.0
-        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, room))
+        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, environment))
     return edges
 
 
@@ -286,7 +289,7 @@ def _make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | G
         points=np.hstack([table[:, :2], flat]) + tangents * shift[:, None],
         tangents=tangents,
         normals=normals,
-        rooms=table[:, 7],
+        environments=table[:, 7],
         cells=np.concatenate(centres),
         white=np.concatenate(white).astype(float),
     )
@@ -458,9 +461,9 @@ class Tracker:
     def _around(self, outline: NDArray[np.float32]) -> tuple[slice, slice]:
         """Rows and columns of the image around a marker's outline, never empty."""
         low, high = outline.min(0), outline.max(0)
-        room = _ROOM * float((high - low).max()) + 16
+        environment = _ENVIRONMENT * float((high - low).max()) + 16
         h, w = self._shape
-        (x0, y0), (x1, y1) = np.clip(low - room, 0, (w - 32, h - 32)), np.clip(high + room, 32, (w, h))
+        (x0, y0), (x1, y1) = np.clip(low - environment, 0, (w - 32, h - 32)), np.clip(high + environment, 32, (w, h))
         return slice(int(y0), int(np.ceil(y1))), slice(int(x0), int(np.ceil(x1)))
 
     def _smallest(self, guess: Pose) -> float:
@@ -587,7 +590,7 @@ class Tracker:
             )
             width = (normal * across).sum(1)
             normal *= np.sign(width)[:, None]
-            half = np.minimum(0.45 * np.abs(width) * pattern.rooms, reach)
+            half = np.minimum(0.45 * np.abs(width) * pattern.environments, reach)
             at = (pixels - origin)[:, None, :] + (half[:, None] * taps)[..., None] * normal[:, None, :]
             h, w = gray.shape
             ends = at[:, [0, -1]]

@@ -1,9 +1,9 @@
 """Light that clipping lost in the ball, found again from surfaces that the same light falls on.
 
-**Unknowns.** Cells of the room that clip (``kernels/recover.py``) are grouped to regions: connected ones, split where
-they are wider than ``REGION`` steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the ball
-shows. Beside regions stand *peaks*: lamps or a sun within a region, or where no ball sees, each with its power p_j >=
-0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the unknown
+**Unknowns.** Cells of the environment that clip (``kernels/recover.py``) are grouped to regions: connected ones, split
+where they are wider than ``REGION`` steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
+ball shows. Beside regions stand *peaks*: lamps or a sun within a region, or where no ball sees, each with its power p_j
+>= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the unknown
 reflectance 1 / u_k; the card's is known.
 
 **Equations.** A surface point x that shows the radiance L receives
@@ -20,7 +20,7 @@ their reflectances allow.
 **Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
 about one mean of all, times (solid angle)^-1/2: halfway between lamps of equal radiance and lamps of equal power, for
 what is small and still clips tends to be brighter than what is wide. The common mean is free; where nothing but the
-card is used it is what makes the card right, and that alone is the rung ``white_card``. Clipped pixels that show a
+card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
@@ -60,7 +60,7 @@ from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
 
-RUNGS: Final = ("clipped", "white_card", "shading")
+METHODS: Final = ("clipped", "white_card", "shading")
 
 REGION: Final = 0.12
 """Steradians: a region wider than this (22 degrees across) is split."""
@@ -114,7 +114,7 @@ MIRROR_TRUST: Final = 0.5
 ITERATIONS: Final = 6
 WARM_ITERATIONS: Final = 3
 STILL: Final = 0.02
-"""Relative change, of surfaces or of the room, below which the light is the same."""
+"""Relative change, of surfaces or of the environment, below which the light is the same."""
 REST: Final = 4
 """Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
 SUDDEN: Final = 0.25
@@ -171,7 +171,7 @@ class Surfaces:
     kinds: NDArray[np.int64]
     """``Kind`` of each surface, (surfaces,)."""
     groups: NDArray[np.int64]
-    """Number of the thing that a surface belongs to, (surfaces,): faces of one box share it."""
+    """Number of the object that a surface belongs to, (surfaces,): faces of one box share it."""
     overlap: NDArray[np.float32]
     """How far points share their surface's texture, 0 to 1, (n, n)."""
 
@@ -912,7 +912,7 @@ class Recovery:
         center: Sequence[float],
         *,
         radius: float = 0.0,
-        rung: str = "shading",
+        method: str = "shading",
     ) -> None:
         """Prepare.
 
@@ -921,14 +921,14 @@ class Recovery:
             white: Reflectance of the card's paper.
             center: Centre of the ball, metres.
             radius: Of the ball, metres: lamps are seen from its surface. 0: from its centre.
-            rung: ``white_card`` or ``shading``.
+            method: ``white_card`` or ``shading``.
 
         Raises:
-            ValueError: There is no such rung.
+            ValueError: There is no such method.
         """
-        if rung not in RUNGS[1:]:
-            raise ValueError(f"recover: no rung {rung!r} to estimate; expected {' or '.join(RUNGS[1:])}")
-        self.surfaces, self.rung = surfaces, rung
+        if method not in METHODS[1:]:
+            raise ValueError(f"recover: no method {method!r} to estimate; expected {' or '.join(METHODS[1:])}")
+        self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[_Peak] = []
         self._frames = 0
@@ -944,19 +944,21 @@ class Recovery:
             cells: As for ``update``.
             observations: As for ``update``.
         """
-        room = cells["solid_angle"][..., None] * cells["radiance"].astype(float)
+        environment = cells["solid_angle"][..., None] * cells["radiance"].astype(float)
         shown = observations["radiance"].mean(axis=1).astype(float)
         told = (observations["visible"] > 0.8) & (observations["clipped"].max(axis=1) < 0.01) & (np.pi * shown > DARK)
         before, self._rested = self._seen, self._rested + 1
         if before is not None and self._frames >= SETTLED and (told & before[2]).any():
             both = told & before[2]
             # The sum of what changed, not of changes: which of two cells sees a window's edge varies by itself.
-            moved = np.abs((room - before[0]).sum(axis=(0, 1))).max() / max(room.sum(axis=(0, 1)).max(), 1e-9)
+            moved = np.abs((environment - before[0]).sum(axis=(0, 1))).max() / max(
+                environment.sum(axis=(0, 1)).max(), 1e-9
+            )
             ratio = np.log(shown[both] / before[1][both])
             moved = max(moved, abs(float(np.median(ratio))), 0.5 * float(np.quantile(np.abs(ratio), 0.8)))
             if self._rested <= (REST if moved < STILL else 1 if moved < SUDDEN else 0):
                 return True
-        self._seen, self._rested = (room, shown, told), 0
+        self._seen, self._rested = (environment, shown, told), 0
         return False
 
     def update(
@@ -995,7 +997,7 @@ class Recovery:
         problem = _Problem(cells, transfer, mirrored, observations, self.surfaces, self._white, trace, origin)
         self._frames += 1
         means, bounds = problem.card_means()
-        if self.rung == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
+        if self.method == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
             excess = problem.member @ (problem.expected[problem.component][:, None] * means)
             return self._estimate(problem, excess, bounds)
         means = np.maximum(means, 0.05)
@@ -1008,13 +1010,13 @@ class Recovery:
         every = SEARCH_EVERY if before < SETTLED else LATER_EVERY
         if before and problem.peaks and (before < SETTLED or before % 2 == 0):
             problem.move_peak(best, means[best])
-        start, room = problem.start(means[best]), PEAKS - len(problem.peaks)
+        start, environment = problem.start(means[best]), PEAKS - len(problem.peaks)
         if before == 0:
-            problem.find_peaks(best, start, room)
+            problem.find_peaks(best, start, environment)
         elif before % every == 1:
             turn = before // SEARCH_EVERY
             candidates = MOST_CANDIDATES if before < FIRST else LATER_CANDIDATES
-            problem.find_peaks(best, start, min(room, 1), candidates=candidates, turn=turn)
+            problem.find_peaks(best, start, min(environment, 1), candidates=candidates, turn=turn)
 
         bright = problem.first_mean
         # Where the card does not tell, reflectances in a channel in which it does are worth more than guesses.

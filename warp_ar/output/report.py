@@ -122,7 +122,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     request = plan.request
     table = Table(title=f"{request.scene.name}, quality {request.quality.name}, {request.size[0]}x{request.size[1]}")
     table.add_column("stage")
-    table.add_column("rung")
+    table.add_column("method")
     table.add_column("state")
     table.add_column("median ms", justify="right")
     table.add_column("what it does, or why it is left out")
@@ -134,7 +134,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
             "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
         )
         time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
-        table.add_row(name, plan.request.quality.rung(name), state, time_text, summaries[name])
+        table.add_row(name, plan.request.quality.method(name), state, time_text, summaries[name])
     for name, reason in left_out(plan):
         table.add_row(name, "", "left out", "", reason, style="dim")
     Console().print(table)

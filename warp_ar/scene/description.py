@@ -378,11 +378,11 @@ class Scene:
     marker: Marker = Marker()
     """What fixes the world."""
     probes: tuple[Probe, ...] = ()
-    """Mirror balls that show the room's light."""
+    """Mirror balls that show the environment."""
     proxies: tuple[Proxy, ...] = ()
-    """The physical things that are modelled."""
+    """The physical objects that are modelled."""
     objects: tuple[Object, ...] = ()
-    """Virtual things."""
+    """Virtual objects."""
     lights: tuple[Light, ...] = ()
     """Virtual lights."""
     exposure: Exposure = Exposure()

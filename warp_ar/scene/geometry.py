@@ -110,10 +110,10 @@ def silhouette_tolerance(extent: float, *, distance: float = 0.4, focal: float =
     """Largest gap between a curved surface and its triangles that a camera cannot see.
 
     A gap g at distance d moves a silhouette by focal g / d pixels. Things on a desk are seen from 0.4 m or more, and
-    things larger than that from at least their own extent, else they do not fit into the picture.
+    objects larger than that from at least their own extent, else they do not fit into the picture.
 
     Args:
-        extent: Radius of the thing in metres.
+        extent: Radius of the object in metres.
         distance: Nearest distance of the camera in metres.
         focal: Focal length in pixels.
         pixels: Silhouette error that is allowed, in pixels.
@@ -128,7 +128,7 @@ def _segments(radius: float, gap: float) -> int:
     """Segments of a circle whose chords stay within ``gap`` of it.
 
     The chord of a segment of angle 2 pi / n is farthest from its arc at its middle, by the sagitta r (1 - cos(pi / n));
-    solved for n: n = pi / acos(1 - gap / r). From 24 on, so that the shading of tiny things stays smooth.
+    solved for n: n = pi / acos(1 - gap / r). From 24 on, so that the shading of tiny objects stays smooth.
     """
     return max(24, math.ceil(math.pi / math.acos(1.0 - gap / radius))) if gap < radius else 24
 

@@ -51,7 +51,7 @@ _MODELS: Final[dict[type, int]] = {
 }
 
 SHADOW_REACH: Final = 12.0
-"""How far an object's shadow of the room's light is followed, in radii of the sphere around it.
+"""How far an object's shadow of the environment is followed, in radii of the sphere around it.
 
 A sphere that rests on a desk hides (r / d)^3 of an even sky's light from a point at distance d: under 1/512 from 8
 radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees high or more.
@@ -75,9 +75,9 @@ _FACES: Final = (
 _CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def shape_kind(thing: scenes.Object | scenes.Proxy) -> int:
+def shape_kind(item: scenes.Object | scenes.Proxy) -> int:
     """Kind of ``structs.Shape`` that an object or proxy becomes; a torus becomes a fine mesh."""
-    return int(structs.MESH if thing.shape == "torus" else _SHAPES[thing.shape])
+    return int(structs.MESH if item.shape == "torus" else _SHAPES[item.shape])
 
 
 def light_kind(light: scenes.Light) -> int:
@@ -93,8 +93,8 @@ def has_sized_lights(scene: scenes.Scene) -> bool:
 def trace_config(scene: scenes.Scene) -> TraceConfig:
     """Which kinds of shape the rays of ``scene`` can meet."""
     return TraceConfig(
-        objects=tuple(sorted({shape_kind(thing) for thing in scene.objects})),
-        proxies=tuple(sorted({shape_kind(thing) for thing in scene.proxies})),
+        objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
+        proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
     )
 
 
@@ -103,7 +103,7 @@ def _is_black(color: scenes.Color) -> bool:
 
 
 def reflects_diffusely(material: scenes.Material) -> bool:
-    """Whether a material shows the room's irradiance."""
+    """Whether a material shows the environment's irradiance."""
     match material:
         case scenes.LambertMaterial():
             return not _is_black(material.base_color)
@@ -115,7 +115,7 @@ def reflects_diffusely(material: scenes.Material) -> bool:
 
 
 def reflects_glossily(material: scenes.Material) -> bool:
-    """Whether a material shows the room's prefiltered light."""
+    """Whether a material shows the environment's prefiltered light."""
     match material:
         case scenes.PhongMaterial():
             return not _is_black(material.specular)
@@ -134,8 +134,8 @@ def material_model(material: scenes.Material) -> int:
 def has_textures(scene: scenes.Scene) -> bool:
     """Whether any virtual object may have a texture: meshes bring their own, which only reading them tells."""
     return any(
-        thing.shape == "mesh" or any(isinstance(value, Path) for value in vars(thing.material).values())
-        for thing in scene.objects
+        item.shape == "mesh" or any(isinstance(value, Path) for value in vars(item.material).values())
+        for item in scene.objects
     )
 
 
@@ -143,14 +143,14 @@ def skeleton(scene: scenes.Scene) -> Any:
     """What of a scene arrays and kernels are made for; scenes that share it differ in numbers alone."""
     objects = tuple(
         (
-            thing.shape,
-            _mesh_key(thing),
-            type(thing.material),
-            tuple(value for value in vars(thing.material).values() if isinstance(value, Path)),
-            reflects_diffusely(thing.material),
-            reflects_glossily(thing.material),
+            item.shape,
+            _mesh_key(item),
+            type(item.material),
+            tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
+            reflects_diffusely(item.material),
+            reflects_glossily(item.material),
         )
-        for thing in scene.objects
+        for item in scene.objects
     )
     lights = tuple(light.kind for light in scene.lights)
     return scene.camera, scene.marker, scene.probes, scene.proxies, objects, lights
@@ -308,28 +308,28 @@ class HostScene:
 
     def _material_records(self) -> npt.NDArray[Any]:
         records = np.zeros(len(self.scene.objects), _dtype(structs.Material))
-        for record, thing in zip(records, self.scene.objects, strict=True):
-            self._fill_material(record, thing, self._textures)
+        for record, item in zip(records, self.scene.objects, strict=True):
+            self._fill_material(record, item, self._textures)
         return records
 
-    def _shape_records(self, things: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
+    def _shape_records(self, items: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
         """Records of ``structs.Shape`` with all that does not move."""
-        records = np.zeros(len(things), _dtype(structs.Shape))
-        for record, thing in zip(records, things, strict=True):
-            scale = getattr(thing, "scale", 1.0)
-            rotation = rotation_matrix(thing.rotate)
-            position = np.array(thing.at)
-            record["kind"], record["scale"], record["material"] = shape_kind(thing), scale, -1
-            key = _mesh_key(thing)
+        records = np.zeros(len(items), _dtype(structs.Shape))
+        for record, item in zip(records, items, strict=True):
+            scale = getattr(item, "scale", 1.0)
+            rotation = rotation_matrix(item.rotate)
+            position = np.array(item.at)
+            record["kind"], record["scale"], record["material"] = shape_kind(item), scale, -1
+            key = _mesh_key(item)
             if key is not None:
                 _, mesh, record["first_vertex"] = self._load(key, device)
                 record["mesh"], record["tree"] = mesh.mesh.id, mesh.tree_address
                 record["extent"], record["smooth"] = mesh.half, 1
                 position = position + rotation @ (scale * mesh.center)
-            elif isinstance(thing, scenes.Object) and thing.shape == "sphere":
-                record["extent"] = thing.radius
+            elif isinstance(item, scenes.Object) and item.shape == "sphere":
+                record["extent"] = item.radius
             else:
-                record["extent"][: len(thing.size)] = 0.5 * np.array(thing.size)
+                record["extent"][: len(item.size)] = 0.5 * np.array(item.size)
             record["rotation"], record["position"] = rotation, position
         return records
 
@@ -342,18 +342,18 @@ class HostScene:
             self._corners += len(ray_mesh.normals)
         return self._meshes[key]
 
-    def _fill_material(self, record: Any, thing: scenes.Object, textures: _Textures) -> None:
+    def _fill_material(self, record: Any, item: scenes.Object, textures: _Textures) -> None:
         """Write the material of an object into a record of ``structs.Material``."""
-        key = _mesh_key(thing)
+        key = _mesh_key(item)
         mesh = None if key is None else self._meshes[key][0]
-        material = thing.material
+        material = item.material
         first = material.diffuse if isinstance(material, scenes.PhongMaterial) else material.base_color
         colors = (first, material.specular) if isinstance(material, scenes.PhongMaterial) else (first,)
         if mesh is not None and mesh.uvs is None:
             for color in colors:
                 if isinstance(color, Path):
                     raise SceneError(
-                        f"{thing.file}: the mesh has no texture coordinates for the texture {color}; "
+                        f"{item.file}: the mesh has no texture coordinates for the texture {color}; "
                         "unwrap it, or give the material a plain colour"
                     )
         record["base_color"], record["base_texture"] = textures.add(first, mesh)
@@ -375,9 +375,9 @@ class HostScene:
         Returns:
             Whether anything is not where ``records_out`` had it.
         """
-        for record, thing, center in zip(self._objects, self.scene.objects, self._centers, strict=True):
-            if thing.animate is not None or seconds == 0.0:
-                rotation, position = thing.pose_at(seconds)
+        for record, item, center in zip(self._objects, self.scene.objects, self._centers, strict=True):
+            if item.animate is not None or seconds == 0.0:
+                rotation, position = item.pose_at(seconds)
                 record["rotation"], record["position"] = rotation, position + rotation @ center
         return _update(records_out, self._objects)
 
@@ -425,7 +425,7 @@ class HostScene:
         return self._balls
 
     def shadow_outline(self) -> Outline:
-        """Where virtual objects can change the room's light on proxies."""
+        """Where virtual objects can change the environment on proxies."""
         self._follow_objects()
         if self._shaded is None:
             proxies = [_faces(record) for record in self._proxies]
@@ -448,13 +448,13 @@ def _dtype(struct: Any) -> Any:
     return np.dtype(struct.numpy_dtype())
 
 
-def _mesh_key(thing: scenes.Object | scenes.Proxy) -> Any:
+def _mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
     """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
-    if thing.shape == "mesh":
-        return thing.file
-    if isinstance(thing, scenes.Object) and thing.shape == "torus":
-        outer = thing.scale * (thing.major_radius + thing.minor_radius)
-        return thing.major_radius, thing.minor_radius, silhouette_tolerance(outer) / thing.scale
+    if item.shape == "mesh":
+        return item.file
+    if isinstance(item, scenes.Object) and item.shape == "torus":
+        outer = item.scale * (item.major_radius + item.minor_radius)
+        return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
     return None
 
 

@@ -16,7 +16,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
 
     Args:
         scene: The scene.
-        folder: Where the text will be saved: paths to things inside it are written relative to it, all others, and
+        folder: Where the text will be saved: paths to objects inside it are written relative to it, all others, and
             without it all paths, in full.
 
     Returns:
@@ -58,15 +58,15 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         lines += ["", "[[probe]]", *table(probe, keys_of(Probe))]
     for proxy in scene.proxies:
         lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
-    for thing in scene.objects:
-        model = next(name for name, kind in MATERIALS.items() if isinstance(thing.material, kind))
-        lines += ["", "[[object]]", *table(thing, ("shape", *OBJECT_KEYS[thing.shape], "at", "rotate", "scale"))]
-        lines += animation(thing)
+    for item in scene.objects:
+        model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
+        lines += ["", "[[object]]", *table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
+        lines += animation(item)
         lines += [
             "",
             "[object.material]",
             f"model = {value(model)}",
-            *table(thing.material, keys_of(type(thing.material))),
+            *table(item.material, keys_of(type(item.material))),
         ]
     for light in scene.lights:
         lines += ["", "[[light]]", *table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]

@@ -8,6 +8,8 @@ from warp_ar.stages.bracket import Bracket
 from warp_ar.stages.composite import Composite
 from warp_ar.stages.declip import Declip
 from warp_ar.stages.diffuse import Diffuse
+from warp_ar.stages.environment_samples import EnvironmentSamples
+from warp_ar.stages.environment_shadow import EnvironmentShadow
 from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
@@ -15,8 +17,6 @@ from warp_ar.stages.mirror_ball import MirrorBall
 from warp_ar.stages.object_light import ObjectLight
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.relight import Relight
-from warp_ar.stages.room_samples import RoomSamples
-from warp_ar.stages.room_shadow import RoomShadow
 from warp_ar.stages.shade import Shade
 from warp_ar.stages.specular import Specular
 from warp_ar.stages.summed_area import SummedArea
@@ -34,9 +34,9 @@ STAGES: tuple[type[Stage], ...] = (
     Specular,
     Visibility,
     SummedArea,
-    RoomSamples,
+    EnvironmentSamples,
     Relight,
-    RoomShadow,
+    EnvironmentShadow,
     ObjectLight,
     Shade,
     MirrorBall,

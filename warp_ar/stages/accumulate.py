@@ -1,4 +1,4 @@
-"""The light of successive frames becomes the light of the room."""
+"""The light of successive frames becomes the light of the environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Accumulate(Stage):
     """Running mean over time, keyed to confidence; follows real changes faster than noise."""
 
     name: ClassVar[str] = "accumulate"
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
     remembers: ClassVar[tuple[str, ...]] = ("accumulate_change",)
 

@@ -1,4 +1,4 @@
-"""What a stage is: what it reads and writes, the rungs it has, and the passes that do its work.
+"""What a stage is: what it reads and writes, the methods it has, and the passes that do its work.
 
 A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the scene and the quality alone,
 what it would read and write, or why the scene does not call for it. Nothing of Warp is touched then. When a pipeline is
@@ -25,7 +25,7 @@ class Request:
     scene: Scene
     """What the user wants to see."""
     quality: Quality
-    """The rung of every stage, and its numbers."""
+    """The method of every stage, and its numbers."""
     size: tuple[int, int]
     """Width and height of the frames in pixels."""
     outputs: tuple[str, ...] = ("image",)
@@ -120,7 +120,7 @@ class Stage(abc.ABC):
 
     name: ClassVar[str]
     """As in reports and in ``Quality``."""
-    rungs: ClassVar[tuple[str, ...]]
+    methods: ClassVar[tuple[str, ...]]
     """Ways to do the work, cheapest first."""
     summary: ClassVar[str]
     """What it does, in one line for ``explain``."""
@@ -132,9 +132,9 @@ class Stage(abc.ABC):
         self.wiring = wiring
 
     @property
-    def rung(self) -> str:
-        """The rung that the quality picks."""
-        return self.request.quality.rung(self.name)
+    def method(self) -> str:
+        """The method that the quality picks."""
+        return self.request.quality.method(self.name)
 
     @classmethod
     @abc.abstractmethod

@@ -20,7 +20,7 @@ class Bracket(Stage):
     """The latest frame of every exposure, merged; frames of shorter exposures come in through ``ShortFrames``."""
 
     name: ClassVar[str] = "bracket"
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
     remembers: ClassVar[tuple[str, ...]] = tuple(f"bracket_{part}" for part in UNWRAPPED)
 

@@ -16,7 +16,7 @@ class Composite(Stage):
     """Lays virtual light and virtual objects over the frame."""
 
     name = "composite"
-    rungs = ("default",)
+    methods = ("default",)
     summary = "frame, virtual light on the desk and virtual objects, in linear light"
 
     @classmethod
@@ -68,8 +68,8 @@ def layer_names(request: Request) -> tuple[str, ...]:
         layers.append("virtual")
     if scene.lights and scene.proxies:
         layers.append("physical_added")
-    if shades_room(request):
-        layers.append("physical_ratio")
+    if shadows_environment(request):
+        layers.append("shadow_ratio")
     if layers and mirrors_virtual(request):
         layers.append("mirrored")
     return tuple(layers)
@@ -77,20 +77,20 @@ def layer_names(request: Request) -> tuple[str, ...]:
 
 def mirrors_virtual(request: Request) -> bool:
     """Whether balls are to show what is virtual."""
-    return bool(request.scene.probes) and request.quality.rung("mirror_ball") not in ("default", "none")
+    return bool(request.scene.probes) and request.quality.method("mirror_ball") not in ("default", "none")
 
 
-def shades_room(request: Request) -> bool:
-    """Whether virtual objects change the room's light on the desk."""
+def shadows_environment(request: Request) -> bool:
+    """Whether virtual objects change the environment on the desk."""
     scene = request.scene
-    wanted = request.quality.rung("room_shadow") not in ("default", "none")
+    wanted = request.quality.method("environment_shadow") not in ("default", "none")
     return bool(wanted and scene.objects and scene.proxies and scene.probes)
 
 
-def shares_room(request: Request) -> bool:
-    """Whether relighting asks which part of the room's light reaches the desk."""
+def shares_environment(request: Request) -> bool:
+    """Whether relighting asks which part of the environment reaches the desk."""
     scene = request.scene
-    asks = request.quality.rung("relight") in ("bounce", "brute_force")
+    asks = request.quality.method("relight") in ("bounce", "brute_force")
     return bool(asks and scene.lights and scene.proxies and scene.probes)
 
 
@@ -102,7 +102,7 @@ def exposes(request: Request) -> bool:
 
 def layers_of(arrays: Arrays) -> composite.Layers:
     """The layers that there are, as kernels read them."""
-    names = ("virtual", "physical_added", "physical_ratio", "mirrored")
+    names = ("virtual", "physical_added", "shadow_ratio", "mirrored")
     return composite.make_layers(*(arrays.get(name) for name in names))
 
 
@@ -111,7 +111,7 @@ def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
     return composite.CompositeConfig(
         virtual="virtual" in layers,
         added="physical_added" in layers,
-        ratio="physical_ratio" in layers,
+        ratio="shadow_ratio" in layers,
         mirrored="mirrored" in layers,
     )
 

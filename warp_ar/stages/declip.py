@@ -15,15 +15,15 @@ from warp_ar.stages.recover import recovers
 
 
 class Declip(Stage):
-    """Estimates radiance above clipping, which another exposure brings into view; its rungs are those of ``expose``."""
+    """Estimates radiance above clipping, which another exposure shows; its methods are those of ``expose``."""
 
     name: ClassVar[str] = "declip"
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "estimates how bright clipped pixels were, by hue, depth and the ball"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Wired where a shorter exposure is asked for at a rung that looks above clipping."""
+        """Wired where a shorter exposure is asked for at a method that looks above clipping."""
         if not declips(request):
             return LeftOut("no shorter exposure asks how bright clipped pixels were")
         return Wiring(("frame", "pose", "environment") if asks_ball(request) else ("frame",), ("declipped",))
@@ -78,9 +78,9 @@ def declips(request: Request) -> bool:
     """Whether clipped pixels are to be estimated: only a shorter exposure shows them."""
     scale = request.scene.exposure.scale
     shorter = isinstance(scale, str) or scale < 1.0
-    return exposes(request) and shorter and request.quality.rung("expose") in ("glow", "ball")
+    return exposes(request) and shorter and request.quality.method("expose") in ("glow", "ball")
 
 
 def asks_ball(request: Request) -> bool:
     """Whether the ball's light says more: only with the energy put back that clipping took there too."""
-    return request.quality.rung("expose") == "ball" and bool(request.scene.probes) and recovers(request)
+    return request.quality.method("expose") == "ball" and bool(request.scene.probes) and recovers(request)

@@ -20,22 +20,22 @@ CLUSTERS = (10, 20)
 
 def diffuse_output(quality: Quality) -> str:
     """Name of the resource that holds irradiance at this quality: ``irradiance_sh`` or ``irradiance_map``."""
-    return "irradiance_sh" if quality.rung(Diffuse.name) == "sh2" else "irradiance_map"
+    return "irradiance_sh" if quality.method(Diffuse.name) == "sh2" else "irradiance_map"
 
 
 class Diffuse(Stage):
     """Filters the environment with the cosine lobe."""
 
     name: ClassVar[str] = "diffuse"
-    rungs: ClassVar[tuple[str, ...]] = ("top_mip", "sh2", "sh4", "clusters", "brute_force")
+    methods: ClassVar[tuple[str, ...]] = ("top_mip", "sh2", "sh4", "clusters", "brute_force")
     summary: ClassVar[str] = "irradiance of the environment for every orientation"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Read the environment, write irradiance in the form of the rung."""
+        """Read the environment, write irradiance in the form of the method."""
         scene = request.scene
         if not scene.probes:
-            return LeftOut("the scene has no probe, so the room's light is unknown")
+            return LeftOut("the scene has no probe, so the environment is unknown")
         if not scene.lights and not any(reflects_diffusely(item.material) for item in scene.objects):
             return LeftOut("no virtual object is diffuse, and no virtual light asks for the desk's reflectance")
         return Wiring(("environment",), (diffuse_output(request.quality),))
@@ -43,12 +43,12 @@ class Diffuse(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance, and sums on the way to it."""
         height = self.request.quality.environment_height
-        if self.rung == "top_mip":
+        if self.method == "top_mip":
             size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
             return {"irradiance_map": ArraySpec(size, wp.vec3)}
-        if self.rung == "sh2":
+        if self.method == "sh2":
             return {"irradiance_sh": ArraySpec((9,), wp.vec3), "diffuse_row_sums": ArraySpec((height, 5), wp.vec3)}
-        if self.rung == "sh4":
+        if self.method == "sh4":
             return {
                 "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
                 "diffuse_row_sums": ArraySpec((height, 9), wp.vec3),
@@ -62,21 +62,21 @@ class Diffuse(Stage):
 
     def _blocks(self) -> tuple[int, int]:
         height = self.request.quality.environment_height
-        if self.rung == "brute_force":
+        if self.method == "brute_force":
             return height, 2 * height
         return min(CLUSTERS[0], height), min(CLUSTERS[1], 2 * height)
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Launches of the rung, and the tables that they need."""
+        """Launches of the method, and the tables that they need."""
         environment = arrays["environment"]
-        if self.rung == "top_mip":
+        if self.method == "top_mip":
             top = arrays["irradiance_map"]
             return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]
-        if self.rung in ("sh2", "sh4"):
-            order = 2 if self.rung == "sh2" else 4
+        if self.method in ("sh2", "sh4"):
+            order = 2 if self.method == "sh2" else 4
             tables = irradiance.make_sh_tables(*environment.shape, order, device)
             sums = arrays["diffuse_row_sums"]
-            if self.rung == "sh2":
+            if self.method == "sh2":
                 sh = arrays["irradiance_sh"]
                 return [
                     Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, sh)),

@@ -18,13 +18,13 @@ class Expose(Stage):
     """Composes the picture and scales its light, over-exposed regions by what they are guessed to have been."""
 
     name = "expose"
-    rungs = ("plain", "box", "glow", "ball")
+    methods = ("plain", "box", "glow", "ball")
     remembers = ("expose_scale",)
     summary = "another exposure: over-exposed regions keep what they can be guessed to have had"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Reads the layers, and what its rung knows of clipped pixels."""
+        """Reads the layers, and what its method knows of clipped pixels."""
         if not exposes(request):
             return LeftOut(
                 "exposure is 1"
@@ -99,4 +99,4 @@ class Expose(Stage):
 def uses_table(request: Request) -> bool:
     """Whether darkening looks at a pixel's surroundings: only the box does, and only where light is taken away."""
     scale = request.scene.exposure.scale
-    return exposes(request) and request.quality.rung("expose") == "box" and (isinstance(scale, str) or scale < 1.0)
+    return exposes(request) and request.quality.method("expose") == "box" and (isinstance(scale, str) or scale < 1.0)

@@ -19,7 +19,7 @@ class Fill(Stage):
     """The complete map: what everything downstream reads, or what ``recover`` starts from."""
 
     name: ClassVar[str] = "fill"
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
+    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "completes the blind cone and hidden parts from confident neighbours"
 
     @classmethod

@@ -38,7 +38,7 @@ class HostCopies:
         self._views: dict[str, npt.NDArray[Any]] = {name: host.numpy() for name, host in self._hosts.items()}
 
     def fetch(self, stream: Any, after: Any, count: int | None = None) -> None:
-        """Begin to copy from the device on ``stream``, as things stand when ``after``'s work so far is done.
+        """Begin to copy from the device on ``stream``, as objects stand when ``after``'s work so far is done.
 
         Args:
             stream: Copies.

@@ -1,4 +1,4 @@
-"""Where the room's light comes from, in a few directions."""
+"""Where the environment comes from, in a few directions."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class KeyLights(Stage):
     """Dominant directions, brightest first, and how far each dominates."""
 
     name: ClassVar[str] = "key_lights"
-    rungs: ClassVar[tuple[str, ...]] = ("default",)
-    summary: ClassVar[str] = "finds the room's brightest directions and how far they dominate"
+    methods: ClassVar[tuple[str, ...]] = ("default",)
+    summary: ClassVar[str] = "finds the environment's brightest directions and how far they dominate"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:

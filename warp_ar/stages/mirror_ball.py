@@ -9,18 +9,18 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import mirror_ball
-from warp_ar.kernels.reflect import Room
-from warp_ar.kernels.relight import RelightConfig, make_desk
+from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names, mirrors_virtual
-from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
+from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
 from warp_ar.stages.relight import Relight, irradiance_name, relight_config
 from warp_ar.stages.shade import shade_config
 from warp_ar.stages.visibility import GrowingRows
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
-"""Rays per pixel, by rung; cheapest first, after ``none``."""
+"""Rays per pixel, by method; cheapest first, after ``none``."""
 
 
 def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
@@ -31,10 +31,10 @@ def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
     lit = "physical_added" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(request.scene),
-        SAMPLES[request.quality.rung("mirror_ball")],
+        SAMPLES[request.quality.method("mirror_ball")],
         shading,
         mirrored_relighting(request) if lit else None,
-        "physical_ratio" in layers,
+        "shadow_ratio" in layers,
     )
 
 
@@ -47,7 +47,7 @@ class MirrorBall(Stage):
     """Virtual objects, light and shadow as the mirror balls of the frame show them."""
 
     name: ClassVar[str] = "mirror_ball"
-    rungs: ClassVar[tuple[str, ...]] = ("none", *SAMPLES)
+    methods: ClassVar[tuple[str, ...]] = ("none", *SAMPLES)
     summary: ClassVar[str] = "what the mirror ball in the picture shows of virtual objects, light and shadows"
 
     @classmethod
@@ -63,15 +63,15 @@ class MirrorBall(Stage):
         reads = {"pose", "frame"}
         if "virtual" in layers:
             config = shade_config(request)
-            reads |= {"objects", *room_reads(config.room)}
+            reads |= {"objects", *distant_light_reads(config.distant)}
             reads |= {"lights"} if config.lights else set()
         if "physical_added" in layers:
             # The ball shows the desk too small for a pixel's surroundings to mean anything.
             wiring = Relight.wire(request)
             assert isinstance(wiring, Wiring)
-            reads |= set(wiring.reads) - {"summed_area", "room_samples"}
-        if "physical_ratio" in layers:
-            reads.add("physical_ratio")
+            reads |= set(wiring.reads) - {"summed_area", "environment_samples"}
+        if "shadow_ratio" in layers:
+            reads.add("shadow_ratio")
         return Wiring(tuple(sorted(reads)), ("mirrored",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -79,7 +79,7 @@ class MirrorBall(Stage):
         width, height = self.request.size
         return {
             "mirrored": ArraySpec((height, width), wp.vec3),
-            **room_arrays(room_config(self.request), self.name),
+            **distant_light_arrays(distant_light_config(self.request), self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -90,7 +90,7 @@ class MirrorBall(Stage):
         relighting = mirrored_relighting(self.request)
         irradiance = irradiance_name(self.request)
         lit = config.relight is not None
-        desk = make_desk(
+        desk = make_receiver(
             relighting,
             arrays["frame"],
             arrays["decode"],
@@ -101,15 +101,17 @@ class MirrorBall(Stage):
             arrays["lamps"] if "lamps" in reads else None,
         )
         shading = config.shade
-        room = Room() if shading is None else make_room(shading.room, self.request, arrays, self.name)
+        distant = (
+            DistantLight() if shading is None else make_distant_light(shading.distant, self.request, arrays, self.name)
+        )
         inputs = (
             arrays["params"],
             arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if "lights" in reads else None,
-            room,
+            distant,
             desk,
-            arrays["physical_ratio"] if config.ratio else None,
+            arrays["shadow_ratio"] if config.ratio else None,
         )
 
         def launch(rows: Rows | None) -> None:

@@ -1,7 +1,7 @@
 """The error model: how precisely each stage computes, and which tests of hard cases watch over it.
 
 Errors are those of float32 arithmetic alone, over the largest value of a stage's output, or in 8-bit codes: what a
-method leaves out (the distance of a lamp, the lobes of an order-2 series) is the price list's matter. The bounds are
+method leaves out (the distance of a lamp, the lobes of an order-2 series) is the cost table's matter. The bounds are
 checked wherever a float64 twin exists; the measured errors are the largest differences from those twins on CPU, and
 ``python -m tests.hard_cases.measure_errors`` measures them anew in a checkout.
 """
@@ -101,14 +101,14 @@ NUMERICS: dict[str, StageNumerics] = {
         3e-07,
         (5, 6, 9, 10, 13, 14, 17),
     ),
-    "room_samples": StageNumerics(
+    "environment_samples": StageNumerics(
         "float32, compensated cumulative sums",
         5e-6,
         "compensated along rows; one rounding a row over them",
         3.6e-07,
         (4, 6, 17, 18),
     ),
-    "room_shadow": StageNumerics(
+    "environment_shadow": StageNumerics(
         "float32; a ratio of equal sums, exactly 1 where less than 1/512 is shaded",
         2e-3,
         "rays at the rims of balls fall to either side",

@@ -1,4 +1,4 @@
-"""Rungs and presets: how accurately each stage works, as one frozen value."""
+"""Methods and presets: how accurately each stage works, as one frozen value."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from types import MappingProxyType
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """The rung of every stage and the sizes that go with it. Equal values share plans and compiled kernels."""
+    """The method of every stage and the sizes that go with it. Equal values share plans and compiled kernels."""
 
     name: str
     """Of the preset, or ``custom``."""
-    rungs: tuple[tuple[str, str], ...]
-    """(stage, rung) pairs, sorted by stage; stages that have only one rung need not be named."""
+    methods: tuple[tuple[str, str], ...]
+    """(stage, method) pairs, sorted by stage; stages that have only one method need not be named."""
     environment_height: int
     """Rows of the latlong environment; it has twice as many columns."""
     edge_samples: int
     """Samples per pixel along the edges of virtual objects; a square number."""
 
-    def rung(self, stage: str) -> str:
-        """Rung of ``stage``; a stage that is not named has its only rung, ``default``."""
-        return dict(self.rungs).get(stage, "default")
+    def method(self, stage: str) -> str:
+        """Method of ``stage``; a stage that is not named has its only method, ``default``."""
+        return dict(self.methods).get(stage, "default")
 
-    def with_rungs(self, **rungs: str) -> Quality:
-        """The same quality with some stages on other rungs."""
-        merged = {**dict(self.rungs), **rungs}
-        return dataclasses.replace(self, name="custom", rungs=tuple(sorted(merged.items())))
+    def with_methods(self, **methods: str) -> Quality:
+        """The same quality with some stages on other methods."""
+        merged = {**dict(self.methods), **methods}
+        return dataclasses.replace(self, name="custom", methods=tuple(sorted(merged.items())))
 
 
-def _preset(name: str, environment_height: int, edge_samples: int, **rungs: str) -> Quality:
-    return Quality(name, tuple(sorted(rungs.items())), environment_height, edge_samples)
+def _preset(name: str, environment_height: int, edge_samples: int, **methods: str) -> Quality:
+    return Quality(name, tuple(sorted(methods.items())), environment_height, edge_samples)
 
 
 PRESETS: Mapping[str, Quality] = MappingProxyType(
@@ -46,7 +46,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 specular="box_mip",
                 relight="relief",
                 recover="clipped",
-                room_shadow="none",
+                environment_shadow="none",
                 expose="box",
                 mirror_ball="none",
                 shade="environment",
@@ -60,7 +60,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 light_shadow="hard",
                 relight="reflectance",
                 recover="white_card",
-                room_shadow="none",
+                environment_shadow="none",
                 expose="box",
                 mirror_ball="none",
                 shade="environment",
@@ -74,7 +74,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 light_shadow="soft",
                 relight="reflectance",
                 recover="shading",
-                room_shadow="coarse",
+                environment_shadow="coarse",
                 expose="glow",
                 mirror_ball="single",
                 shade="environment",
@@ -88,7 +88,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 light_shadow="soft",
                 relight="bounce",
                 recover="shading",
-                room_shadow="bounce",
+                environment_shadow="bounce",
                 expose="ball",
                 mirror_ball="smooth",
                 shade="one_bounce",
@@ -102,7 +102,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 light_shadow="soft",
                 relight="brute_force",
                 recover="shading",
-                room_shadow="brute_force",
+                environment_shadow="brute_force",
                 expose="ball",
                 mirror_ball="brute_force",
                 shade="one_bounce",
@@ -113,8 +113,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
 DEFAULT_PRESET = "medium"
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
 """Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included. A preset errs
-least by the price list within ``SHARE`` of its budget: docs/prices.md gives the rule and what departs from it,
-``python -m bench.write_prices`` applies it. ``paper`` is the paper's method, ``reference`` the last rungs that end
-within a lifetime: neither has a budget."""
+least by the cost table within ``SHARE`` of its budget: docs/costs.md gives the rule and what departs from it,
+``python -m bench.write_cost_tables`` applies it. ``paper`` is the paper's method, ``reference`` the last methods that
+end within a lifetime: neither has a budget."""
 SHARE = 0.8
 """Of a budget, what is planned with: the rest is for slower moments, as ``--quality auto`` has it."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_ar.kernels import environment
 from warp_ar.kernels import recover as kernels
-from warp_ar.kernels.structs import RoomLamp
+from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
@@ -57,25 +57,25 @@ class _Solution:
 class Recover(Stage):
     """Estimates what clipped texels lack from surfaces that the same light falls on.
 
-    It comes after filling, not before: what the surfaces receive depends on the whole room, the part behind the ball
-    included, and a lamp's recovered energy must not be spread into the unseen by filling.
+    It comes after filling, not before: what the surfaces receive depends on the whole environment, the part behind the
+    ball included, and a lamp's recovered energy must not be spread into the unseen by filling.
     """
 
     name: ClassVar[str] = "recover"
-    rungs: ClassVar[tuple[str, ...]] = recovery.RUNGS
+    methods: ClassVar[tuple[str, ...]] = recovery.METHODS
     summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
     remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "recover_cells", "lamps")
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Needs a mirror ball and a rung that does something."""
+        """Needs a mirror ball and a method that does something."""
         if not request.scene.probes:
             return LeftOut(NO_PROBE)
         if not recovers(request):
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
-            ("environment", "lamps") if request.quality.rung(cls.name) == "shading" else ("environment",),
+            ("environment", "lamps") if request.quality.method(cls.name) == "shading" else ("environment",),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -83,11 +83,11 @@ class Recover(Stage):
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         cells = kernels.cell_shape(*shape)
-        self._surfaces = recovery.find_surfaces(self.request.scene, card_only=self.rung == "white_card")
+        self._surfaces = recovery.find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
-            **{name: ArraySpec((recovery.PEAKS,), RoomLamp) for name in self.wiring.writes if name == "lamps"},
+            **{name: ArraySpec((recovery.PEAKS,), Emitter) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_lacking": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
@@ -111,7 +111,9 @@ class Recover(Stage):
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
         ball = scene.probes[0]
-        solver = recovery.Recovery(self._surfaces, scene.marker.white, ball.center, radius=ball.radius, rung=self.rung)
+        solver = recovery.Recovery(
+            self._surfaces, scene.marker.white, ball.center, radius=ball.radius, method=self.method
+        )
         self._progress = _Progress(solver)
         self._asks = self._arrives = self._news = False
         self._worker: ThreadPoolExecutor | None = None
@@ -215,7 +217,7 @@ class Recover(Stage):
         """Begin to solve, and wait for it where it takes effect at once."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
-            if self.rung == "shading":
+            if self.method == "shading":
                 # Now, not in the worker later: kernels are translated by one thread at a time.
                 proxies = trace_config(self.request.scene).proxies
                 wp.load_module(kernels.make_kernels(proxies)[2].module, device=self._device)
@@ -278,7 +280,7 @@ class Recover(Stage):
         now.estimate = solution.estimate
         values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
         if "lamps" in self.wiring.writes:
-            records = np.zeros(recovery.PEAKS, np.dtype(RoomLamp.numpy_dtype()))
+            records = np.zeros(recovery.PEAKS, np.dtype(Emitter.numpy_dtype()))
             for record, lamp in zip(records, solution.estimate.lamps, strict=False):
                 record["origin"], record["direction"] = lamp.origin, lamp.direction
                 record["distance"], record["power"] = lamp.distance, lamp.power
@@ -291,8 +293,8 @@ class Recover(Stage):
             self._worker.shutdown(wait=False)
 
     def resume(self, other: Stage) -> None:
-        """Keep the lamps that were found, and when; on another rung, or on another desk, look anew."""
-        if not isinstance(other, Recover) or other.rung != self.rung:
+        """Keep the lamps that were found, and when; on another method, or on another desk, look anew."""
+        if not isinstance(other, Recover) or other.method != self.method:
             return
         mine, yours = self.request.scene, other.request.scene
         if (mine.marker, mine.probes, mine.proxies) == (yours.marker, yours.probes, yours.proxies):
@@ -327,10 +329,10 @@ class Recover(Stage):
 
 def recovers(request: Request) -> bool:
     """Whether the quality asks for recovery."""
-    return request.quality.rung("recover") not in ("default", "clipped")
+    return request.quality.method("recover") not in ("default", "clipped")
 
 
-def knows_lamps(request: Request) -> bool:
-    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``RoomLamp``."""
+def knows_emitters(request: Request) -> bool:
+    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``Emitter``."""
     wiring = Recover.wire(request)
     return isinstance(wiring, Wiring) and "lamps" in wiring.writes

@@ -10,14 +10,14 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels import desk_cells, relight
-from warp_ar.kernels.room_shadow import count_parts
+from warp_ar.kernels import receiver_cells, relight
+from warp_ar.kernels.environment_shadow import count_parts
 from warp_ar.scene.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import shares_room
+from warp_ar.stages.composite import shares_environment
 from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.recover import knows_lamps
-from warp_ar.stages.room_samples import SAMPLES
+from warp_ar.stages.environment_samples import SAMPLES
+from warp_ar.stages.recover import knows_emitters
 from warp_ar.stages.shade import casts_soft, sees_near
 from warp_ar.stages.visibility import GrowingRows
 
@@ -27,9 +27,9 @@ class Grain:
     """How finely cells of the desk are estimated."""
 
     samples: int
-    """Of the room's light, for its share."""
+    """Of the environment, for its share."""
     share: int
-    """Pixels per cell of the room's share, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
+    """Pixels per cell of the environment's share, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
     bounced: int
     """The same, of bounced light."""
     patch: int
@@ -37,7 +37,8 @@ class Grain:
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
-"""Rungs that know the room's own shadows on the desk and one bounce of virtual light; else they are ``reflectance``."""
+"""Methods that know the environment's own shadows on the desk and one bounce of virtual light; else they are
+``reflectance``."""
 STRIDE_ROWS = 480
 
 
@@ -45,32 +46,32 @@ class Relight(Stage):
     """Adds what virtual lights send to the proxies, shadowed, to the desk in the frame."""
 
     name = "relight"
-    rungs = (*relight.RUNGS, *GRAINS)
+    methods = (*relight.METHODS, *GRAINS)
     summary = "virtual light and its shadows on the physical desk"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Reads what its rung needs to know of the room and the desk."""
+        """Reads what its method needs to know of the environment and the desk."""
         if not request.scene.lights:
             return LeftOut("the scene has no virtual light")
         if not request.scene.proxies:
             return LeftOut("the scene has no proxy for virtual light to fall on")
-        rung = relight_rung(request)
+        method = relight_method(request)
         reads = ["pose", "lights", "objects"]
-        if rung != "flat":
+        if method != "flat":
             reads += ["frame", "key_lights"]
-        if rung in ("relief", "reflectance", *GRAINS):
+        if method in ("relief", "reflectance", *GRAINS):
             reads.append("summed_area")
-        if rung in ("reflectance", *GRAINS):
+        if method in ("reflectance", *GRAINS):
             reads.append(irradiance_name(request))
-            reads += ["lamps"] * knows_lamps(request)
-        if shares_room(request):
-            reads.append("room_samples")
+            reads += ["lamps"] * knows_emitters(request)
+        if shares_environment(request):
+            reads.append("environment_samples")
         return Wiring(tuple(reads), ("physical_added",))
 
     def gives_way(self) -> tuple[str, ...]:
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
-        return () if sees_near(self.request) else ("room_shadow",)
+        return () if sees_near(self.request) else ("environment_shadow",)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
@@ -79,7 +80,7 @@ class Relight(Stage):
         if self.request.quality.edge_samples > 1:
             specs["relight_seen"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
-        if shares_room(self.request):
+        if shares_environment(self.request):
             cells = _cells(self.request, _grain(self.request).share)
             specs["relight_share"] = ArraySpec(cells, wp.vec3)
             specs["relight_share_surface"] = ArraySpec(cells, wp.int32, -1)
@@ -88,8 +89,8 @@ class Relight(Stage):
             cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
             specs["relight_bounced"] = ArraySpec(cells, wp.vec3)
             specs["relight_bounced_surface"] = ArraySpec(cells, wp.int32, -1)
-            specs["relight_patches"] = ArraySpec(patches, desk_cells.Patch, desk_cells.Patch())
-            specs["relight_listed"] = ArraySpec(patches, desk_cells.Patch, desk_cells.Patch())
+            specs["relight_patches"] = ArraySpec(patches, receiver_cells.Patch, receiver_cells.Patch())
+            specs["relight_listed"] = ArraySpec(patches, receiver_cells.Patch, receiver_cells.Patch())
             specs["relight_count"] = ArraySpec(patches[:1], wp.int32)
         return specs
 
@@ -99,7 +100,7 @@ class Relight(Stage):
         config = relight_config(self.request)
         relight.make_relight_kernel(config)
         cells = make_cells(self.request, arrays)
-        room = arrays[irradiance] if irradiance in reads else None
+        distant = arrays[irradiance] if irradiance in reads else None
         known = (
             arrays["frame"],
             arrays["decode"],
@@ -108,7 +109,7 @@ class Relight(Stage):
             arrays["probes"],
             arrays["light_array"],
             arrays["key_lights"] if "key_lights" in reads else None,
-            room,
+            distant,
         )
         lamps = arrays["lamps"] if "lamps" in reads else None
         camera = arrays["params"], arrays["rays"]
@@ -121,7 +122,7 @@ class Relight(Stage):
         light_rows = arrays["light_rows"]
         last = [Pass(launch, rows=height, extent=GrowingRows(light_rows))]
         frame, decode, table, scene, probes, lights, key_lights, _ = known
-        desk = relight.make_desk(config, frame, decode, table, probes, key_lights, room, lamps, cells)
+        desk = relight.make_receiver(config, frame, decode, table, probes, key_lights, distant, lamps, cells)
         if config.edge_samples > 1:
             lists = make_edge_lists(arrays, device, self.name)
 
@@ -135,7 +136,7 @@ class Relight(Stage):
         if not (config.share or config.bounced):
             return last
 
-        place = desk_cells.CellConfig(config)
+        place = receiver_cells.CellConfig(config)
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
@@ -152,17 +153,17 @@ class Relight(Stage):
         grain = _grain(self.request)
         if config.share:
             share, surface, size = arrays["relight_share"], arrays["relight_share_surface"], cells.share_stride
-            parts = 1 if device.is_cpu else count_parts(*share.shape, desk_cells.SHARE_PARTS)
+            parts = 1 if device.is_cpu else count_parts(*share.shape, receiver_cells.SHARE_PARTS)
             sums = None
             if parts > 1:
-                sums = wp.empty(desk_cells.share_sums_shape(parts, *share.shape), dtype=wp.vec3, device=device)
+                sums = wp.empty(receiver_cells.share_sums_shape(parts, *share.shape), dtype=wp.vec3, device=device)
 
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
-                own = arrays["room_samples"], grain.samples, size, share, surface
+                own = arrays["environment_samples"], grain.samples, size, share, surface
                 more = {"bounced": bounced, "sums_out": sums, "rows": rows}
-                desk_cells.share_room(place, *camera, scene, lights, desk, *own, **more)
+                receiver_cells.share_environment(place, *camera, scene, lights, desk, *own, **more)
 
-            desk_cells.make_share_room_kernel(place)
+            receiver_cells.make_share_environment_kernel(place)
             passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))
         if config.bounced:
             patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
@@ -170,16 +171,18 @@ class Relight(Stage):
             step, wide = cells.bounced_stride, _stride(self.request, grain.patch)
 
             def send(rows: Rows | None) -> None:
-                desk_cells.send_light(place, *camera, scene, lights, desk, wide, patches, rows=rows)
+                receiver_cells.send_light(place, *camera, scene, lights, desk, wide, patches, rows=rows)
 
             def arrange(rows: Rows | None) -> None:
-                desk_cells.list_patches(patches, listed, count, rows=rows)
+                receiver_cells.list_patches(patches, listed, count, rows=rows)
 
             def gather(rows: Rows | None) -> None:
-                desk_cells.gather_light(place, *camera, scene, desk, listed, count, wide, step, bounced, lit, rows=rows)
+                receiver_cells.gather_light(
+                    place, *camera, scene, desk, listed, count, wide, step, bounced, lit, rows=rows
+                )
 
-            desk_cells.make_send_light_kernel(place)
-            desk_cells.make_gather_light_kernel(place)
+            receiver_cells.make_send_light_kernel(place)
+            receiver_cells.make_gather_light_kernel(place)
             lit_patches = rows_of(wide, len(patches), 0)
             passes.append(Pass(send, rows=len(patches), extent=lit_patches))
             passes.append(Pass(arrange, rows=len(patches), extent=lit_patches))
@@ -191,7 +194,7 @@ class Relight(Stage):
 
 
 def _grain(request: Request) -> Grain:
-    return GRAINS[relight_rung(request)]
+    return GRAINS[relight_method(request)]
 
 
 def _stride(request: Request, pixels: int) -> int:
@@ -205,13 +208,13 @@ def _cells(request: Request, pixels: int) -> tuple[int, int]:
     return -(-height // stride), -(-width // stride)
 
 
-def make_cells(request: Request, arrays: Arrays) -> relight.DeskCells:
+def make_cells(request: Request, arrays: Arrays) -> relight.ReceiverCells:
     """The cells of a request as kernels read them."""
-    cells = relight.DeskCells()
-    if relight_rung(request) in GRAINS:
+    cells = relight.ReceiverCells()
+    if relight_method(request) in GRAINS:
         grain = _grain(request)
         cells.share_stride, cells.bounced_stride = _stride(request, grain.share), _stride(request, grain.bounced)
-    if shares_room(request):
+    if shares_environment(request):
         cells.share, cells.share_surface = arrays["relight_share"], arrays["relight_share_surface"]
     if bounces_virtual(request):
         cells.bounced, cells.bounced_surface = arrays["relight_bounced"], arrays["relight_bounced_surface"]
@@ -220,30 +223,30 @@ def make_cells(request: Request, arrays: Arrays) -> relight.DeskCells:
 
 def bounces_virtual(request: Request) -> bool:
     """Whether lit proxies light each other: where the quality asks for it, and one proxy faces another."""
-    return relight_rung(request) in GRAINS and proxies_face(request.scene)
+    return relight_method(request) in GRAINS and proxies_face(request.scene)
 
 
 def relight_config(request: Request) -> relight.RelightConfig:
     """What the relighting of a request's desk calls for."""
-    rung = relight_rung(request)
+    method = relight_method(request)
     return relight.RelightConfig(
-        "reflectance" if rung in GRAINS else rung,
+        "reflectance" if method in GRAINS else method,
         trace_config(request.scene),
         "sh" if irradiance_name(request) == "irradiance_sh" else "map",
         bool(request.scene.probes),
         casts_soft(request),
-        rung in ("reflectance", *GRAINS) and knows_lamps(request),
-        shares_room(request),
+        method in ("reflectance", *GRAINS) and knows_emitters(request),
+        shares_environment(request),
         bounces_virtual(request),
         request.quality.edge_samples,
     )
 
 
-def relight_rung(request: Request) -> str:
-    """The quality's rung, or ``flat`` where no ball tells anything of the room."""
-    return request.quality.rung(Relight.name) if request.scene.probes else relight.RUNGS[0]
+def relight_method(request: Request) -> str:
+    """The quality's method, or ``flat`` where no ball tells anything of the environment."""
+    return request.quality.method(Relight.name) if request.scene.probes else relight.METHODS[0]
 
 
 def irradiance_name(request: Request) -> str:
-    """Resource that holds the room's irradiance at this quality."""
-    return "irradiance_sh" if request.quality.rung("diffuse") == "sh2" else "irradiance_map"
+    """Resource that holds the environment's irradiance at this quality."""
+    return "irradiance_sh" if request.quality.method("diffuse") == "sh2" else "irradiance_map"

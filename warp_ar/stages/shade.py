@@ -1,4 +1,4 @@
-"""Virtual objects lit by the room and by virtual lights."""
+"""Virtual objects lit by the environment and by virtual lights."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels.reflect import RoomConfig
+from warp_ar.kernels.reflect import DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
 from warp_ar.scene.ray_scene import has_sized_lights, light_kind
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.reflect import make_room, room_arrays, room_config, room_reads
+from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -20,7 +20,7 @@ def shade_config(request: Request) -> ShadeConfig:
     """What the shading of a request's objects calls for."""
     scene = request.scene
     return ShadeConfig(
-        room=room_config(request),
+        distant=distant_light_config(request),
         lights=tuple(sorted({light_kind(light) for light in scene.lights})),
         edge_samples=request.quality.edge_samples,
         soft=casts_soft(request),
@@ -30,15 +30,15 @@ def shade_config(request: Request) -> ShadeConfig:
 
 def casts_soft(request: Request) -> bool:
     """Whether sized virtual lights cast soft shadows: ``light_shadow`` names a way of two stages, hard or soft."""
-    return request.quality.rung("light_shadow") == "soft" and has_sized_lights(request.scene)
+    return request.quality.method("light_shadow") == "soft" and has_sized_lights(request.scene)
 
 
 def sees_near(request: Request) -> bool:
     """Whether the quality asks for what surrounds the objects at close range."""
-    return request.quality.rung("shade") == "one_bounce"
+    return request.quality.method("shade") == "one_bounce"
 
 
-def near_names(config: RoomConfig) -> tuple[str, ...]:
+def near_names(config: DistantLightConfig) -> tuple[str, ...]:
     """Resources of what surrounds the objects, those that their materials show."""
     diffuse = () if config.diffuse == "none" else ("object_irradiance",)
     return (*diffuse, "object_mirrored") if config.specular else diffuse
@@ -48,8 +48,8 @@ class Shade(Stage):
     """Radiance and coverage of virtual objects, with smooth edges."""
 
     name = "shade"
-    rungs = ("environment", "one_bounce")
-    summary = "shade virtual objects by the room's light and virtual lights, shadowed and anti-aliased"
+    methods = ("environment", "one_bounce")
+    summary = "shade virtual objects by the environment and virtual lights, shadowed and anti-aliased"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
@@ -60,9 +60,9 @@ class Shade(Stage):
         reads = ["pose", "objects", "hit_object", "hits"]
         if config.lights:
             reads.append("lights")
-        reads += room_reads(config.room)
+        reads += distant_light_reads(config.distant)
         if config.near:
-            reads += near_names(config.room)
+            reads += near_names(config.distant)
         return Wiring(tuple(reads), ("virtual",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -71,7 +71,7 @@ class Shade(Stage):
         return {
             "virtual": ArraySpec((height, width), wp.vec4),
             **edge_arrays(self.request, self.name),
-            **room_arrays(room_config(self.request), self.name),
+            **distant_light_arrays(distant_light_config(self.request), self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -83,7 +83,7 @@ class Shade(Stage):
             arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
-            make_room(config.room, self.request, arrays, self.name),
+            make_distant_light(config.distant, self.request, arrays, self.name),
             arrays["hit_object"],
             arrays["hits"],
         )

@@ -12,7 +12,7 @@ from warp_ar.kernels import prefilter, pyramid
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.ray_scene import reflects_glossily
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
-from warp_ar.stages.room_shadow import bounces_light
+from warp_ar.stages.environment_shadow import bounces_light
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -30,7 +30,7 @@ class Specular(Stage):
     """Prefilters the environment with lobes of growing width."""
 
     name: ClassVar[str] = "specular"
-    rungs: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis32", "fis128", "brute_force")
+    methods: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis32", "fis128", "brute_force")
     summary: ClassVar[str] = "the environment filtered for glossy reflection, level by level"
 
     @classmethod
@@ -39,7 +39,7 @@ class Specular(Stage):
         if not request.scene.objects:
             return LeftOut("the scene has no virtual object")
         if not request.scene.probes:
-            return LeftOut("the scene has no probe, so the room's light is unknown")
+            return LeftOut("the scene has no probe, so the environment is unknown")
         if not glossy_materials(request.scene):
             return LeftOut("no virtual object has a glossy material")
         return Wiring(("environment",), ("specular_levels",))
@@ -53,29 +53,29 @@ class Specular(Stage):
         """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
         specs = {"specular_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
-        if self.rung != "brute_force" and not self._mirrors_only:
+        if self.method != "brute_force" and not self._mirrors_only:
             specs["specular_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
             specs["specular_blocks_done"] = ArraySpec((1,), wp.int32)
-        if self.rung not in ("box_mip", "brute_force") and not self._mirrors_only:
+        if self.method not in ("box_mip", "brute_force") and not self._mirrors_only:
             specs["specular_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
             specs["specular_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Launches of the rung; weights and samples are made here, once."""
+        """Launches of the method; weights and samples are made here, once."""
         height = self.request.quality.environment_height
         lobe = scene_lobe(self.request.scene)
         environment, levels = arrays["environment"], arrays["specular_levels"]
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]
-        if self.rung == "brute_force":
+        if self.method == "brute_force":
             return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
 
         box, blocks_done = arrays["specular_pyramid"], arrays["specular_blocks_done"]
-        isotropic = self.rung != "box_mip"
+        isotropic = self.method != "box_mip"
         passes = [Pass(lambda rows: pyramid.build_pyramid(environment, blocks_done, box, isotropic=isotropic))]
-        if self.rung in ("box_mip", "energy_mip"):
+        if self.method in ("box_mip", "energy_mip"):
             numbers = prefilter.mip_weights(height, lobe) if isotropic else prefilter.box_weights(height)
             weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
             passes.append(
@@ -85,7 +85,7 @@ class Specular(Stage):
                 )
             )
         else:
-            samples = prefilter.make_lobe_samples(height, lobe, int(self.rung.removeprefix("fis")), device)
+            samples = prefilter.make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
             passes.append(
                 Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels)
             )

@@ -11,21 +11,21 @@ from warp_ar.kernels import summed_area
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 from warp_ar.stages.composite import layer_names
 from warp_ar.stages.expose import uses_table
-from warp_ar.stages.relight import relight_rung
+from warp_ar.stages.relight import relight_method
 
 
 class SummedArea(Stage):
     """Sums the frame's intensity so that any box's mean costs four look-ups."""
 
     name = "summed_area"
-    rungs = ("default",)
+    methods = ("default",)
     summary = "summed-area table of the frame: means over boxes of any size"
 
     @classmethod
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Wired for darkening by the paper's box, and for relief against its surroundings."""
         lit = "physical_added" in layer_names(request)
-        relief = lit and relight_rung(request) not in ("flat", "paper")
+        relief = lit and relight_method(request) not in ("flat", "paper")
         if not uses_table(request) and not relief:
             return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
         return Wiring(("frame",), ("summed_area",))

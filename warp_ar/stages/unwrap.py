@@ -20,7 +20,7 @@ class Unwrap(Stage):
     """Light of the current frame, with how far each direction can be trusted and how much of it clips."""
 
     name: ClassVar[str] = "unwrap"
-    rungs: ClassVar[tuple[str, ...]] = probe.RUNGS
+    methods: ClassVar[tuple[str, ...]] = probe.METHODS
     summary: ClassVar[str] = "reads the light off the mirror ball, exactly for a camera nearby"
 
     @classmethod
@@ -45,8 +45,8 @@ class Unwrap(Stage):
         """Corners first, then texels between them."""
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
         config = probe.ProjectConfig(tuple(kinds))
-        rung = self.request.quality.rung(self.name)
-        rung = rung if rung != "default" else "area"
+        method = self.request.quality.method(self.name)
+        method = method if method != "default" else "area"
         height = self.request.quality.environment_height
 
         def project(rows: Rows | None) -> None:
@@ -69,7 +69,7 @@ class Unwrap(Stage):
                 arrays["probe_radiance"],
                 arrays["probe_confidence"],
                 arrays["probe_clipped"],
-                rung=rung,
+                method=method,
                 rows=rows,
             )
 

@@ -34,7 +34,7 @@ class Visibility(Stage):
     """Traces primary rays, only where virtual objects can be on screen."""
 
     name = "visibility"
-    rungs = ("default",)
+    methods = ("default",)
     summary = "trace which virtual object each pixel sees, hidden by proxies in front"
 
     @classmethod

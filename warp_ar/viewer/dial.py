@@ -1,7 +1,7 @@
 """The time/accuracy dial: what a budget buys on this device, and how far off that is.
 
-Errors come from the price list, costs from measurements on this device, both as for ``--quality auto``; they are
-measured here one rung at a time between other work, so that frames and edits go on meanwhile.
+Errors come from the cost table, costs from measurements on this device, both as for ``--quality auto``; they are
+measured here one method at a time between other work, so that frames and edits go on meanwhile.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, Controller
-from warp_ar.accuracy.cost_table import Knob, load_errors, relevant_knobs, setting, turn
+from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings, turn
 from warp_ar.accuracy.costs import BASE, Costs, cache_folder, cost_key, measure_steps, read_costs, write_costs
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
@@ -45,7 +45,7 @@ class Dial:
         self._offer: dict[str, Any] = {}
         self._progress: float | None = None
         self._failed: str | None = None
-        self._knobs: tuple[Knob, ...] = ()
+        self._settings: tuple[Setting, ...] = ()
         self._stopped = False
 
     @property
@@ -60,7 +60,7 @@ class Dial:
 
     @property
     def measuring(self) -> bool:
-        """Whether costs are being measured: frames do well to leave room for that."""
+        """Whether costs are being measured: frames do well to leave environment for that."""
         return self._progress is not None
 
     def switch(self, budget: float | None) -> None:
@@ -88,19 +88,20 @@ class Dial:
         if self.measuring or self._stopped:
             return
         scene, size = pipeline.scene, pipeline.size
-        # Edits change costs as load does; only another scene, its frames' size or an unknown knob ask for a new look.
+        # Edits change costs as load does; only another scene, its frames' size or an unknown setting ask for a new
+        # look.
         key = f"{scene.name} {size}"
         if key != self._key:
             self._key = key
-            self._knobs = relevant_knobs(scene, size)
+            self._settings = relevant_settings(scene, size)
             plan = make_plan(dataclasses.replace(pipeline.plan.request, quality=BASE))
-            self._cache_key = cost_key(plan, pipeline.device, self._knobs)
-            self._adopt(read_costs(self._folder, self._cache_key, self._knobs))
+            self._cache_key = cost_key(plan, pipeline.device, self._settings)
+            self._adopt(read_costs(self._folder, self._cache_key, self._settings))
             self._notify(self.record())
         if self._costs is None and self._budget is not None and key != self._failed:
             self._progress = 0.0
             self._notify(self.record())
-            steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._knobs)
+            steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
             helper.submit(self._step, helper, steps, key)
 
     def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
@@ -113,7 +114,7 @@ class Dial:
             self._adopt(end.value)
         except WarpArError as error:
             self._failed = key
-            self._notify({"type": "notice", "text": f"What rungs cost cannot be measured: {error}", "bad": True})
+            self._notify({"type": "notice", "text": f"What methods cost cannot be measured: {error}", "bad": True})
         finally:
             self._progress = progress
         self._notify(self.record())
@@ -166,8 +167,8 @@ class Dial:
         return {"type": "dial", "measuring": self._progress, "known": self._controller is not None, **self._offer}
 
     def _list(self, controller: Controller, costs: Costs) -> dict[str, Any]:
-        names = [knob.name for knob in self._knobs]
-        ladders = {knob.name: list(knob.rungs) for knob in self._knobs}
+        names = [setting.name for setting in self._settings]
+        ladders = {setting.name: list(setting.methods) for setting in self._settings}
         return {
             "base": costs.base,
             "ladders": ladders,
@@ -175,19 +176,21 @@ class Dial:
                 {
                     "ms": round(choice.milliseconds, 3),
                     "error": round(choice.error, 5),
-                    "rungs": [ladders[name].index(dict(choice.settings)[name]) for name in names],
+                    "methods": [ladders[name].index(dict(choice.settings)[name]) for name in names],
                 }
                 for choice in controller.choices
             ],
-            "presets": {name: price for name in PRESETS if (price := self._price(PRESETS[name], costs)) is not None},
+            "presets": {
+                name: method_cost for name in PRESETS if (method_cost := self._price(PRESETS[name], costs)) is not None
+            },
         }
 
     def _price(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
-        """What a preset should cost and err; None where it has rungs that are not measured."""
-        rungs = {knob.name: setting(quality, knob) for knob in self._knobs}
-        if any(rung not in costs.rungs[knob] for knob, rung in rungs.items()):
+        """What a preset should cost and err; None where it has methods that are not measured."""
+        methods = {setting.name: chosen(quality, setting) for setting in self._settings}
+        if any(method not in costs.methods[setting] for setting, method in methods.items()):
             return None
         return {
-            "ms": round(costs.excess(rungs), 3),
-            "error": round(sum(self._errors[knob][rung] for knob, rung in rungs.items()), 5),
+            "ms": round(costs.excess(methods), 3),
+            "error": round(sum(self._errors[setting][method] for setting, method in methods.items()), 5),
         }

@@ -74,46 +74,46 @@ def checked(scene: Scene) -> Scene:
     return dataclasses.replace(loads_scene(dumps_scene(scene)), path=scene.path)
 
 
-def set_value(scene: Scene, thing: str, index: int, key: str, value: Any) -> Scene:
-    """The scene with one key of one thing changed.
+def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scene:
+    """The scene with one key of one part changed.
 
     Args:
         scene: The scene.
-        thing: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
+        part: ``object``, ``light``, ``proxy``, ``probe``, ``exposure`` or ``marker``.
         index: Which one.
         key: A key of the scene file's section, or of its material.
         value: A number, a tuple of numbers or a word.
 
     Raises:
-        UsageError: There is no such thing, or it has no such key that could be edited.
+        UsageError: There is no such part, or it has no such key that could be edited.
         SceneError: The scene file would refuse the value.
     """
-    if thing in ("exposure", "marker"):
-        section = dataclasses.replace(getattr(scene, thing), **{_key(thing, key): value})
-        changed: dict[str, Any] = {thing: section}
+    if part in ("exposure", "marker"):
+        section = dataclasses.replace(getattr(scene, part), **{_key(part, key): value})
+        changed: dict[str, Any] = {part: section}
         return checked(dataclasses.replace(scene, **changed))
-    items = list(getattr(scene, _LISTS[thing]))
+    items = list(getattr(scene, _LISTS[part]))
     if index >= len(items):
-        raise UsageError(f"{thing} {index}: the scene has {len(items)}")
+        raise UsageError(f"{part} {index}: the scene has {len(items)}")
     item = items[index]
     if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
         items[index] = dataclasses.replace(item, material=_material(item.material, key, value))
     else:
-        changes = {_key(thing, key): value}
-        if thing == "light" and key in ("target", "direction"):
+        changes = {_key(part, key): value}
+        if part == "light" and key in ("target", "direction"):
             changes["direction" if key == "target" else "target"] = None
         items[index] = dataclasses.replace(item, **changes)
-    return _with_list(scene, thing, tuple(items))
+    return _with_list(scene, part, tuple(items))
 
 
-def _with_list(scene: Scene, thing: str, items: tuple[Any, ...]) -> Scene:
-    changed: dict[str, Any] = {_LISTS[thing]: items}
+def _with_list(scene: Scene, part: str, items: tuple[Any, ...]) -> Scene:
+    changed: dict[str, Any] = {_LISTS[part]: items}
     return checked(dataclasses.replace(scene, **changed))
 
 
-def _key(thing: str, key: str) -> str:
-    if key not in _KEYS[thing]:
-        raise UsageError(f"{thing}: key {key!r} cannot be edited; expected {', '.join(_KEYS[thing])}")
+def _key(part: str, key: str) -> str:
+    if key not in _KEYS[part]:
+        raise UsageError(f"{part}: key {key!r} cannot be edited; expected {', '.join(_KEYS[part])}")
     return key
 
 
@@ -131,20 +131,20 @@ def _material(material: Material, key: str, value: Any) -> Material:
     return dataclasses.replace(material, **{key: value})
 
 
-def add_thing(scene: Scene, thing: str, kind: str) -> Scene:
+def add_part(scene: Scene, part: str, kind: str) -> Scene:
     """The scene with a new object or light of ``kind``."""
-    items = getattr(scene, _LISTS[thing])
+    items = getattr(scene, _LISTS[part])
     if len(items) >= MOST_THINGS:
         raise UsageError(f"{len(items)} are on the desk already; {MOST_THINGS} at most: take one away first")
-    return _with_list(scene, thing, (*items, _NEW[kind]))
+    return _with_list(scene, part, (*items, _NEW[kind]))
 
 
-def remove_thing(scene: Scene, thing: str, index: int) -> Scene:
+def remove_part(scene: Scene, part: str, index: int) -> Scene:
     """The scene without one object or light."""
-    items = getattr(scene, _LISTS[thing])
+    items = getattr(scene, _LISTS[part])
     if index >= len(items):
-        raise UsageError(f"{thing} {index}: the scene has {len(items)}")
-    return _with_list(scene, thing, items[:index] + items[index + 1 :])
+        raise UsageError(f"{part} {index}: the scene has {len(items)}")
+    return _with_list(scene, part, items[:index] + items[index + 1 :])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,17 +158,17 @@ class Wanted:
     off: frozenset[str] = frozenset()
     """Effects that are switched off."""
     hidden: frozenset[tuple[str, int]] = frozenset()
-    """(thing, index) of objects and lights that are hidden."""
-    rungs: tuple[tuple[str, str], ...] = ()
-    """(stage, rung) that differ from the preset's."""
+    """(part, index) of objects and lights that are hidden."""
+    methods: tuple[tuple[str, str], ...] = ()
+    """(stage, method) that differ from the preset's."""
 
     def shown_scene(self) -> Scene:
         """The scene without what is hidden or switched off: the one that a file of this picture holds."""
         scene = self.scene
 
-        def seen(thing: str, effect: str) -> tuple[Any, ...]:
-            items = getattr(scene, _LISTS[thing])
-            return tuple(x for i, x in enumerate(items) if effect not in self.off and (thing, i) not in self.hidden)
+        def seen(part: str, effect: str) -> tuple[Any, ...]:
+            items = getattr(scene, _LISTS[part])
+            return tuple(x for i, x in enumerate(items) if effect not in self.off and (part, i) not in self.hidden)
 
         return dataclasses.replace(
             scene,
@@ -181,29 +181,29 @@ class Wanted:
 
     def shown_quality(self) -> Quality:
         """The quality without what is switched off."""
-        rungs = dict(self.rungs)
+        methods = dict(self.methods)
         if "relief" in self.off:
-            rungs["relight"] = "flat"
-        if "room_shadow" in self.off:
-            rungs["room_shadow"] = "none"
-        return self.quality.with_rungs(**rungs) if rungs else self.quality
+            methods["relight"] = "flat"
+        if "environment_shadow" in self.off:
+            methods["environment_shadow"] = "none"
+        return self.quality.with_methods(**methods) if methods else self.quality
 
-    def without_thing(self, thing: str, index: int) -> Wanted:
+    def without_part(self, part: str, index: int) -> Wanted:
         """With one object or light removed; what is hidden stays hidden."""
-        hidden = {(t, i - (t == thing and i > index)) for t, i in self.hidden if (t, i) != (thing, index)}
-        return dataclasses.replace(self, scene=remove_thing(self.scene, thing, index), hidden=frozenset(hidden))
+        hidden = {(t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index)}
+        return dataclasses.replace(self, scene=remove_part(self.scene, part, index), hidden=frozenset(hidden))
 
-    def with_rung(self, stage: str, rung: str) -> Wanted:
-        """With a stage on another rung than the preset's; an empty name goes back.
+    def with_method(self, stage: str, method: str) -> Wanted:
+        """With a stage on another method than the preset's; an empty name goes back.
 
         Raises:
-            UsageError: There is no such stage or rung.
+            UsageError: There is no such stage or method.
         """
-        known = {kind.name: kind.rungs for kind in STAGES}
-        if stage not in known or (rung and rung not in known[stage]):
-            raise UsageError(f"stage {stage!r} has no rung {rung!r}")
-        rungs = {**dict(self.rungs), stage: rung}
-        return dataclasses.replace(self, rungs=tuple(sorted((s, r) for s, r in rungs.items() if r)))
+        known = {kind.name: kind.methods for kind in STAGES}
+        if stage not in known or (method and method not in known[stage]):
+            raise UsageError(f"stage {stage!r} has no method {method!r}")
+        methods = {**dict(self.methods), stage: method}
+        return dataclasses.replace(self, methods=tuple(sorted((s, r) for s, r in methods.items() if r)))
 
     def with_effect(self, name: str, on: bool) -> Wanted:
         """With an effect switched."""
@@ -220,7 +220,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
             key: value for key, value in fields.items() if isinstance(value, str | int | float | tuple) or value is None
         }
 
-    def thing(kind: str, index: int, item: Any) -> dict[str, Any]:
+    def part(kind: str, index: int, item: Any) -> dict[str, Any]:
         record = {**plain(item), "visible": (kind, index) not in wanted.hidden, "animated": item.animate is not None}
         if isinstance(item, Object):
             model = next(name for name, made in _MODELS.items() if isinstance(item.material, made))
@@ -230,14 +230,14 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
     return {
         "name": scene.name,
-        "objects": [thing("object", i, item) for i, item in enumerate(scene.objects)],
-        "lights": [thing("light", i, item) for i, item in enumerate(scene.lights)],
+        "objects": [part("object", i, item) for i, item in enumerate(scene.objects)],
+        "lights": [part("light", i, item) for i, item in enumerate(scene.lights)],
         "probes": [plain(item) for item in scene.probes],
         "exposure": scene.exposure.scale,
         "marker": {"dictionary": scene.marker.dictionary, "id": scene.marker.id, "size": scene.marker.size},
         "effects": {name: name not in wanted.off for name in EFFECTS},
         "quality": wanted.quality.name,
-        "rungs": dict(wanted.rungs),
+        "methods": dict(wanted.methods),
     }
 
 

@@ -51,7 +51,7 @@ _LIGHT_SECONDS: Final = 0.25
 _COST_FRAMES: Final = 30
 _SETTLED: Final = 10
 _MEASURING_REST: Final = 0.15
-"""Seconds that the frames rest, one from the next, while rungs are timed: what runs beside them spoils the times."""
+"""Seconds that the frames rest, one from the next, while methods are timed: what runs beside them spoils the times."""
 BOARD: Final = Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022))
 """What a camera is calibrated with: a sheet of A4."""
 _BOARD_SECONDS: Final = 0.4
@@ -340,21 +340,21 @@ class Host:
             WarpArError: It cannot be done; nothing has changed.
         """
         match command:
-            case protocol.Set(thing, index, key, value):
-                self._change(lambda w: dataclasses.replace(w, scene=edits.set_value(w.scene, thing, index, key, value)))
-            case protocol.Add(thing, kind):
-                self._change(lambda w: dataclasses.replace(w, scene=edits.add_thing(w.scene, thing, kind)))
-            case protocol.Remove(thing, index):
-                self._change(lambda w: w.without_thing(thing, index))
-            case protocol.Show(thing, index, on):
-                item = {(thing, index)}
+            case protocol.Set(part, index, key, value):
+                self._change(lambda w: dataclasses.replace(w, scene=edits.set_value(w.scene, part, index, key, value)))
+            case protocol.Add(part, kind):
+                self._change(lambda w: dataclasses.replace(w, scene=edits.add_part(w.scene, part, kind)))
+            case protocol.Remove(part, index):
+                self._change(lambda w: w.without_part(part, index))
+            case protocol.Show(part, index, on):
+                item = {(part, index)}
                 self._change(lambda w: dataclasses.replace(w, hidden=w.hidden - item if on else w.hidden | item))
             case protocol.Effect(name, on):
                 self._change(lambda w: w.with_effect(name, on))
             case protocol.SetQuality(name):
                 self._set_budget(self._dial.last_budget if name == AUTO else None, name)
-            case protocol.Rung(stage, rung):
-                self._change(lambda w: w.with_rung(stage, rung))
+            case protocol.Method(stage, method):
+                self._change(lambda w: w.with_method(stage, method))
             case protocol.Budget(ms):
                 self._set_budget(ms, self._preset.name)
             case protocol.Compare(other):
@@ -644,7 +644,7 @@ class Host:
 
     def _target(self) -> _Target:
         scene = dataclasses.replace(self._wanted.shown_scene(), camera=self._feed.camera or self._wanted.scene.camera)
-        # The page draws handles where things are: that takes the pose, even where no stage does.
+        # The page draws handles where parts are: that takes the pose, even where no stage does.
         outputs = ("image", "pose") if self._wanted.scene.objects or self._wanted.scene.lights else ("image",)
         source = self._feed.source
         return _Target(scene, self._wanted.shown_quality(), source.size, outputs, source.exposures)
@@ -751,7 +751,7 @@ class Host:
         self._light = values if values.any() else None
 
     def _watch_cost(self, pipeline: Pipeline, image: Image, result: Result, light_ms: float) -> None:
-        """Learn what the preset costs; under a budget, turn the knobs that it asks for."""
+        """Learn what the preset costs; under a budget, turn the settings that it asks for."""
         if not result.shown or (result.pose is None and pipeline.plan.needs("pose")):
             return
         self._since_swap += 1
@@ -821,14 +821,14 @@ class Host:
         return bytes(cv2.imencode(".png", self.latest.image[..., ::-1])[1])
 
     def environment_exr(self) -> bytes:
-        """The room's light as an EXR.
+        """The environment as an EXR.
 
         Raises:
             UsageError: It is not known.
         """
         if self._light is None:
             raise UsageError(
-                "the room's light is not captured: no stage of this scene reads it, or the marker was not seen"
+                "the environment is not captured: no stage of this scene reads it, or the marker was not seen"
             )
         with tempfile.TemporaryDirectory(dir=self._folder.name) as folder:
             path = Path(folder) / "environment.exr"
@@ -856,7 +856,7 @@ class Host:
         pipeline = self._main.pipeline
         assert pipeline is not None
         summaries = {kind.name: kind.summary for kind in STAGES} | {"track": "finds the marker and the camera's pose"}
-        rungs = {kind.name: list(kind.rungs) for kind in STAGES if len(kind.rungs) > 1}
+        methods = {kind.name: list(kind.methods) for kind in STAGES if len(kind.methods) > 1}
         plan = pipeline.plan
         return {
             "type": "plan",
@@ -866,14 +866,14 @@ class Host:
             "run": [
                 {
                     "stage": name,
-                    "rung": pipeline.quality.rung(name),
-                    "rungs": rungs.get(name, []),
+                    "method": pipeline.quality.method(name),
+                    "methods": methods.get(name, []),
                     "summary": summaries[name],
                 }
                 for name in stage_names(plan)
             ],
             "left_out": [
-                {"stage": name, "reason": reason, "rungs": rungs.get(name, [])} for name, reason in left_out(plan)
+                {"stage": name, "reason": reason, "methods": methods.get(name, [])} for name, reason in left_out(plan)
             ],
         }
 
@@ -908,7 +908,7 @@ class Host:
         return round(100.0 * float(cv2.norm(lit.image, lit.other, cv2.NORM_L1)) / (lit.image.size * 255.0), 3)
 
     def light(self) -> npt.NDArray[np.float32] | None:
-        """The room's light, latlong linear RGB, as it was a moment ago."""
+        """The environment, latlong linear RGB, as it was a moment ago."""
         return self._light
 
     def dial_message(self) -> dict[str, Any]:

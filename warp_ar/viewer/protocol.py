@@ -26,7 +26,7 @@ MAX_PICTURE: Final = 1 << 20
 SMALLEST_CAMERA: Final = (64, 48)
 LARGEST_CAMERA: Final = (1920, 1080)
 
-EFFECTS: Final = ("objects", "lights", "room", "desk", "exposure", "relief", "room_shadow")
+EFFECTS: Final = ("objects", "lights", "room", "desk", "exposure", "relief", "environment_shadow")
 """What the page can switch off."""
 THINGS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
 """What of a scene the page can edit."""
@@ -54,9 +54,9 @@ class Ping:
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """Give a key of a scene's thing a value, as the scene file would."""
+    """Give a key of a scene's part a value, as the scene file would."""
 
-    thing: str
+    part: str
     index: int
     key: str
     value: Any
@@ -66,7 +66,7 @@ class Set:
 class Add:
     """Put something new on the desk."""
 
-    thing: str
+    part: str
     kind: str
 
 
@@ -74,7 +74,7 @@ class Add:
 class Remove:
     """Take something away."""
 
-    thing: str
+    part: str
     index: int
 
 
@@ -82,7 +82,7 @@ class Remove:
 class Show:
     """Show or hide one object or light."""
 
-    thing: str
+    part: str
     index: int
     on: bool
 
@@ -103,11 +103,11 @@ class SetQuality:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rung:
-    """Choose the rung of one stage; an empty name goes back to the preset's."""
+class Method:
+    """Choose the method of one stage; an empty name goes back to the preset's."""
 
     stage: str
-    rung: str
+    method: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +189,7 @@ Command: TypeAlias = (
     | Show
     | Effect
     | SetQuality
-    | Rung
+    | Method
     | Budget
     | Compare
     | Play
@@ -262,13 +262,13 @@ _ID = _integer(0, 1 << 53)
 _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callable[[Any], Any]]]]] = {
     "ack": (Ack, {"id": _ID}),
     "ping": (Ping, {"sent": _number(0.0, 1e15)}),
-    "set": (Set, {"thing": _choice(*THINGS), "index": _INDEX, "key": _name, "value": _value}),
-    "add": (Add, {"thing": _choice(*KINDS), "kind": _choice(*KINDS["object"], *KINDS["light"])}),
-    "remove": (Remove, {"thing": _choice(*KINDS), "index": _INDEX}),
-    "show": (Show, {"thing": _choice(*KINDS), "index": _INDEX, "on": _flag}),
+    "set": (Set, {"part": _choice(*THINGS), "index": _INDEX, "key": _name, "value": _value}),
+    "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*KINDS["object"], *KINDS["light"])}),
+    "remove": (Remove, {"part": _choice(*KINDS), "index": _INDEX}),
+    "show": (Show, {"part": _choice(*KINDS), "index": _INDEX, "on": _flag}),
     "effect": (Effect, {"name": _choice(*EFFECTS), "on": _flag}),
     "quality": (SetQuality, {"name": _name}),
-    "rung": (Rung, {"stage": _name, "rung": _name}),
+    "method": (Method, {"stage": _name, "method": _name}),
     "budget": (Budget, {"ms": _optional(_number(1.0, 10000.0))}),
     "compare": (Compare, {"other": _name}),
     "play": (Play, {"on": _flag}),
@@ -317,8 +317,8 @@ def parse_text(text: str) -> Command:
             fields[key] = check(message[key])
         except ProtocolError as error:
             raise ProtocolError(f"{kind}: {key}: {error}") from error
-    if kind == "add" and fields["kind"] not in KINDS[fields["thing"]]:
-        raise ProtocolError(f"add: kind: expected one of {', '.join(KINDS[fields['thing']])}")
+    if kind == "add" and fields["kind"] not in KINDS[fields["part"]]:
+        raise ProtocolError(f"add: kind: expected one of {', '.join(KINDS[fields['part']])}")
     return make(**fields)
 
 

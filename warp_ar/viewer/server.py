@@ -142,7 +142,7 @@ class _Viewer:
         self.picture: asyncio.Task[None] | None = None
 
     def tell(self, message: str | bytes) -> None:
-        """Send a message when there is room; a viewer that lets 64 pile up misses some."""
+        """Send a message when there is environment; a viewer that lets 64 pile up misses some."""
         with contextlib.suppress(asyncio.QueueFull):
             self.queue.put_nowait(message)
         self.wake.set()
@@ -348,7 +348,7 @@ class Server:
                 self._tell_all(await self._light_message(light))
 
     async def _light_message(self, light: npt.NDArray[np.float32] | None) -> bytes:
-        """The room's light as a picture, packed once for all who ask."""
+        """The environment as a picture, packed once for all who ask."""
         if light is None:
             return protocol.pack({"type": "light", "known": False}, b"")
         if self._packed_light is None or self._packed_light[0] is not light:

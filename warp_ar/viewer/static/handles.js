@@ -83,8 +83,8 @@ export class Handles extends EventTarget {
       const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
       item.halo = make("path", { class: "halo" }, item.group);
       item.ring = this.#part(item, "at", make("path", { class: "ring" }, item.group));
-      item.knob = make("circle", { class: "knob", r: 6 }, item.group);
-      item.knobHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
+      item.setting = make("circle", { class: "setting", r: 6 }, item.group);
+      item.settingHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
     });
     this.#scene.lights.forEach((light, index) => {
       const item = this.#group("light", index, `${light.kind} light ${index + 1}`);
@@ -92,7 +92,7 @@ export class Handles extends EventTarget {
       item.floor = this.#part(item, "floor", make("path", { class: "ring" }, item.group));
       if (light.target) {
         item.beam = make("line", { class: "stem" }, item.group);
-        item.target = make("circle", { class: "knob", r: 5 }, item.group);
+        item.target = make("circle", { class: "setting", r: 5 }, item.group);
         item.targetHit = this.#part(item, "target", make("circle", { class: "hit", r: 18 }, item.group));
       }
       item.lamp = make("circle", { class: "lamp", r: 10 }, item.group);
@@ -156,8 +156,8 @@ export class Handles extends EventTarget {
     item.ring.setAttribute("d", path);
     item.halo.setAttribute("d", path);
     const angle = (object.rotate[2] * Math.PI) / 180;
-    const knob = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
-    for (const [element, size] of [[item.knob, 5.5], [item.knobHit, 18]]) put(element, knob, size * unit);
+    const setting = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
+    for (const [element, size] of [[item.setting, 5.5], [item.settingHit, 18]]) put(element, setting, size * unit);
   }
 
   #placeLight(item, light, unit) {

@@ -59,7 +59,7 @@ const EFFECTS = {
   lights: ["Virtual lights", ""],
   room: ["Light of the room", "captured from the mirror ball"],
   desk: ["The desk's shape", "receives light and shadow, hides what is behind it"],
-  room_shadow: ["Shadows of the room's light", "under virtual objects"],
+  environment_shadow: ["Shadows of the room's light", "under virtual objects"],
   relief: ["Relief of the desk", "virtual light brings out its bumps"],
   exposure: ["Exposure", "darkens as a camera would"],
 };
@@ -239,7 +239,7 @@ export class TimePanel {
     this.#means.clear();
     this.#skips.clear();
     this.#rows.clear();
-    const all = [...plan.run, { stage: "encode", rung: "", rungs: [], summary: "packs the picture for the page, once for all viewers" }];
+    const all = [...plan.run, { stage: "encode", method: "", methods: [], summary: "packs the picture for the page, once for all viewers" }];
     const runs = all.map((entry, index) => this.#row(entry, hue(index)));
     const outs = plan.left_out.map((entry) => this.#row(entry, "var(--line)"));
     this.list.replaceChildren(...runs, ...outs);
@@ -248,10 +248,10 @@ export class TimePanel {
   #row(entry, tint) {
     const out = "reason" in entry;
     const why = el("div", { class: "why" }, out ? `Left out: ${entry.reason}.` : `${entry.summary[0].toUpperCase()}${entry.summary.slice(1)}.`);
-    if (entry.rungs.length > 1) {
-      const pick = el("select", { "aria-label": `Rung of ${entry.stage}`, onchange: () => this.#connection.send("rung", { stage: entry.stage, rung: pick.value }) },
-        ...(entry.rungs.includes(entry.rung) ? [] : [el("option", { value: "", selected: true }, "default")]),
-        ...entry.rungs.map((rung) => el("option", { value: rung, selected: rung === entry.rung }, rung)));
+    if (entry.methods.length > 1) {
+      const pick = el("select", { "aria-label": `Method of ${entry.stage}`, onchange: () => this.#connection.send("method", { stage: entry.stage, method: pick.value }) },
+        ...(entry.methods.includes(entry.method) ? [] : [el("option", { value: "", selected: true }, "default")]),
+        ...entry.methods.map((method) => el("option", { value: method, selected: method === entry.method }, method)));
       why.append(pick);
     }
     const bar = el("b");
@@ -439,16 +439,16 @@ export class QualityPanel {
     this.plot.parentElement.classList.toggle("off", !on);
     this.plot.style.display = bought ? "" : "none";
     if (bought) this.#plot(bought);
-    document.getElementById("buys").replaceChildren(...(bought && on ? this.#rungs(bought.choice) : []));
+    document.getElementById("buys").replaceChildren(...(bought && on ? this.#methods(bought.choice) : []));
     document.getElementById("budget-note").textContent = this.#note(bought);
   }
 
   #note(bought) {
     const { measuring } = this.#dial ?? {};
-    if (typeof measuring === "number") return `Measuring what each rung costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
-    if (!bought) return "The program then chooses the rungs that err least within this time. What each costs on this device is measured once, in about half a minute.";
+    if (typeof measuring === "number") return `Measuring what each method costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
+    if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once, in about half a minute.";
     const { choice, took, fits } = bought;
-    if (this.#dial.choices.every((one) => one.error === 0)) return "What these rungs err is not in the price list, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
+    if (this.#dial.choices.every((one) => one.error === 0)) return "What these methods err is not in the price list, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
     const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];
     if (!fits) parts.push("Nothing cheaper is left.");
     const { difference, compare } = this.#state ?? {};
@@ -488,9 +488,9 @@ export class QualityPanel {
     this.plot.setAttribute("aria-label", `Error over time: ${brief(took(choice))} milliseconds, error ${error(choice.error)}, base ${brief(base)} milliseconds`);
   }
 
-  #rungs(choice) {
+  #methods(choice) {
     return Object.entries(this.#dial.ladders).map(([name, ladder], index) => {
-      const place = choice.rungs[index];
+      const place = choice.methods[index];
       const pips = el("span", { class: "pips", "aria-hidden": "true" }, ...ladder.map((_, i) => el("i", { class: i <= place ? "on" : "" })));
       return el("li", {}, el("span", { class: "name" }, name.replaceAll("_", " ")), pips, el("span", {}, ladder[place].replaceAll("_", " ")));
     });

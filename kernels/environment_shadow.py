@@ -1,13 +1,13 @@
-"""Shadows that virtual objects cast on the real desk under the room's light, and the light that they bounce onto it.
+"""Shadows that virtual objects cast on the real desk under the environment, and the light that they bounce onto it.
 
 What a proxy's pixel becomes is a factor on what the camera sees there [Deb98]: reflectance cancels,
 
     ratio = E_with / E_without,   per channel,
 
 E the irradiance at the pixel's point, without the virtual objects (the proxies and the mirror balls shadow it: they are
-real and in the picture already) and with them. Both are sums over the same samples of the room's light
-(``room_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black object
-0, and an error of the samples cancels to first order.
+real and in the picture already) and with them. Both are sums over the same samples of the environment
+(``environment_samples``), so a point that no object shades has a ratio of exactly 1, one that sees nothing but a black
+object 0, and an error of the samples cancels to first order.
 
 Cells. One pixel of every ``stride x stride`` is estimated. The cells of a tile of ``side x side`` use one set of
 samples each, and every set in turn; a filter then averages over one tile's worth of cells, with the edge cells of a
@@ -24,19 +24,19 @@ number: elsewhere the ratio is 1, and need not be averaged. Nor need it be sprea
 
 Bounce. What a ray meets is not black. Either a ray finds out (``traced``): an object reflects one of its two lobes,
 picked by their reflectance. Its rough lobe gives albedo E(n) / pi, times what a ray into it meets: nothing, 1; an
-object, that object's own colour; the desk, 1 if a ray from there leaves the scene, else a share of the object's
+object, that object's own colour; the receiver, 1 if a ray from there leaves the scene, else a share of the object's
 reflectance, so that light dies out between an object and the ground that it stands on, the slower the whiter the
 object. Its glossy lobe gives what is in the mirror direction.
 
-Or it is an estimate without a ray (``estimated``). Both lobes reflect the distant room, whose part behind the cell's
-own surface is that surface: the desk. Let h be the share of the light that objects hide, u what they send of the room
-before the cell's surface, d of the desk if it were not shaded. The desk that they see is near the cell and shaded as
-it is, so the ratio r is that of
+Or it is an estimate without a ray (``estimated``). Both lobes reflect the distant environment, whose part behind the
+cell's own surface is that surface: the receiver. Let h be the share of the light that objects hide, u what they send of
+the environment before the cell's surface, d of the receiver if it were not shaded. The receiver that they see is near
+the cell and shaded as it is, so the ratio r is that of
 
     r = 1 - h + u + d r,    r = (1 - h + u) / (1 - d)
 
-with all the light that goes to and fro between an object and the ground: white objects in a white room (u + d = h)
-leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
+with all the light that goes to and fro between an object and the ground: white objects in a white environment (u + d =
+h) leave it as it is, black ones give 1 - h, and where nothing but the ground is seen (u = 0, h = 1) all is dark.
 
 The physical. A ray that meets a proxy or a mirror ball, with objects or without them, finds its light: the camera's
 picture of it where that shows it (``traced``), else what the ball saw in its direction; of a ball what it reflects.
@@ -54,22 +54,22 @@ from typing import Literal
 
 import warp as wp
 
+from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
-    Room,
-    RoomConfig,
+    DistantLight,
+    DistantLightConfig,
     look_up,
+    make_distant_irradiance,
     make_find_in_frame,
     make_mirrored,
-    make_room_irradiance,
     make_shade_unoccluded,
 )
 from warp_ar.kernels.relight import meets_probe
-from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
 from warp_ar.kernels.structs import BOX, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import (
@@ -93,7 +93,7 @@ CONTRAST = wp.constant(wp.float32(0.03))
 NOISE = wp.constant(wp.float32(1.0))
 """The same, in standard errors of the narrow mean."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 512.0))
-"""Change of the room's light that no 8-bit picture shows: a quarter of a code at most, taken for none."""
+"""Change of the environment that no 8-bit picture shows: a quarter of a code at most, taken for none."""
 MAX_PARTS = 8
 """Threads of a CUDA device that share the samples of a cell at most."""
 ENOUGH_THREADS = 1 << 20
@@ -103,7 +103,8 @@ CPU_RUN = 32
 WARP_LANES = 32
 """Threads of a CUDA device that go the same way or wait for each other."""
 KINDS = wp.constant(4)
-"""Sums per part of a cell: light without the objects, what they hide, what they send of the room and of the desk."""
+"""Sums per part of a cell: light without the objects, what they hide, what they send of the environment and of the
+receiver."""
 CHUNK = wp.constant(64)
 """Samples that are culled together: the bits of a mask."""
 WORD = 32
@@ -117,37 +118,37 @@ MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 MAX_RATIO = wp.constant(wp.float32(4.0))
 """Largest factor: what objects bounce onto a dark place is bounded, as the picture of it is mostly noise."""
 CAUSTIC_ALPHA = wp.constant(wp.float32(0.35))
-"""Least width of an object's lobe as the desk sees it, near the object.
+"""Least width of an object's lobe as the receiver sees it, near the object.
 
-A mirror's image of a lamp on the desk is too fine for the few rays that look for it: it would come out as specks. This
-blurs it to what they can carry, and keeps its energy. From afar fewer rays meet the object and each stands for more of
-what it shows: the width grows as the distance over the object's size.
+A mirror's image of a lamp on the receiver is too fine for the few rays that look for it: it would come out as specks.
+This blurs it to what they can carry, and keeps its energy. From afar fewer rays meet the object and each stands for
+more of what it shows: the width grows as the distance over the object's size.
 """
 MAX_BRIGHTNESS = wp.constant(wp.float32(2.0))
 """Largest radiance of an object, estimated, over the mean of what its surroundings send to the cell's surface.
 
-The sides of things are dark beside a top that a lamp lights, and few samples show them: a brighter object is specks.
+The sides of objects are dark beside a top that a lamp lights, and few samples show them: a brighter object is specks.
 """
 MAX_RETURN = wp.constant(wp.float32(0.99))
-"""Largest share of its light that the desk gets back from objects, estimated: what goes to and fro stays finite."""
+"""Largest share of its light that the receiver gets back from objects, estimated: what goes to and fro stays finite."""
 FURTHER = wp.constant(wp.float32(0.5))
-"""Light of an object close above the desk, over that in the open: half of what it sees is its own shadow."""
+"""Light of an object close above the receiver, over that in the open: half of what it sees is its own shadow."""
 DEPTH_STEP = wp.constant(wp.float32(0.03))
 """Relative change of depth from which neighbours on a mesh belong to different parts of it."""
 
 
 @dataclasses.dataclass(frozen=True)
-class RoomShadowConfig:
+class EnvironmentShadowConfig:
     """What is compiled into the kernel."""
 
-    room: RoomConfig
+    distant: DistantLightConfig
     """Kinds of shape and forms of light."""
     count: int
     """Samples per set: up to 64, or a multiple of it."""
     side: int
     """Pixels along a tile; there are side^2 sets."""
     bounce: Literal["estimated", "traced"]
-    """How what objects reflect onto the desk is found."""
+    """How what objects reflect onto the receiver is found."""
     asking: float = 1.0
     """Share of a set, its first samples, that is asked what the object that it meets sends; others only stop there."""
     near: bool = False
@@ -166,7 +167,7 @@ def bounding_radius(shape: Shape) -> wp.float32:
 
 @wp.func
 def caustic_alpha(shape: Shape, point: wp.vec3) -> wp.float32:
-    """Least width of the lobe of an object as a point of the desk sees it."""
+    """Least width of the lobe of an object as a point of the receiver sees it."""
     return wp.clamp(CAUSTIC_ALPHA * wp.length(shape.position - point) / bounding_radius(shape), CAUSTIC_ALPHA, 1.0)
 
 
@@ -186,7 +187,7 @@ def make_mask_cone(count: int, near: bool) -> wp.Function:
     @wp.func(module="unique")
     def mask_cone(
         directions: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         first: wp.int32,
         point: wp.vec3,
         to_center: wp.vec3,
@@ -212,45 +213,45 @@ def make_mask_cone(count: int, near: bool) -> wp.Function:
 class Sent:
     """What an object reflects along a ray."""
 
-    room: wp.vec3  # radiance that it has from the room
-    desk: wp.vec3  # radiance that it would have from a desk without shadows
+    distant: wp.vec3  # radiance that it has from the environment
+    desk: wp.vec3  # radiance that it would have from a receiver without shadows
 
 
 @functools.cache
-def make_look_wide(config: RoomConfig) -> wp.Function:
-    """``look_wide(room, direction) -> vec3``: the distant room around a direction, as few rays can carry it."""
+def make_look_wide(config: DistantLightConfig) -> wp.Function:
+    """``look_wide(environment, direction) -> vec3``: the environment around a direction, as few rays carry it."""
 
     @wp.func(module="unique")
-    def look_wide(room: Room, direction: wp.vec3) -> wp.vec3:
+    def look_wide(distant: DistantLight, direction: wp.vec3) -> wp.vec3:
         radiance = wp.vec3(0.0)
         if wp.static(config.specular):
-            level = level_from_alpha(CAUSTIC_ALPHA, room.level_height)
-            radiance = sample_levels(room.levels, direction, level, room.level_height)
+            level = level_from_alpha(CAUSTIC_ALPHA, distant.level_height)
+            radiance = sample_levels(distant.levels, direction, level, distant.level_height)
         elif wp.static(config.diffuse == "sh"):
-            radiance = sh_irradiance(room.irradiance_sh, direction) / wp.pi
+            radiance = sh_irradiance(distant.irradiance_sh, direction) / wp.pi
         elif wp.static(config.diffuse == "map"):
-            radiance = sample_latlong(room.irradiance_map, direction) / wp.pi
+            radiance = sample_latlong(distant.irradiance_map, direction) / wp.pi
         return radiance
 
     return look_wide
 
 
 @functools.cache
-def make_estimated(config: RoomConfig) -> wp.Function:
-    """``estimated(scene, room, hit, direction, alpha, up, from_desk) -> Sent``.
+def make_estimated(config: DistantLightConfig) -> wp.Function:
+    """``estimated(scene, environment, hit, direction, alpha, up, from_desk) -> Sent``.
 
-    What an object sends back along a ray that met it at ``hit``, without a further ray: both lobes of the distant room,
-    the glossy one ``alpha`` wide or more. What lies below ``up`` is the desk; ``from_desk`` is the irradiance that a
-    surface above it has from there.
+    What an object sends back along a ray that met it at ``hit``, without a further ray: both lobes of the distant
+    environment, the glossy one ``alpha`` wide or more. What lies below ``up`` is the receiver; ``from_desk`` is the
+    irradiance that a surface above it has from there.
     """
     surface_at = make_surface(config.models, config.textures)
     mirrored = make_mirrored(config)
-    room_irradiance = make_room_irradiance(config)
+    distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
     def estimated(
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         hit: Hit,
         direction: wp.vec3,
         alpha: wp.float32,
@@ -262,32 +263,32 @@ def make_estimated(config: RoomConfig) -> wp.Function:
         if wp.dot(hit.geometric_normal, wo) < 0.0:
             normal = -normal
         cosine = wp.max(wp.dot(normal, wo), 0.0)
-        surface = surface_at(scene, room.dfg, scene.objects[hit.shape].material, hit.uv, cosine)
+        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cosine)
         sent = Sent()
         if wp.static(config.diffuse != "none"):
-            irradiance = room_irradiance(room, hit.point, normal)
+            irradiance = distant_irradiance(distant, hit.point, normal)
             # A surface sees (1 - n.up) / 2 of what an even desk sends to one that faces it.
             desk = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_desk, irradiance)
             sent.desk = wp.cw_mul(surface.diffuse, desk) / wp.pi
-            sent.room = wp.cw_mul(surface.diffuse, irradiance - desk) / wp.pi
+            sent.distant = wp.cw_mul(surface.diffuse, irradiance - desk) / wp.pi
         if wp.static(config.specular):
             outward = reflect(wo, normal)
-            floor = level_from_alpha(alpha, room.level_height)
+            floor = level_from_alpha(alpha, distant.level_height)
             radiance = wp.cw_mul(
                 surface.reflectance,
-                mirrored(room, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor),
+                mirrored(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor),
             )
             share = wp.clamp(0.5 - 0.5 * wp.dot(outward, up) / CAUSTIC_ALPHA, 0.0, 1.0)
             sent.desk += share * radiance
-            sent.room += (1.0 - share) * radiance
+            sent.distant += (1.0 - share) * radiance
         return sent
 
     return estimated
 
 
 @functools.cache
-def make_bounced(config: RoomConfig) -> wp.Function:
-    """``bounced(params, frame, decode_table, scene, room, hit, direction, alpha, seed) -> vec3``.
+def make_bounced(config: DistantLightConfig) -> wp.Function:
+    """``bounced(params, frame, decode_table, scene, environment, hit, direction, alpha, seed) -> vec3``.
 
     Radiance that an object sends back along a ray that met it at ``hit``: one lobe, the glossy one ``alpha`` wide or
     more, one ray; a Monte-Carlo estimate.
@@ -302,7 +303,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
     find_in_frame = make_find_in_frame(config.trace, config.probes)
     shade_unoccluded = make_shade_unoccluded(config)
     mirrored = make_mirrored(config)
-    room_irradiance = make_room_irradiance(config)
+    distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
     def bounced(
@@ -310,7 +311,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         hit: Hit,
         direction: wp.vec3,
         alpha: wp.float32,
@@ -323,7 +324,7 @@ def make_bounced(config: RoomConfig) -> wp.Function:
             normal = -normal
             geometric = -geometric
         surface = surface_at(
-            scene, room.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
+            scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
         )
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
@@ -349,33 +350,33 @@ def make_bounced(config: RoomConfig) -> wp.Function:
         other = closest_object(scene, origin, outward, FAR)
         proxy = closest_proxy(scene, origin, outward, other.t)
         if proxy.shape >= 0:
-            # Light of the desk, as far as a ray from there leaves the scene.
+            # Light of the receiver, as far as a ray from there leaves the scene.
             up = proxy.geometric_normal
             if wp.dot(up, outward) > 0.0:
                 up = -up
             leaving = frame_from_normal(up) * sample_cosine_hemisphere(wp.vec2(u[1], u[0]))
             start = offset_origin(proxy.point, up, leaving, proxy.error)
             at = find_in_frame(
-                params, frame.shape[0], frame.shape[1], scene, room.probes, proxy.point, proxy.geometric_normal
+                params, frame.shape[0], frame.shape[1], scene, distant.probes, proxy.point, proxy.geometric_normal
             )
             if at[0] >= 0.0:
                 received = look_up(frame, decode_table, at[0], at[1])
             else:
-                received = sample_latlong(room.environment, outward)
+                received = sample_latlong(distant.environment, outward)
             if is_rough:
                 if wp.static(config.diffuse != "none"):
-                    received = room_irradiance(room, hit.point, normal) / wp.pi
+                    received = distant_irradiance(distant, hit.point, normal) / wp.pi
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
-            received = shade_unoccluded(scene, room, other, outward)
+            received = shade_unoccluded(scene, distant, other, outward)
         elif is_rough:
-            received = room_irradiance(room, hit.point, normal) / wp.pi
+            received = distant_irradiance(distant, hit.point, normal) / wp.pi
         else:
             if wp.static(config.specular):
-                floor = level_from_alpha(alpha, room.level_height)
+                floor = level_from_alpha(alpha, distant.level_height)
                 received = mirrored(
-                    room, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor
+                    distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, floor
                 )
         return wp.cw_mul(weight, received)
 
@@ -383,8 +384,8 @@ def make_bounced(config: RoomConfig) -> wp.Function:
 
 
 @functools.cache
-def make_seen_proxy(config: RoomConfig) -> wp.Function:
-    """``seen_proxy(params, ray, scene, probes) -> Hit``: the surface of the desk that a pixel shows, or shape -1."""
+def make_seen_proxy(config: DistantLightConfig) -> wp.Function:
+    """``seen_proxy(params, ray, scene, probes) -> Hit``: the receiver's surface that a pixel shows, or shape -1."""
     closest_proxy = make_trace(config.trace).closest_proxy
 
     @wp.func(module="unique")
@@ -404,7 +405,7 @@ def make_seen_proxy(config: RoomConfig) -> wp.Function:
 
 @wp.func
 def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
-    """Share of the room's light that is left, and the depth beside it."""
+    """Share of the environment that is left, and the depth beside it."""
     ratio = wp.vec4(1.0, 1.0, 1.0, depth)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
@@ -414,7 +415,7 @@ def ratio_of(without: wp.vec3, hidden: wp.vec3, depth: wp.float32) -> wp.vec4:
 
 @wp.func
 def bounced_of(without: wp.vec3, hidden: wp.vec3, sent: wp.vec3, returned: wp.vec3) -> wp.vec3:
-    """What objects send, relative to the room's light; ``returned`` is the part that the desk itself must light."""
+    """What objects send, relative to the environment; ``returned`` is the part that the receiver itself must light."""
     ratio = wp.vec3(0.0)
     for channel in range(3):
         if without[channel] > MIN_IRRADIANCE:
@@ -434,16 +435,16 @@ class Sender:
 
 
 @functools.cache
-def make_find_sender(config: RoomShadowConfig) -> wp.Function:
-    """``find_sender(params, frame, decode_table, scene, room, samples, index, origin, direction, ...) -> Sender``.
+def make_find_sender(config: EnvironmentShadowConfig) -> wp.Function:
+    """``find_sender(params, frame, decode_table, scene, environment, samples, index, origin, ...) -> Sender``.
 
     The sample itself, ``distance`` away, or the physical before it: a proxy if ``by_proxy``, a mirror ball if
     ``by_ball``; those that the ray cannot meet need not be asked.
     """
-    closest_proxy = make_trace(config.room.trace).closest_proxy
+    closest_proxy = make_trace(config.distant.trace).closest_proxy
     traced = config.bounce == "traced"
-    find_in_frame = make_find_in_frame(config.room.trace, config.room.probes) if traced else None
-    look_wide = make_look_wide(config.room)
+    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes) if traced else None
+    look_wide = make_look_wide(config.distant)
 
     @wp.func(module="unique")
     def find_sender(
@@ -451,8 +452,8 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
-        room: Room,
-        samples: wp.array[RoomSample],
+        distant: DistantLight,
+        samples: wp.array[EnvironmentSample],
         index: wp.int32,
         origin: wp.vec3,
         direction: wp.vec3,
@@ -474,7 +475,7 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
                         frame.shape[0],
                         frame.shape[1],
                         scene,
-                        room.probes,
+                        distant.probes,
                         proxy.point,
                         proxy.geometric_normal,
                     )
@@ -483,17 +484,17 @@ def make_find_sender(config: RoomShadowConfig) -> wp.Function:
                 else:
                     # Where the ball saw it; a lamp right beside it is not its light.
                     sender.radiance = wp.min(
-                        sample_latlong(room.environment, proxy.point - samples[index].origin), wp.vec3(1.0, 1.0, 1.0)
+                        sample_latlong(distant.environment, proxy.point - samples[index].origin), wp.vec3(1.0, 1.0, 1.0)
                     )
-        if wp.static(config.room.probes):
+        if wp.static(config.distant.probes):
             if by_ball:
-                for ball in range(room.probes.shape[0]):
-                    probe = room.probes[ball]
+                for ball in range(distant.probes.shape[0]):
+                    probe = distant.probes[ball]
                     t = intersect_sphere(probe.radius, origin - probe.center, direction, sender.distance)
                     if t < sender.distance:
                         sender.distance = t
                         normal = (origin + t * direction - probe.center) / probe.radius
-                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(room, reflect(-direction, normal)))
+                        sender.radiance = wp.cw_mul(probe.reflectance, look_wide(distant, reflect(-direction, normal)))
         return sender
 
     return find_sender
@@ -509,23 +510,23 @@ class Before:
 
 
 @functools.cache
-def make_look_before(config: RoomConfig) -> wp.Function:
-    """``look_before(room, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
+def make_look_before(config: DistantLightConfig) -> wp.Function:
+    """``look_before(environment, normal, direction) -> Before``: of a surface that ``direction`` leaves."""
     look_wide = make_look_wide(config)
 
     @wp.func(module="unique")
-    def look_before(room: Room, normal: wp.vec3, direction: wp.vec3) -> Before:
+    def look_before(distant: DistantLight, normal: wp.vec3, direction: wp.vec3) -> Before:
         before = Before()
         before.up = normal
         if wp.dot(normal, direction) < 0.0:
             before.up = -normal
-        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(room, before.up))
+        before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, before.up))
         if wp.static(config.diffuse == "sh"):
-            before.from_desk = sh_irradiance(room.irradiance_sh, -before.up)
-            before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(room.irradiance_sh, before.up)) / wp.pi
+            before.from_desk = sh_irradiance(distant.irradiance_sh, -before.up)
+            before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(distant.irradiance_sh, before.up)) / wp.pi
         if wp.static(config.diffuse == "map"):
-            before.from_desk = sample_latlong(room.irradiance_map, -before.up)
-            before.brightest = MAX_BRIGHTNESS * wp.max(sample_latlong(room.irradiance_map, before.up)) / wp.pi
+            before.from_desk = sample_latlong(distant.irradiance_map, -before.up)
+            before.brightest = MAX_BRIGHTNESS * wp.max(sample_latlong(distant.irradiance_map, before.up)) / wp.pi
         return before
 
     return look_before
@@ -540,11 +541,11 @@ class Physical:
 
 
 @functools.cache
-def make_masks(config: RoomShadowConfig, count: int) -> tuple[wp.Function, wp.Function]:
+def make_masks(config: EnvironmentShadowConfig, count: int) -> tuple[wp.Function, wp.Function]:
     """Which of ``count`` samples from ``first`` on may meet something, a bit each, as a point sees them.
 
-    ``mask_objects(scene, directions, samples, first, point) -> uint64``, and ``mask_physical(scene, room, directions,
-    samples, first, point, own) -> Physical``, ``own`` being the proxy that the point is on.
+    ``mask_objects(scene, directions, samples, first, point) -> uint64``, and ``mask_physical(scene, environment,
+    directions, samples, first, point, own) -> Physical``, ``own`` being the proxy that the point is on.
     """
     mask_cone = make_mask_cone(count, config.near)
 
@@ -552,7 +553,7 @@ def make_masks(config: RoomShadowConfig, count: int) -> tuple[wp.Function, wp.Fu
     def mask_objects(
         scene: RayScene,
         directions: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         first: wp.int32,
         point: wp.vec3,
     ) -> wp.uint64:
@@ -565,9 +566,9 @@ def make_masks(config: RoomShadowConfig, count: int) -> tuple[wp.Function, wp.Fu
     @wp.func(module="unique")
     def mask_physical(
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         directions: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         first: wp.int32,
         point: wp.vec3,
         own: wp.int32,
@@ -583,9 +584,9 @@ def make_masks(config: RoomShadowConfig, count: int) -> tuple[wp.Function, wp.Fu
                 mask.proxies = mask.proxies | mask_cone(
                     directions, samples, first, point, shape.position - point, bounding_radius(shape)
                 )
-        if wp.static(config.room.probes):
-            for index in range(room.probes.shape[0]):
-                probe = room.probes[index]
+        if wp.static(config.distant.probes):
+            for index in range(distant.probes.shape[0]):
+                probe = distant.probes[index]
                 mask.balls = mask.balls | mask_cone(
                     directions, samples, first, point, probe.center - point, probe.radius
                 )
@@ -617,17 +618,19 @@ def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
 
 
 @functools.cache
-def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
+def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     if config.count > CHUNK and config.count % CHUNK:
         raise ValueError(f"count is {config.count}; expected up to {CHUNK} or a multiple of it")
-    trace = make_trace(config.room.trace)
+    trace = make_trace(config.distant.trace)
     closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
     mask_objects, mask_physical = make_masks(config, min(config.count, CHUNK))
-    seen_proxy, find_sender = make_seen_proxy(config.room), make_find_sender(config)
+    seen_proxy, find_sender = make_seen_proxy(config.distant), make_find_sender(config)
     traced = config.bounce == "traced"
-    bounced = make_bounced(config.room) if traced else None
-    estimated, look_before = (None, None) if traced else (make_estimated(config.room), make_look_before(config.room))
+    bounced = make_bounced(config.distant) if traced else None
+    estimated, look_before = (
+        (None, None) if traced else (make_estimated(config.distant), make_look_before(config.distant))
+    )
     side = config.side
     chunk = min(config.count, CHUNK)
     asked = round(config.count * config.asking)
@@ -637,7 +640,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         raise ValueError(f"parts is {config.parts}; expected a divisor of {chunk}")
 
     @wp.kernel(module="unique", enable_backward=False)
-    def room_shadow_kernel(
+    def environment_shadow_kernel(
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
@@ -645,10 +648,10 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         directions: wp.array[wp.vec3],
         flux: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         stride: wp.int32,
         lanes: wp.int32,
         # Out:
@@ -674,7 +677,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
         wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
         if rect[0] >= rect[1] or not inside_rect(row, column, wide):
             return
-        hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+        hit = seen_proxy(params[0], rays[row, column], scene, distant.probes)
         if hit.shape < 0:
             return
         surface_out[i, j] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
@@ -699,7 +702,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
             if wp.static(config.count == chunk):
                 if virtual_mask == wp.uint64(0):
                     return
-            physical = mask_physical(scene, room, directions, samples, at, point, own)
+            physical = mask_physical(scene, distant, directions, samples, at, point, own)
             # Most samples meet nothing: they are but a sum.
             met = virtual_mask | physical.proxies | physical.balls
             begin = part * wp.static(chunk // config.parts)
@@ -729,7 +732,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                             frame,
                             decode_table,
                             scene,
-                            room,
+                            distant,
                             samples,
                             at + k,
                             origin,
@@ -756,16 +759,18 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
                                 if wp.static(traced):
                                     seed = pcg3d_hash(wp.uint32(at + k), wp.uint32(row), wp.uint32(column))
                                     sent += stands_for * bounced(
-                                        params[0], frame, decode_table, scene, room, other, direction, alpha, seed
+                                        params[0], frame, decode_table, scene, distant, other, direction, alpha, seed
                                     )
                                 else:
                                     if before.up == wp.vec3(0.0, 0.0, 0.0):
-                                        before = look_before(room, hit.geometric_normal, direction)
-                                    light = estimated(scene, room, other, direction, alpha, before.up, before.from_desk)
-                                    stands_for *= wp.min(
-                                        before.brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0
+                                        before = look_before(distant, hit.geometric_normal, direction)
+                                    light = estimated(
+                                        scene, distant, other, direction, alpha, before.up, before.from_desk
                                     )
-                                    sent += stands_for * light.room
+                                    stands_for *= wp.min(
+                                        before.brightest / wp.max(wp.max(light.distant + light.desk), 1.0e-20), 1.0
+                                    )
+                                    sent += stands_for * light.distant
                                     returned += stands_for * light.desk
                 bit = bit << wp.uint64(1)
         unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
@@ -780,7 +785,7 @@ def make_room_shadow_kernel(config: RoomShadowConfig) -> wp.Kernel:
             ratio_out[i, j] = ratio_of(without, hidden, hit.t)
             bounced_out[i, j] = bounced_of(without, hidden, sent, returned)
 
-    return room_shadow_kernel
+    return environment_shadow_kernel
 
 
 @wp.kernel(enable_backward=False)
@@ -823,19 +828,19 @@ class Steps:
     items: wp.array[wp.int32]  # the list: number of the cell times CHUNK, and the sample
     listed: wp.array[wp.int32]  # (1,): its length
     sums: wp.array3d[wp.vec3]  # (2 * parts, rows, columns): light without the objects, and what they hide
-    sent: wp.array2d[wp.vec3]  # (2, items): what objects send of the room, and of the desk
+    sent: wp.array2d[wp.vec3]  # (2, items): what objects send of the environment, and of the receiver
 
 
 @functools.cache
-def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
+def make_find_hits_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the first step: samples that objects hide, and the list of those that ask what these send."""
     size = config.count // config.parts
     asked = round(config.count * config.asking)
     side = config.side
     mask_objects, mask_physical = make_masks(config, size)
-    trace = make_trace(config.room.trace)
+    trace = make_trace(config.distant.trace)
     closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
-    seen_proxy = make_seen_proxy(config.room)
+    seen_proxy = make_seen_proxy(config.distant)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def find_hits_kernel(
@@ -843,9 +848,9 @@ def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         directions: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         stride: wp.int32,
         # Out:
         ratio_out: wp.array2d[wp.vec4],
@@ -864,7 +869,7 @@ def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
         margin = stride * side
         wide = wp.vec4i(rect[0] - margin, rect[1] + margin, rect[2] - margin, rect[3] + margin)
         if rect[0] < rect[1] and inside_rect(row, column, wide):
-            hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+            hit = seen_proxy(params[0], rays[row, column], scene, distant.probes)
             if hit.shape >= 0:
                 key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
                 if part == 0:
@@ -874,7 +879,7 @@ def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
                 at = first_of_set(i, j, side, samples.shape[0]) + begin
                 virtual_mask = mask_objects(scene, directions, samples, at, hit.point)
                 if virtual_mask != wp.uint64(0):
-                    physical = mask_physical(scene, room, directions, samples, at, hit.point, hit.shape)
+                    physical = mask_physical(scene, distant, directions, samples, at, hit.point, hit.shape)
                     asking = wp.int32(0)
                     # Its end is no constant: unrolled, the kernel would hold its rays many times over.
                     for k in range(begin, begin + size):
@@ -893,10 +898,10 @@ def make_find_hits_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         if (physical.proxies & bit) != wp.uint64(0):
                             proxy = closest_proxy(scene, origin, direction, reach)
                             reach = wp.min(reach, proxy.t)
-                        if wp.static(config.room.probes):
+                        if wp.static(config.distant.probes):
                             if (physical.balls & bit) != wp.uint64(0):
-                                for index in range(room.probes.shape[0]):
-                                    probe = room.probes[index]
+                                for index in range(distant.probes.shape[0]):
+                                    probe = distant.probes[index]
                                     t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
                                     reach = wp.min(reach, t)
                         if occluded_by_objects(scene, origin, direction, reach):
@@ -927,12 +932,12 @@ def any_hit(hits: wp.array3d[wp.uint32], i: wp.int32, j: wp.int32) -> wp.bool:
 
 
 @functools.cache
-def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
-    """Kernel of the second step: light of the room, and how much of it is hidden, where something is."""
+def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of the second step: light of the environment, and how much of it is hidden, where something is."""
     size = config.count // config.parts
     side = config.side
     _, mask_physical = make_masks(config, size)
-    seen_proxy, find_sender = make_seen_proxy(config.room), make_find_sender(config)
+    seen_proxy, find_sender = make_seen_proxy(config.distant), make_find_sender(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def sum_light_kernel(
@@ -942,10 +947,10 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         directions: wp.array[wp.vec3],
         flux: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         stride: wp.int32,
         surface: wp.array2d[wp.int32],
         # Out:
@@ -956,10 +961,10 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
         if not any_hit(steps_out.hits, i, j):
             return
         pixel = rays[cell_pixel(i, stride, rays.shape[0]), cell_pixel(j, stride, rays.shape[1])]
-        hit = seen_proxy(params[0], pixel, scene, room.probes)
+        hit = seen_proxy(params[0], pixel, scene, distant.probes)
         begin = part * size
         at = first_of_set(i, j, side, samples.shape[0]) + begin
-        physical = mask_physical(scene, room, directions, samples, at, hit.point, hit.shape)
+        physical = mask_physical(scene, distant, directions, samples, at, hit.point, hit.shape)
         met = physical.proxies | physical.balls
         found = wp.uint64(steps_out.hits[part, i, j])
         without = wp.vec3(0.0)
@@ -986,7 +991,7 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
                         frame,
                         decode_table,
                         scene,
-                        room,
+                        distant,
                         samples,
                         k,
                         origin,
@@ -1006,15 +1011,17 @@ def make_sum_light_kernel(config: RoomShadowConfig) -> wp.Kernel:
 
 
 @functools.cache
-def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
+def make_ask_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the third step: what objects send along the listed rays."""
     asked = round(config.count * config.asking)
     side = config.side
-    closest_object = make_trace(config.room.trace).closest_object
-    seen_proxy = make_seen_proxy(config.room)
+    closest_object = make_trace(config.distant.trace).closest_object
+    seen_proxy = make_seen_proxy(config.distant)
     traced = config.bounce == "traced"
-    bounced = make_bounced(config.room) if traced else None
-    estimated, look_before = (None, None) if traced else (make_estimated(config.room), make_look_before(config.room))
+    bounced = make_bounced(config.distant) if traced else None
+    estimated, look_before = (
+        (None, None) if traced else (make_estimated(config.distant), make_look_before(config.distant))
+    )
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def ask_kernel(
@@ -1024,9 +1031,9 @@ def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
         frame: wp.array2d[wp.vec3ub],
         decode_table: wp.array[wp.vec3],
         scene: RayScene,
-        room: Room,
+        distant: DistantLight,
         directions: wp.array[wp.vec3],
-        samples: wp.array[RoomSample],
+        samples: wp.array[EnvironmentSample],
         stride: wp.int32,
         columns: wp.int32,
         threads: wp.int32,
@@ -1040,7 +1047,7 @@ def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
             index = first_of_set(i, j, side, samples.shape[0]) + item % CHUNK
             row = cell_pixel(i, stride, rays.shape[0])
             column = cell_pixel(j, stride, rays.shape[1])
-            hit = seen_proxy(params[0], rays[row, column], scene, room.probes)
+            hit = seen_proxy(params[0], rays[row, column], scene, distant.probes)
             direction = directions[index]
             measure = samples[index].measure
             if wp.static(config.near):
@@ -1059,13 +1066,13 @@ def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
                 if wp.static(traced):
                     seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
                     sent = stands_for * bounced(
-                        params[0], frame, decode_table, scene, room, other, direction, alpha, seed
+                        params[0], frame, decode_table, scene, distant, other, direction, alpha, seed
                     )
                 else:
-                    before = look_before(room, hit.geometric_normal, direction)
-                    light = estimated(scene, room, other, direction, alpha, before.up, before.from_desk)
-                    stands_for *= wp.min(before.brightest / wp.max(wp.max(light.room + light.desk), 1.0e-20), 1.0)
-                    sent = stands_for * light.room
+                    before = look_before(distant, hit.geometric_normal, direction)
+                    light = estimated(scene, distant, other, direction, alpha, before.up, before.from_desk)
+                    stands_for *= wp.min(before.brightest / wp.max(wp.max(light.distant + light.desk), 1.0e-20), 1.0)
+                    sent = stands_for * light.distant
                     returned = stands_for * light.desk
             steps_out.sent[0, place] = sent
             if wp.static(not traced):
@@ -1075,7 +1082,7 @@ def make_ask_kernel(config: RoomShadowConfig) -> wp.Kernel:
 
 
 @functools.cache
-def make_join_steps_kernel(config: RoomShadowConfig) -> wp.Kernel:
+def make_join_steps_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
     """Kernel of the last step: estimates of the cells from which something is hidden."""
     size = config.count // config.parts
     asked = round(config.count * config.asking)
@@ -1215,7 +1222,7 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
 
 
 @functools.cache
-def make_spread_ratio_kernel(config: RoomConfig) -> wp.Kernel:
+def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
     seen_proxy = make_seen_proxy(config)
 
@@ -1289,17 +1296,17 @@ def make_spread_ratio_kernel(config: RoomConfig) -> wp.Kernel:
     return spread_ratio_kernel
 
 
-def shade_room(
-    config: RoomShadowConfig,
+def shade_environment(
+    config: EnvironmentShadowConfig,
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
     scene: RayScene,
-    room: Room,
+    distant: DistantLight,
     directions: wp.array[wp.vec3],
     flux: wp.array[wp.vec3],
-    samples: wp.array[RoomSample],
+    samples: wp.array[EnvironmentSample],
     stride: int,
     ratio_out: wp.array2d[wp.vec4],
     bounced_out: wp.array2d[wp.vec3],
@@ -1319,13 +1326,13 @@ def shade_room(
         frame: (H, W) the camera's frame, RGB; needed if bounces are traced.
         decode_table: (256,) of ``color.decode_table``.
         scene: Objects and proxies.
-        room: The room's light; what ``config.room`` leaves out may be empty.
+        distant: The environment; what ``config.environment`` leaves out may be empty.
         directions: (config.side^2 * n,) directions of the samples, set after set; n is config.count or more.
         flux: (the same) radiance times solid angle of the samples.
         samples: (the same) the samples.
         stride: Pixels from one estimate to the next.
-        ratio_out: (ceil(H / stride), ceil(W / stride)) RGB share of the room's light that is not hidden, and depth.
-        bounced_out: (the same) what objects send there, relative to the room's light.
+        ratio_out: (ceil(H / stride), ceil(W / stride)) RGB share of the environment that is not hidden, and depth.
+        bounced_out: (the same) what objects send there, relative to the environment.
         surface_out: (the same) number of the surface seen; -1 for none, where ratio_out holds nothing.
         shaded_out: ``shaded_shape`` of that: number of the last frame in which something in a tile of cells was shaded.
         sums_out: Scratch of ``sums_shape``; needed if ``config.parts`` is not 1, and then ``rows`` must be None.
@@ -1334,7 +1341,7 @@ def shade_room(
     """
     if steps is not None:
         seen = [params, rays]
-        light = [frame, decode_table, scene, room, directions]
+        light = [frame, decode_table, scene, distant, directions]
         threads = min(steps.items.shape[0], ASKING_THREADS)
         cells = steps.hits.shape
         device = rays.device
@@ -1342,7 +1349,7 @@ def shade_room(
         wp.launch(
             make_find_hits_kernel(config),
             cells,
-            [*seen, scene, room, directions, samples, stride],
+            [*seen, scene, distant, directions, samples, stride],
             [ratio_out, bounced_out, surface_out, steps],
             device=device,
         )
@@ -1371,9 +1378,9 @@ def shade_room(
     lanes = 1 if rays.device.is_cpu else WARP_LANES
     cells = ratio_out.shape
     launch_rows(
-        make_room_shadow_kernel(config),
+        make_environment_shadow_kernel(config),
         (cells[0] * config.parts, cells[1]),
-        [params, rays, frame, decode_table, scene, room, directions, flux, samples, stride, lanes],
+        [params, rays, frame, decode_table, scene, distant, directions, flux, samples, stride, lanes],
         [ratio_out, bounced_out, surface_out, shaded_out, sums_out],
         rows=rows,
         device=rays.device,
@@ -1390,11 +1397,11 @@ def count_parts(rows: int, columns: int, most: int = MAX_PARTS) -> int:
     return parts
 
 
-def make_steps(config: RoomShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Steps | None:
-    """Scratch for ``shade_room`` to find so many cells in steps, or None where it needs too much or more than a set.
+def make_steps(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Steps | None:
+    """Scratch of ``shade_environment`` for cells in steps; None where it needs more than a set, or too much.
 
     Args:
-        config: As for ``shade_room``; ``config.parts`` at least 2, as one part's samples are the bits of a word.
+        config: As for ``shade_environment``; ``config.parts`` at least 2, as one part's samples are the bits of a word.
         rows: Rows of cells.
         columns: Cells in a row.
         device: Where.
@@ -1436,13 +1443,13 @@ def filter_ratio(
     """Average the estimates over tiles, along surfaces only; exactly 1 where nothing is shaded, or next to nothing.
 
     Args:
-        ratio: From ``shade_room``.
-        bounced: From ``shade_room``.
-        surface: From ``shade_room``.
+        ratio: From ``shade_environment``.
+        bounced: From ``shade_environment``.
+        surface: From ``shade_environment``.
         side: Cells along a tile.
         filtered_out: As ``ratio``, without the depth; written only where a surface is seen.
         params: (1,) FrameParams: frame_index; needed with ``shaded`` and ``seen_out``.
-        shaded: From ``shade_room``; where it is left out every cell is averaged.
+        shaded: From ``shade_environment``; where it is left out every cell is averaged.
         seen_out: As ``shaded``: number of the last frame in which something in a tile of cells is not 1.
         rows: Band of rows; None means all.
     """
@@ -1457,7 +1464,7 @@ def filter_ratio(
 
 
 def spread_ratio(
-    config: RoomConfig,
+    config: DistantLightConfig,
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
@@ -1481,7 +1488,7 @@ def spread_ratio(
         scene: Proxies.
         probes: Mirror balls; needed if ``config.probes``.
         filtered: From ``filter_ratio``.
-        surface: From ``shade_room``.
+        surface: From ``shade_environment``.
         stride: Pixels per cell.
         physical_ratio_out: (H, W) factor on the frame; 1 outside the rectangle and where no proxy is seen.
         seen: From ``filter_ratio``; where it is left out every pixel is looked at.

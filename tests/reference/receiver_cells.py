@@ -1,8 +1,8 @@
-"""Float64 twins of ``warp_ar.kernels.desk_cells``: brute force over samples and patches."""
+"""Float64 twins of ``warp_ar.kernels.receiver_cells``: brute force over samples and patches."""
 
 import numpy as np
 
-from tests.reference import room_shadow
+from tests.reference import environment_shadow
 
 GREY = 0.5
 
@@ -22,12 +22,12 @@ def meet_ball(origin, directions, center, radius):
     to_center = np.asarray(center) - origin
     along = directions @ to_center
     inside = np.sqrt(np.maximum(radius**2 - to_center @ to_center + along**2, 0))
-    t = np.where(room_shadow.meets_sphere(origin, directions, center, radius), along - inside, np.inf)
+    t = np.where(environment_shadow.meets_sphere(origin, directions, center, radius), along - inside, np.inf)
     return t, (np.where(np.isfinite(t), t, 0)[:, None] * directions - to_center) / radius
 
 
-def share_room(point, normal, directions, measure, radiance, distances, boxes, balls, facing):
-    """Share of the room's light at a point, (3,).
+def share_environment(point, normal, directions, measure, radiance, distances, boxes, balls, facing):
+    """Share of the environment at a point, (3,).
 
     Args:
         point: Where.
@@ -42,9 +42,9 @@ def share_room(point, normal, directions, measure, radiance, distances, boxes, b
     """
     weight = (np.maximum(directions @ normal, 0) * measure)[:, None]
     nearest, seen = np.array(distances, float), np.array(radiance, float)
-    things = [(*meet_ball(point, directions, c, r), reflectance) for c, r, reflectance in balls]
-    things += [(*meet_box(point, directions, *box), GREY) for box in boxes]
-    for t, normals, reflectance in things:
+    items = [(*meet_ball(point, directions, c, r), reflectance) for c, r, reflectance in balls]
+    items += [(*meet_box(point, directions, *box), GREY) for box in boxes]
+    for t, normals, reflectance in items:
         hidden = t < nearest
         seen = np.where(hidden[:, None], reflectance * facing(normals), seen)
         nearest = np.where(hidden, t, nearest)

@@ -1,8 +1,8 @@
-"""``python -m bench.write_prices``: the measured price list into ``docs/prices.md`` and the README.
+"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/costs.md`` and the README.
 
-It reads ``bench/results/*_prices.jsonl``, which ``python -m bench prices`` prints, and the errors of
-``warp_ar/accuracy/price_list.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
-replaces what stands between ``<!-- prices:NAME -->`` and ``<!-- /prices:NAME -->``. It prints for every preset what
+It reads ``bench/results/*_prices.jsonl``, which ``python -m bench costs`` prints, and the errors of
+``warp_ar/accuracy/cost_table.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
+replaces what stands between ``<!-- costs:NAME -->`` and ``<!-- /costs:NAME -->``. It prints for every preset what
 the rule of ``quality.BUDGETS`` would choose.
 """
 
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from warp_ar.accuracy.cost_table import KNOBS, WORDS, Choice, Price, choose, frontier, load_errors, setting
+from warp_ar.accuracy.cost_table import SETTINGS, WORDS, Choice, MethodCost, choose, chosen, load_errors, pareto_front
 from warp_ar.accuracy.costs import BASE
 from warp_ar.stages.quality import BUDGETS, PRESETS, SHARE
 
@@ -32,8 +32,8 @@ def read(pattern: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in files[-1].read_text().splitlines() if line.startswith("{")] if files else []
 
 
-def rungs(lines: list[dict[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
-    return {(line["knob"], line["rung"]): line for line in lines if "rung" in line}
+def methods(lines: list[dict[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(line["setting"], line["method"]): line for line in lines if "method" in line}
 
 
 def table(head: list[str], rows: list[list[str]], left: int) -> str:
@@ -59,29 +59,29 @@ def device_of(lines: list[dict[str, Any]]) -> str:
     return "one CPU core's work" if lines[0].get("clock") == "processor" else "two CPU cores"
 
 
-def rung_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any]) -> str:
+def method_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: dict[str, Any]) -> str:
     errors, arrays = load_errors(), listed.get("stage_errors", {})
     rows = []
-    ours, theirs = rungs(cpu), rungs(cuda)
-    for knob in KNOBS:
-        if knob.name not in listed["errors"]:
+    ours, theirs = methods(cpu), methods(cuda)
+    for setting in SETTINGS:
+        if setting.name not in listed["errors"]:
             continue
-        what, words = WORDS.get(knob.name, ("", {}))
-        rows.append([f"**{knob.name.replace('_', ' ')}**", what, "", "", "", ""])
-        for rung in knob.rungs:
-            known = rung in listed["errors"][knob.name]
-            apart = arrays.get(knob.name, {}).get(rung)
+        what, words = WORDS.get(setting.name, ("", {}))
+        rows.append([f"**{setting.name.replace('_', ' ')}**", what, "", "", "", ""])
+        for method in setting.methods:
+            known = method in listed["errors"][setting.name]
+            apart = arrays.get(setting.name, {}).get(method)
             rows.append(
                 [
-                    f"`{rung}`",
-                    words.get(rung, ""),
-                    f"{errors[knob.name][rung]:.4f}" if known else "0",
+                    f"`{method}`",
+                    words.get(method, ""),
+                    f"{errors[setting.name][method]:.4f}" if known else "0",
                     f"{apart:.1%}" if apart else "",
-                    milliseconds(ours.get((knob.name, rung))),
-                    milliseconds(theirs.get((knob.name, rung))),
+                    milliseconds(ours.get((setting.name, method))),
+                    milliseconds(theirs.get((setting.name, method))),
                 ]
             )
-    head = ["rung", "what it does", "error (FLIP)", "rel. RMSE", f"ms, {device_of(cpu)}", f"ms, {device_of(cuda)}"]
+    head = ["method", "what it does", "error (FLIP)", "rel. RMSE", f"ms, {device_of(cpu)}", f"ms, {device_of(cuda)}"]
     return table(head, rows, 2)
 
 
@@ -102,63 +102,70 @@ def preset_table(
     return table(head, rows, 2)
 
 
-def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tuple[str, str], Price]]:
-    """Choices by what ``desk`` calls for, milliseconds relative to the base; the base's; the prices."""
+def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tuple[str, str], MethodCost]]:
+    """Choices by what ``desk`` calls for, milliseconds relative to the base; the base's; the costs."""
     errors = load_errors()
-    found = rungs([line for line in lines if line["scene"] == "desk"])
-    prices = []
-    for knob in KNOBS:
-        own = {rung: found[knob.name, rung] for rung in knob.rungs if (knob.name, rung) in found}
+    found = methods([line for line in lines if line["scene"] == "desk"])
+    method_costs = []
+    for setting in SETTINGS:
+        own = {method: found[setting.name, method] for method in setting.methods if (setting.name, method) in found}
         if not own:
             continue
-        start = own[setting(BASE, knob)]["median_ms"]
-        prices += [
-            Price(knob.name, rung, line["median_ms"] - start, errors[knob.name][rung])
-            for rung, line in own.items()
-            if rung != "brute_force"
+        start = own[chosen(BASE, setting)]["median_ms"]
+        method_costs += [
+            MethodCost(setting.name, method, line["median_ms"] - start, errors[setting.name][method])
+            for method, line in own.items()
+            if method != "brute_force"
         ]
-    frame = next(line["base_ms"] for line in lines if line.get("knob") == "diffuse")
-    return frontier(prices), frame, {(price.knob, price.rung): price for price in prices}
+    frame = next(line["base_ms"] for line in lines if line.get("setting") == "diffuse")
+    return (
+        pareto_front(method_costs),
+        frame,
+        {(method_cost.setting, method_cost.method): method_cost for method_cost in method_costs},
+    )
 
 
 def rule_table(cpu: list[dict[str, Any]]) -> str:
     """Every preset beside what its budget would buy at best."""
-    front, base, prices = front_of(cpu)
+    front, base, method_costs = front_of(cpu)
     scale = OVERLAP if cpu[0].get("clock") == "processor" else 1.0
     rows = []
     for name, budget in BUDGETS.items():
         best = choose(front, (SHARE * budget - TRACKING_MS) * scale - base)
-        own = {knob: setting(PRESETS[name], next(k for k in KNOBS if k.name == knob)) for knob, _ in prices}
-        milliseconds_ = (base + sum(prices[pair].milliseconds for pair in own.items())) / scale + TRACKING_MS
-        error = sum(prices[pair].error for pair in own.items())
+        own = {
+            setting: chosen(PRESETS[name], next(k for k in SETTINGS if k.name == setting))
+            for setting, _ in method_costs
+        }
+        milliseconds_ = (base + sum(method_costs[pair].milliseconds for pair in own.items())) / scale + TRACKING_MS
+        error = sum(method_costs[pair].error for pair in own.items())
         rows.append([f"`{name}`", f"{budget:.0f}", f"{milliseconds_:.0f}", f"{error:.4f}", f"{best.error:.4f}"])
-        other = {knob: rung for knob, rung in best.settings if own[knob] != rung}
+        other = {setting: method for setting, method in best.settings if own[setting] != method}
         print(
             f"{name}: {milliseconds_:.1f} of {budget:.0f} ms, error {error:.4f}; the best errs {best.error:.4f} in "
-            f"{(base + best.milliseconds) / scale + TRACKING_MS:.1f} ms with {other or 'the same rungs'}"
+            f"{(base + best.milliseconds) / scale + TRACKING_MS:.1f} ms with {other or 'the same methods'}"
         )
     return table(["preset", "budget, ms", "expected ms", "expected error", "the budget's least"], rows, 1)
 
 
 def replace(path: Path, name: str, text: str) -> None:
     old = path.read_text(encoding="utf-8")
-    block = f"<!-- prices:{name} -->\n{text}\n<!-- /prices:{name} -->"
-    new, count = re.subn(rf"<!-- prices:{name} -->.*?<!-- /prices:{name} -->", lambda _: block, old, flags=re.S)
+    block = f"<!-- costs:{name} -->\n{text}\n<!-- /costs:{name} -->"
+    new, count = re.subn(rf"<!-- costs:{name} -->.*?<!-- /costs:{name} -->", lambda _: block, old, flags=re.S)
     if count != 1:
-        sys.exit(f"write_prices: {path.name} has {count} blocks {name!r}; expected 1")
+        sys.exit(f"write_cost_tables: {path.name} has {count} blocks {name!r}; expected 1")
     path.write_text(new, encoding="utf-8")
 
 
 def main() -> None:
-    cpu, cuda = read("cpu_prices.jsonl"), read("h*_prices.jsonl")
-    listed = json.loads((ROOT / "warp_ar" / "price_list.json").read_text(encoding="utf-8"))
+    cpu, cuda = read("cpu_costs.jsonl"), read("h*_prices.jsonl")
+    listed = json.loads((ROOT / "warp_ar" / "cost_table.json").read_text(encoding="utf-8"))
     presets = json.loads((ROOT / "bench" / "results" / "presets.json").read_text(encoding="utf-8"))
     if not cpu:
-        sys.exit("write_prices: no bench/results/cpu_prices.jsonl; make it with python -m bench prices --device cpu")
-    page = ROOT / "docs" / "prices.md"
+        sys.exit("write_cost_tables: no bench/results/cpu_costs.jsonl; make it with python -m bench costs --device cpu")
+    page = ROOT / "docs" / "costs.md"
     scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
     replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
-    replace(page, "rungs", rung_table(cpu, cuda, listed))
+    replace(page, "methods", method_table(cpu, cuda, listed))
     replace(page, "rule", rule_table(cpu))
     replace(ROOT / "README.md", "extract", preset_table(cpu, cuda, presets, ["desk"]))
 

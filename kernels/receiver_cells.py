@@ -1,8 +1,9 @@
-"""What ``relight`` needs to know of the desk beyond its own pixel, estimated for cells of the frame.
+"""What ``relight`` needs to know of the receiver beyond its own pixel, estimated for cells of the frame.
 
-**Share.** Reflectance is what the camera sees over what the room sends (``relight``, equation 3). The room's filtered
-irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it is too much, and the desk
-would be taken for darker than it is. So per cell, over the room's samples (``room_samples``),
+**Share.** Reflectance is what the camera sees over what the environment sends (``relight``, equation 3). The
+environment's filtered irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it is
+too much, and the receiver would be taken for darker than it is. So per cell, over the environment's samples
+(``environment_samples``),
 
     share = 1 - sum over hidden ones of measure * cos * (radiance - what hides it) / sum of measure * cos * radiance,
 
@@ -30,19 +31,19 @@ import functools
 
 import warp as wp
 
+from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.relight import (
     DEFAULT_REFLECTANCE,
-    Desk,
+    Receiver,
     RelightConfig,
     look_up_cells,
     make_lit_by,
     meets_probe,
     middle_pixel,
 )
-from warp_ar.kernels.room_samples import RoomSample, sample_toward
 from warp_ar.kernels.shadow import sample_light, tile_turn
 from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import (
@@ -61,13 +62,13 @@ wp.set_module_options({"enable_backward": False})
 MIN_IRRADIANCE = wp.constant(wp.float32(1.0e-6))
 """Irradiance, in camera values, below which a share means nothing."""
 NEGLIGIBLE = wp.constant(wp.float32(1.0 / 1024.0))
-"""Bounced light over the room's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
+"""Bounced light over the environment's that no 8-bit picture shows: an eighth of a code at most, taken for none."""
 MIN_FACING = wp.constant(wp.float32(0.02))
 """Least cosine at which the area that pixels show is believed: beyond it a patch would reach over the horizon."""
 SHARE_PARTS = 16
 """Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
 SHARE_SUMS = wp.constant(2)
-"""Sums per part of a cell: the room's light, and what is lost of it."""
+"""Sums per part of a cell: the environment, and what is lost of it."""
 PENDING = wp.constant(-2)
 """What ``surface_out`` holds less the cell's surface while parts of its share are not yet added."""
 
@@ -87,7 +88,7 @@ class CellConfig:
     """What is compiled into the kernels."""
 
     relight: RelightConfig
-    """Of the direct light: kinds of shape, and form of the room's irradiance."""
+    """Of the direct light: kinds of shape, and form of the environment's irradiance."""
 
     @property
     def trace(self) -> TraceConfig:
@@ -96,13 +97,13 @@ class CellConfig:
 
 
 @functools.cache
-def make_seen_desk(config: CellConfig) -> wp.Function:
-    """``seen_desk(params, rays, scene, desk, row, col) -> Hit``: the proxy that a pixel shows, or shape -1."""
+def make_seen_receiver(config: CellConfig) -> wp.Function:
+    """``seen_receiver(params, rays, scene, desk, row, col) -> Hit``: the proxy that a pixel shows, or shape -1."""
     closest_proxy = make_trace(config.trace).closest_proxy
 
     @wp.func(module="unique")
-    def seen_desk(
-        params: FrameParams, rays: wp.array2d[wp.vec2], scene: RayScene, desk: Desk, row: wp.int32, col: wp.int32
+    def seen_receiver(
+        params: FrameParams, rays: wp.array2d[wp.vec2], scene: RayScene, desk: Receiver, row: wp.int32, col: wp.int32
     ) -> Hit:
         ray = rays[row, col]
         direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
@@ -115,7 +116,7 @@ def make_seen_desk(config: CellConfig) -> wp.Function:
                     hit.shape = -1
         return hit
 
-    return seen_desk
+    return seen_receiver
 
 
 @wp.func
@@ -152,11 +153,11 @@ def in_lit_cells(cell_row: wp.int32, cell_col: wp.int32, stride: wp.int32, rect:
 
 @functools.cache
 def make_mean_facing(config: CellConfig) -> wp.Function:
-    """``mean_facing(desk, normal) -> vec3``: mean radiance, by the cosine, of the room before a surface."""
+    """``mean_facing(desk, normal) -> vec3``: mean radiance, by the cosine, of the environment before a surface."""
     form = config.relight.irradiance
 
     @wp.func(module="unique")
-    def mean_facing(desk: Desk, normal: wp.vec3) -> wp.vec3:
+    def mean_facing(desk: Receiver, normal: wp.vec3) -> wp.vec3:
         if wp.static(form == "sh"):
             mean = sh_irradiance(desk.irradiance_sh, normal) / wp.pi
         else:
@@ -168,23 +169,23 @@ def make_mean_facing(config: CellConfig) -> wp.Function:
 
 
 @functools.cache
-def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
-    """Kernel of ``share_room``."""
-    seen_desk = make_seen_desk(config)
+def make_share_environment_kernel(config: CellConfig) -> wp.Kernel:
+    """Kernel of ``share_environment``."""
+    seen_receiver = make_seen_receiver(config)
     mean_facing = make_mean_facing(config)
     closest_proxy = make_trace(config.trace).closest_proxy
     only_planes = set(config.trace.proxies) <= {PLANE}
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
-    def share_room_kernel(
+    def share_environment_kernel(
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
-        samples: wp.array[RoomSample],
+        desk: Receiver,
+        samples: wp.array[EnvironmentSample],
         count: wp.int32,
         stride: wp.int32,
         bounced: wp.bool,
@@ -208,7 +209,7 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
             return
         i = middle_pixel(ci, stride, rays.shape[0])
         j = middle_pixel(cj, stride, rays.shape[1])
-        hit = seen_desk(params[0], rays, scene, desk, i, j)
+        hit = seen_receiver(params[0], rays, scene, desk, i, j)
         if hit.shape < 0:
             return
         key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
@@ -282,7 +283,7 @@ def make_share_room_kernel(config: CellConfig) -> wp.Kernel:
         else:
             share_out[ci, cj] = shares_of(lost, whole)
 
-    return share_room_kernel
+    return share_environment_kernel
 
 
 @wp.kernel(enable_backward=False)
@@ -310,7 +311,7 @@ def join_shares_kernel(
 @functools.cache
 def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``send_light``."""
-    seen_desk = make_seen_desk(config)
+    seen_receiver = make_seen_receiver(config)
     lit_by = make_lit_by(dataclasses.replace(config.relight, bounced=False))
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -321,7 +322,7 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Desk,
+        desk: Receiver,
         stride: wp.int32,
         # Out:
         patches_out: wp.array2d[Patch],
@@ -332,7 +333,7 @@ def make_send_light_kernel(config: CellConfig) -> wp.Kernel:
         i = middle_pixel(ci, stride, rays.shape[0])
         j = middle_pixel(cj, stride, rays.shape[1])
         if inside_rect(i, j, params[0].light_rect):
-            hit = seen_desk(params[0], rays, scene, desk, i, j)
+            hit = seen_receiver(params[0], rays, scene, desk, i, j)
             if hit.shape >= 0:
                 lit = lit_by(scene, lights, desk, hit, i, j, wp.vec3(), tile_turn(ci, cj))
                 added = lit.added
@@ -376,7 +377,7 @@ def list_patches_kernel(
 @functools.cache
 def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
     """Kernel of ``gather_light``."""
-    seen_desk = make_seen_desk(config)
+    seen_receiver = make_seen_receiver(config)
     mean_facing = make_mean_facing(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
@@ -386,7 +387,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
         params: wp.array[FrameParams],
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
-        desk: Desk,
+        desk: Receiver,
         patches: wp.array2d[Patch],
         count: wp.array[wp.int32],
         patch_stride: wp.int32,
@@ -402,7 +403,7 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
             return
         i = middle_pixel(ci, stride, rays.shape[0])
         j = middle_pixel(cj, stride, rays.shape[1])
-        hit = seen_desk(params[0], rays, scene, desk, i, j)
+        hit = seen_receiver(params[0], rays, scene, desk, i, j)
         if hit.shape < 0:
             return
         surface_out[ci, cj] = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
@@ -418,23 +419,23 @@ def make_gather_light_kernel(config: CellConfig) -> wp.Kernel:
                 if here > 0.0 and there > 0.0:
                     squared = wp.dot(way, way)
                     total += here * there / (squared * (squared + patch.area / wp.pi)) * patch.flux
-        room = wp.pi * mean_facing(desk, hit.normal)
+        distant = wp.pi * mean_facing(desk, hit.normal)
         seen = bool(False)
         for channel in range(3):
-            if total[channel] > NEGLIGIBLE * room[channel]:
+            if total[channel] > NEGLIGIBLE * distant[channel]:
                 seen = True
         bounced_out[ci, cj] = wp.where(seen, total, wp.vec3(0.0, 0.0, 0.0))
 
     return gather_light_kernel
 
 
-def share_room(
+def share_environment(
     config: CellConfig,
     params: wp.array,
     rays: wp.array,
     scene: RayScene,
     lights: wp.array,
-    desk: Desk,
+    desk: Receiver,
     samples: wp.array,
     count: int,
     stride: int,
@@ -445,17 +446,17 @@ def share_room(
     sums_out: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
-    """Estimate which part of the room's light reaches the desk, for cells that virtual lights may shine on.
+    """Estimate which part of the environment reaches the receiver, for cells that virtual lights may shine on.
 
     Args:
-        config: Kinds of shape, form of the room's irradiance.
+        config: Kinds of shape, form of the environment's irradiance.
         params: (1,) FrameParams: camera and light_rect.
         rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         scene: Proxies.
         lights: (n,) Light.
-        desk: From ``relight.make_desk``: balls and the room's irradiance; with the cells of ``gather_light`` if
-            ``bounced``.
-        samples: (n,) RoomSample.
+        desk: From ``relight.make_receiver``: balls and the environment's irradiance; with the cells of ``gather_light``
+            if ``bounced``.
+        samples: (n,) EnvironmentSample.
         count: How many of them are used, the first ones. The same for all cells, so there is no noise; an aligned block
             of Sobol's sequence if it is a power of 2.
         stride: Pixels per cell.
@@ -468,7 +469,7 @@ def share_room(
     """
     parts = 1 if sums_out is None else sums_out.shape[0] // int(SHARE_SUMS)
     launch_rows(
-        make_share_room_kernel(config),
+        make_share_environment_kernel(config),
         (share_out.shape[0] * parts, share_out.shape[1]),
         [params, rays, scene, lights, desk, samples, min(count, samples.shape[0]), stride, bounced, parts],
         [share_out, surface_out, sums_out],
@@ -490,21 +491,21 @@ def send_light(
     rays: wp.array,
     scene: RayScene,
     lights: wp.array,
-    desk: Desk,
+    desk: Receiver,
     stride: int,
     patches_out: wp.array,
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Find what every patch of the desk sends on of the virtual light that falls on it.
+    """Find what every patch of the receiver sends on of the virtual light that falls on it.
 
     Args:
-        config: As for ``share_room``.
+        config: As for ``share_environment``.
         params: (1,) FrameParams: camera and light_rect.
         rays: (H, W) vec2.
         scene: Objects and proxies.
         lights: (n,) Light.
-        desk: From ``relight.make_desk``, with the cells of ``share_room`` where the config has them.
+        desk: From ``relight.make_receiver``, with the cells of ``share_environment`` where the config has them.
         stride: Pixels along a patch.
         patches_out: (ceil(H / stride), ceil(W / stride)) Patch; those that send nothing have no area.
         rows: Band of rows of patches; None means all.
@@ -538,7 +539,7 @@ def gather_light(
     params: wp.array,
     rays: wp.array,
     scene: RayScene,
-    desk: Desk,
+    desk: Receiver,
     patches: wp.array,
     count: wp.array,
     patch_stride: int,
@@ -548,20 +549,20 @@ def gather_light(
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Sum what patches send to the cells of the desk.
+    """Sum what patches send to the cells of the receiver.
 
     Args:
-        config: As for ``share_room``.
+        config: As for ``share_environment``.
         params: (1,) FrameParams: camera and light_rect.
         rays: (H, W) vec2.
         scene: Proxies.
-        desk: From ``relight.make_desk``: balls and the room's irradiance.
+        desk: From ``relight.make_receiver``: balls and the environment's irradiance.
         patches: (r, c) Patch of ``list_patches``; only rows that light_rect reaches are read.
         count: (r,) int32, how many of a row send light.
         patch_stride: Pixels along a patch.
         stride: Pixels per cell.
         bounced_out: (ceil(H / stride), ceil(W / stride)) vec3, irradiance; 0 where it is less than ``NEGLIGIBLE`` of
-            the room's, undefined where ``surface_out`` is -1.
+            the environment's, undefined where ``surface_out`` is -1.
         surface_out: The same shape, int32: ``surface_key`` of the cell, -1 for none.
         rows: Band of rows of cells; None means all.
     """

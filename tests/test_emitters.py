@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels.lamps import MAX_GAIN, REACH, add_nearness, turn_to_lamps
-from warp_ar.kernels.structs import RoomLamp
+from warp_ar.kernels.emitters import MAX_GAIN, REACH, add_nearness, correct_parallax
+from warp_ar.kernels.structs import Emitter
 
 CENTER = np.array([-0.12, 0.03, 0.035])
 FLOAT = 1e-5
@@ -22,7 +22,7 @@ def beside(x, y, z):
 def evaluate_kernel(
     # In:
     irradiance: wp.vec3,
-    lamps: wp.array[RoomLamp],
+    lamps: wp.array[Emitter],
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     # Out:
@@ -33,12 +33,12 @@ def evaluate_kernel(
 
 
 def evaluate(device, irradiance, lamps, points, normals):
-    records = np.zeros(len(lamps), np.dtype(RoomLamp.numpy_dtype()))
+    records = np.zeros(len(lamps), np.dtype(Emitter.numpy_dtype()))
     for record, (direction, distance, power) in zip(records, lamps, strict=True):
         record["origin"], record["direction"] = CENTER, direction
         record["distance"], record["power"] = distance, power
     out = wp.zeros(len(points), dtype=wp.vec3, device=device)
-    inputs = [wp.array(records, dtype=RoomLamp, device=device)]
+    inputs = [wp.array(records, dtype=Emitter, device=device)]
     inputs += [wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in (points, normals)]
     wp.launch(evaluate_kernel, len(points), [wp.vec3(*irradiance), *inputs], [out], device=device)
     return out.numpy()
@@ -82,22 +82,22 @@ def test_bounded_and_never_negative(device):
 @wp.kernel(enable_backward=False)
 def turn_kernel(
     # In:
-    lamps: wp.array[RoomLamp],
+    lamps: wp.array[Emitter],
     points: wp.array[wp.vec3],
     directions: wp.array[wp.vec3],
     # Out:
     turned_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    turned_out[i] = turn_to_lamps(lamps, points[i], directions[i])
+    turned_out[i] = correct_parallax(lamps, points[i], directions[i])
 
 
 def turn(device, lamps, point, directions):
-    records = np.zeros(len(lamps), np.dtype(RoomLamp.numpy_dtype()))
+    records = np.zeros(len(lamps), np.dtype(Emitter.numpy_dtype()))
     for record, (direction, distance) in zip(records, lamps, strict=True):
         record["origin"], record["direction"], record["distance"] = CENTER, direction, distance
     out = wp.zeros(len(directions), dtype=wp.vec3, device=device)
-    inputs = [wp.array(records, dtype=RoomLamp, device=device)]
+    inputs = [wp.array(records, dtype=Emitter, device=device)]
     inputs += [
         wp.array(np.array(a, np.float32), dtype=wp.vec3, device=device) for a in ([point] * len(directions), directions)
     ]

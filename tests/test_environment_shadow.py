@@ -5,23 +5,23 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.reference import room_shadow as reference
+from tests.reference import environment_shadow as reference
 from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records, shape
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import room_samples, room_shadow
-from warp_ar.kernels.reflect import Room, RoomConfig
-from warp_ar.kernels.room_samples import RoomSample
+from warp_ar.kernels import environment_samples, environment_shadow
+from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     BOX,
     LAMBERT,
     PLANE,
     SPHERE,
+    Emitter,
     FrameParams,
     Material,
     Probe,
     RayScene,
-    RoomLamp,
     Shape,
 )
 from warp_ar.kernels.visibility import TraceConfig
@@ -50,10 +50,10 @@ def draw(environment, count=COUNT * SIDE * SIDE):
     height, width = environment.shape[:2]
     cumulative, sums = wp.zeros((height, width), wp.float32), wp.zeros(height, wp.vec2)
     directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
-    samples = wp.zeros(count, RoomSample)
+    samples = wp.zeros(count, EnvironmentSample)
     source = wp.array(environment, dtype=wp.vec3)
-    room_samples.sum_environment(source, cumulative, sums)
-    room_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), directions, flux, samples)
+    environment_samples.sum_environment(source, cumulative, sums)
+    environment_samples.draw_samples(source, cumulative, sums, wp.vec3(*ORIGIN), directions, flux, samples)
     return directions, flux, samples
 
 
@@ -61,8 +61,8 @@ def list_texels(environment):
     environment = np.asarray(environment, np.float32)
     count = environment.shape[0] * environment.shape[1]
     directions, flux = wp.zeros(count, wp.vec3), wp.zeros(count, wp.vec3)
-    samples = wp.zeros(count, RoomSample)
-    room_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), directions, flux, samples)
+    samples = wp.zeros(count, EnvironmentSample)
+    environment_samples.list_texels(wp.array(environment, dtype=wp.vec3), wp.vec3(*ORIGIN), directions, flux, samples)
     return directions, flux, samples
 
 
@@ -99,9 +99,9 @@ def run(
     parts=1,
     in_steps=False,
 ):
-    kinds = tuple(tuple(sorted({thing["kind"] for thing in things})) for things in (objects, proxies))
-    forms = RoomConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
-    config = room_shadow.RoomShadowConfig(forms, count, side, bounce, asking, near, parts)
+    kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
+    forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
+    config = environment_shadow.EnvironmentShadowConfig(forms, count, side, bounce, asking, near, parts)
     params = records(
         FrameParams,
         {
@@ -113,33 +113,33 @@ def run(
         },
     )
     scene = RayScene()
-    objects = [{**thing, "material": 0} for thing in objects]
+    objects = [{**item, "material": 0} for item in objects]
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     scene.materials = records(
         Material, {"model": LAMBERT, "base_color": (albedo,) * 3, "base_texture": -1, "specular_texture": -1}
     )
-    room = Room()
-    room.environment = wp.array(sky(), dtype=wp.vec3)
-    room.probes = records(Probe, *probes)
+    surroundings = DistantLight()
+    surroundings.environment = wp.array(sky(), dtype=wp.vec3)
+    surroundings.probes = records(Probe, *probes)
     coefficients = np.zeros((9, 3), np.float32)
     coefficients[0] = np.pi / 0.28209479
-    room.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
     cells = -(-H // stride), -(-W // stride)
     ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
     bounced = wp.zeros(cells, wp.vec3)
-    shaded = wp.full(room_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
+    shaded = wp.full(environment_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
     rays = wp.array(RAYS, dtype=wp.vec2)
-    steps = room_shadow.make_steps(config, *cells, rays.device) if in_steps else None
+    steps = environment_shadow.make_steps(config, *cells, rays.device) if in_steps else None
     assert in_steps == (steps is not None)
-    room_shadow.shade_room(
+    environment_shadow.shade_environment(
         config,
         params,
         rays,
         frame,
         tables()[0],
         scene,
-        room,
+        surroundings,
         *drawn,
         stride,
         ratio,
@@ -147,25 +147,25 @@ def run(
         surface,
         shaded_out=shaded,
         steps=steps,
-        sums_out=wp.full(room_shadow.sums_shape(parts, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
+        sums_out=wp.full(environment_shadow.sums_shape(parts, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
         rows=rows,
     )
     if not filtered:
         return ratio.numpy()[..., :3], surface.numpy()
     averaged, skipped = wp.zeros(cells, wp.vec3), wp.zeros(cells, wp.vec3)
     seen = wp.full_like(shaded, -1)
-    room_shadow.filter_ratio(ratio, bounced, surface, side, averaged, rows=rows)
+    environment_shadow.filter_ratio(ratio, bounced, surface, side, averaged, rows=rows)
     # Around cells that are not shaded nothing is averaged, with the same result.
-    room_shadow.filter_ratio(
+    environment_shadow.filter_ratio(
         ratio, bounced, surface, side, skipped, params=params, shaded=shaded, seen_out=seen, rows=rows
     )
     np.testing.assert_array_equal(skipped.numpy(), averaged.numpy())
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    spread = [forms, params, rays, scene, room.probes, averaged, surface, stride]
-    room_shadow.spread_ratio(*spread, out)
+    spread = [forms, params, rays, scene, surroundings.probes, averaged, surface, stride]
+    environment_shadow.spread_ratio(*spread, out)
     # Tiles in which no cell differs from 1 are passed by, with the same result.
     passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
-    room_shadow.spread_ratio(*spread, passed, seen=seen)
+    environment_shadow.spread_ratio(*spread, passed, seen=seen)
     np.testing.assert_array_equal(passed.numpy(), out.numpy())
     return out.numpy()
 
@@ -173,7 +173,7 @@ def run(
 # --- Samples ----------------------------------------------------------------------------------------------------------
 
 
-def test_samples_of_a_constant_room_sum_to_the_sphere(device):
+def test_samples_of_a_constant_environment_sum_to_the_sphere(device):
     directions, flux, samples = draw(sky(0.7))
     assert samples.numpy()["measure"].sum() == pytest.approx(4 * np.pi, rel=STRATIFIED)
     up = np.maximum(directions.numpy()[:, 2], 0) @ flux.numpy()
@@ -195,11 +195,11 @@ def test_cumulative_sums_match_their_twin(device, size):
     """Along rows and over rows, over eight decades of radiance."""
     environment = np.float32(10.0 ** np.random.default_rng(6).uniform(-4, 4, (*size, 3)))
     cumulative, sums = wp.zeros(size, wp.float32), wp.zeros(size[0], wp.vec2)
-    room_samples.sum_environment(wp.array(environment, dtype=wp.vec3), cumulative, sums)
-    along, over = reference.cumulative_sums(environment.astype(np.float64), float(room_samples.SIDE_WEIGHT))
-    check_error("room_samples", cumulative.numpy(), along)
+    environment_samples.sum_environment(wp.array(environment, dtype=wp.vec3), cumulative, sums)
+    along, over = reference.cumulative_sums(environment.astype(np.float64), float(environment_samples.SIDE_WEIGHT))
+    check_error("environment_samples", cumulative.numpy(), along)
     for channel in range(2):
-        check_error("room_samples", sums.numpy()[:, channel], over[:, channel])
+        check_error("environment_samples", sums.numpy()[:, channel], over[:, channel])
 
 
 @pytest.mark.parametrize("size", [(16, 32), (5, 9), (1, 4)])
@@ -249,7 +249,7 @@ def test_sobol_matches_its_twin(device):
 @wp.kernel(enable_backward=False)
 def _sobol_kernel(out: wp.array[wp.float32]):
     i = wp.tid()
-    out[i] = room_samples.sobol_second(wp.uint32(i))
+    out[i] = environment_samples.sobol_second(wp.uint32(i))
 
 
 def test_texels_list_the_map(device):
@@ -269,7 +269,7 @@ def lamp_at(*positions, origin=ORIGIN):
         distance = np.linalg.norm(offset)
         far = np.inf if at is None else distance
         values.append({"origin": origin, "direction": offset / distance, "distance": far})
-    return records(RoomLamp, *values, {})
+    return records(Emitter, *values, {})
 
 
 def test_lamps_give_their_samples_a_place(device):
@@ -280,7 +280,7 @@ def test_lamps_give_their_samples_a_place(device):
     environment[wi @ direction > np.cos(0.1)] = 40.0
     environment[wi[..., 2] > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    room_samples.place_lamps(lamp_at(at, None), samples)
+    environment_samples.place_lamps(lamp_at(at, None), samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
@@ -294,7 +294,7 @@ def test_lamps_are_placed_from_where_the_ball_mirrors_them(device):
     environment = sky(0.5, (256, 512))
     environment[reference.texel_directions(256, 512)[0] @ direction > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    room_samples.place_lamps(lamp_at(at, origin=mirrors), samples)
+    environment_samples.place_lamps(lamp_at(at, origin=mirrors), samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     places = found["origin"][near] + found["distance"][near, None] * found["direction"][near]
@@ -324,7 +324,7 @@ def test_sphere_under_an_even_sky(device):
     assert np.sqrt((inner**2).mean()) < STRATIFIED
 
 
-def test_reference_rung_matches_the_twin(device):
+def test_reference_method_matches_the_twin(device):
     environment = np.random.default_rng(1).random((32, 64, 3)).astype(np.float32)
     environment[8, 40] = 300.0
     drawn = list_texels(environment)
@@ -350,7 +350,7 @@ def test_reference_rung_matches_the_twin(device):
             continue
         expected = reference.ratio_on_plane(point[None], wi, flux, spheres, balls)[0]
         # A ray at a rim may fall on either side: one of 2048, none bright but the sun, which is clear of them.
-        check_error("room_shadow", got[row, column], expected)
+        check_error("environment_shadow", got[row, column], expected)
         checked += 1
     assert checked > 20
 
@@ -394,7 +394,7 @@ def test_sun_in_shadow_leaves_the_sky(device):
     assert got[at][0] == pytest.approx(expected, abs=0.02)
 
 
-def test_black_room_and_deep_contact(device):
+def test_black_environment_and_deep_contact(device):
     assert (run(draw(sky(0.0)), [sphere((0, 0, 0.05), 0.05)]) == 1).all()
     # A slab that lies on the desk leaves nothing under it.
     slab = shape(BOX, (0, 0, 0.02), (0.2, 0.2, 0.02 - 1e-5))
@@ -419,7 +419,7 @@ def test_bounce(device, bounce, albedo):
         assert albedo * 0.7 < back.mean() < albedo + MEAN_ERROR
 
 
-def test_estimated_bounce_keeps_the_energy_of_a_white_room(device):
+def test_estimated_bounce_keeps_the_energy_of_a_white_environment(device):
     """To and fro between white objects and the desk nothing is lost, however close they are."""
     for item in (sphere((0, 0, 0.08), 0.05), sphere((0.03, 0.02, 0.06), 0.05), shape(BOX, (0, 0, 0.07), (0.05,) * 3)):
         got = run(draw(sky(1.0)), [item], albedo=1.0)
@@ -442,15 +442,15 @@ def test_estimated_bounce_is_the_sum_of_its_series(device):
     t = along - np.sqrt(radius**2 - (to_center @ to_center - along**2))
     up = ((point + t[:, None] * wi[met] - center) / radius)[:, 2]
     hidden, desk = weight[met].sum() / weight.sum(), albedo * (weight[met] @ (0.5 - 0.5 * up)) / weight.sum()
-    room = albedo * hidden - desk
+    surroundings = albedo * hidden - desk
     assert hidden > 0.01
     assert 0.005 < desk < albedo * hidden
-    assert got[at] == pytest.approx((1 - hidden + room) / (1 - desk), abs=SUM_ERROR)
+    assert got[at] == pytest.approx((1 - hidden + surroundings) / (1 - desk), abs=SUM_ERROR)
 
 
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
 def test_the_physical_is_not_black(device, bounce):
-    """In a white room with a white box and a perfect ball only the virtual object, a black one, takes light."""
+    """In a white environment with a white box and a perfect ball only the virtual object, a black one, takes light."""
     center, radius = (0.02, -0.03, 0.03), 0.02
     drawn = draw(sky(1.0))
     probes = [{"center": (0.1, -0.03, 0.03), "radius": 0.03, "reflectance": (1, 1, 1)}]
@@ -470,7 +470,7 @@ def test_the_physical_is_not_black(device, bounce):
 
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
 def test_the_physical_among_samples_matches_the_reference(device, bounce):
-    """Sets of 64 samples beside every texel, with a box and a ball that differ from the room behind them."""
+    """Sets of 64 samples beside every texel, with a box and a ball that differ from the environment behind them."""
     environment = sky(0.3)
     environment[8:14, 10:30] = 4.0
     probes = [{"center": (0.1, 0.02, 0.03), "radius": 0.03, "reflectance": (0.8, 0.8, 0.8)}]
@@ -498,9 +498,11 @@ def test_half_of_a_set_speaks_for_all_of_it(device, bounce):
 
 @pytest.mark.parametrize("asking", [0.0, 1.5])
 def test_asking_is_a_share(asking):
-    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
     with pytest.raises(ValueError, match="asking is"):
-        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 64, 4, "traced", asking))
+        environment_shadow.make_environment_shadow_kernel(
+            environment_shadow.EnvironmentShadowConfig(forms, 64, 4, "traced", asking)
+        )
 
 
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
@@ -525,7 +527,7 @@ def test_near_lamps_cast_their_own_shadow(device):
     directions, flux, samples = draw(environment)
     item = [sphere((0.1, 0, 0.1), 0.03)]
     distant = run((directions, flux, samples), item)[..., 0]
-    room_samples.place_lamps(lamp_at(lamp), samples)
+    environment_samples.place_lamps(lamp_at(lamp), samples)
     near = run((directions, flux, samples), item, near=True)[..., 0]
     # Centre of the shadow: where the line through lamp and object meets the desk.
     expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)
@@ -559,7 +561,7 @@ def test_bands_of_rows_and_rectangles(device, stride):
 def test_threads_that_share_a_cell_find_the_same(device, bounce, asking):
     """By one kernel or in steps: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
-    room_samples.place_lamps(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    environment_samples.place_lamps(lamp_at((0.1, 0.05, 0.4)), drawn[2])
     scene = {
         "objects": [sphere((0, 0, 0.05), 0.05), shape(BOX, (-0.1, -0.1, 0.03), (0.03, 0.02, 0.03))],
         "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),
@@ -582,24 +584,24 @@ def test_threads_that_share_a_cell_find_the_same(device, bounce, asking):
 
 
 def test_steps_take_one_set_and_little_memory(device):
-    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
     def steps(count, parts, asking=1.0):
-        config = room_shadow.RoomShadowConfig(forms, count, 4, "traced", asking, parts=parts)
-        return room_shadow.make_steps(config, 10, 20, device)
+        config = environment_shadow.EnvironmentShadowConfig(forms, count, 4, "traced", asking, parts=parts)
+        return environment_shadow.make_steps(config, 10, 20, device)
 
     found = steps(64, 4, 0.5)
     assert (found.hits.shape, found.items.shape) == ((4, 10, 20), (10 * 20 * 32,))
     assert steps(64, 1) is None, "more samples than a word has bits"
     assert steps(128, 8) is None, "more than a set"
-    config = room_shadow.RoomShadowConfig(forms, 64, 4, "traced", parts=2)
-    assert room_shadow.make_steps(config, 1080, 1920, device) is None
+    config = environment_shadow.EnvironmentShadowConfig(forms, 64, 4, "traced", parts=2)
+    assert environment_shadow.make_steps(config, 1080, 1920, device) is None
 
 
 @wp.kernel(enable_backward=False)
 def _columns_kernel(side: wp.int32, lanes: wp.int32, out: wp.array[wp.int32]):
     thread = wp.tid()
-    out[thread] = room_shadow.cell_column(thread, out.shape[0], side, lanes)
+    out[thread] = environment_shadow.cell_column(thread, out.shape[0], side, lanes)
 
 
 @pytest.mark.parametrize("columns", [5, 128, 300, 640])
@@ -639,7 +641,7 @@ def test_filter_keeps_surfaces_apart(device):
     surface[3, :] = -1
     out = wp.full((16, 16), wp.vec3(5.0, 5.0, 5.0), dtype=wp.vec3)
     bounced = wp.zeros((16, 16), wp.vec3)
-    room_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), bounced, wp.array(surface, dtype=wp.int32), 4, out)
+    environment_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), bounced, wp.array(surface, dtype=wp.int32), 4, out)
     expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
     expected[3] = 5.0
     np.testing.assert_array_equal(out.numpy(), expected)
@@ -651,7 +653,7 @@ def filtered(ratio, side=4):
     surface = wp.zeros(cells.shape[:2], wp.int32)
     out = wp.zeros(surface.shape, wp.vec3)
     cells = wp.array(cells, dtype=wp.vec4)
-    room_shadow.filter_ratio(cells, wp.zeros(surface.shape, wp.vec3), surface, side, out)
+    environment_shadow.filter_ratio(cells, wp.zeros(surface.shape, wp.vec3), surface, side, out)
     return out.numpy()[..., 0]
 
 
@@ -671,7 +673,7 @@ def test_filter_narrows_where_that_makes_a_difference(device):
     np.testing.assert_allclose(np.delete(got, [11, 12]), np.delete(expected, [11, 12]), atol=1e-6)
     assert 0.35 <= got[11] <= 0.425
     weak = np.full((24, 24), 0.5)
-    weak[:, 12:] += 0.5 * room_shadow.CONTRAST
+    weak[:, 12:] += 0.5 * environment_shadow.CONTRAST
     assert np.ptp(filtered(weak)[8, 10:14]) < np.ptp(filtered(weak, side=2)[8, 10:14])
     # A mean of 16 cells has half the noise of a mean of 4: where cells differ by chance, few of the latter are picked.
     noise = 0.5 + np.random.default_rng(0).normal(0, 0.1, (96, 96))
@@ -681,13 +683,13 @@ def test_filter_narrows_where_that_makes_a_difference(device):
 
 def test_what_no_picture_shows_is_exactly_one(device):
     value = np.ones((24, 24), np.float32)
-    value[:, 12:] = 1 - 0.9 * room_shadow.NEGLIGIBLE
+    value[:, 12:] = 1 - 0.9 * environment_shadow.NEGLIGIBLE
     assert (filtered(value) == 1).all()
-    value[:, 12:] = 1 - 1.1 * room_shadow.NEGLIGIBLE
+    value[:, 12:] = 1 - 1.1 * environment_shadow.NEGLIGIBLE
     assert (filtered(value)[:, 14:] != 1).all()
 
 
-ON_DESK = RoomConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False)
+ON_DESK = DistantLightConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
 
 def test_spread_is_a_ramp(device):
@@ -701,7 +703,7 @@ def test_spread_is_a_ramp(device):
         out, rays = wp.zeros(size, wp.vec3), wp.zeros(size, wp.vec2)
         surface = wp.zeros(cells, wp.int32)
         averaged = wp.array(values, dtype=wp.vec3)
-        room_shadow.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, surface, stride, out)
+        environment_shadow.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, surface, stride, out)
         expected = [np.clip(np.arange(n), axis[0], axis[-1]) for n, axis in zip(size, axes, strict=True)]
         np.testing.assert_allclose(out.numpy()[..., :2], np.stack(np.meshgrid(*expected, indexing="ij"), -1), atol=1e-5)
 
@@ -721,22 +723,24 @@ def test_pixels_between_surfaces_find_their_own(device):
     surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
     averaged = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
     out, rays = wp.zeros((H, W), wp.vec3), wp.array(RAYS, dtype=wp.vec2)
-    room_shadow.spread_ratio(ON_DESK, params, rays, scene, None, averaged, surface, stride, out)
+    environment_shadow.spread_ratio(ON_DESK, params, rays, scene, None, averaged, surface, stride, out)
     np.testing.assert_array_equal(out.numpy()[..., 0], np.where(on_board, 0.25, 1.0))
 
 
 def test_count_must_fill_chunks():
-    forms = RoomConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
+    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
     with pytest.raises(ValueError, match="count is 100"):
-        room_shadow.make_room_shadow_kernel(room_shadow.RoomShadowConfig(forms, 100, 4, "estimated"))
+        environment_shadow.make_environment_shadow_kernel(
+            environment_shadow.EnvironmentShadowConfig(forms, 100, 4, "estimated")
+        )
 
 
 # --- Stage ------------------------------------------------------------------------------------------------------------
 
 
-def stages(scene, rung, **changes):
+def stages(scene, method, **changes):
     scene = dataclasses.replace(scene, **changes)
-    quality = PRESETS["medium"].with_rungs(room_shadow=rung)
+    quality = PRESETS["medium"].with_methods(environment_shadow=method)
     plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
     return {stage.name for stage, _ in plan.stages}, dict(plan.left_out)
 
@@ -744,13 +748,13 @@ def stages(scene, rung, **changes):
 def test_stage_says_why_it_is_left_out():
     scene = load_scene("torus")
     run_stages, _ = stages(scene, "coarse")
-    assert {"room_samples", "room_shadow"} <= run_stages
-    for changes, rung, reason in (
+    assert {"environment_samples", "environment_shadow"} <= run_stages
+    for changes, method, reason in (
         ({"objects": ()}, "coarse", "no virtual object"),
         ({"proxies": ()}, "coarse", "no proxy"),
         ({}, "none", "leaves out"),
     ):
-        names, left_out = stages(scene, rung, **changes)
-        assert "room_shadow" not in names
-        assert "room_samples" not in names
-        assert reason in left_out["room_shadow"]
+        names, left_out = stages(scene, method, **changes)
+        assert "environment_shadow" not in names
+        assert "environment_samples" not in names
+        assert reason in left_out["environment_shadow"]

@@ -1,14 +1,14 @@
-"""The room's light as a set of directions, each with the light that it stands for.
+"""The environment as a set of directions, each with the light that it stands for.
 
 The environment becomes ``count * sets`` samples, drawn again whenever it changes. A surface's irradiance is the sum
 
     E = sum over samples of  measure * radiance * max(n.w, 0) * visible,   measure = 1 / (number of samples * pdf).
 
-Density. Half of the samples follow what arrives at the desk, radiance times the weight of the direction, so that a lamp
-of one texel and the sky around it get samples by their light; half follow the weight alone, so that no sample stands
-for more than twice its share of the hemisphere and what objects reflect is sampled evenly. The weight is 0.3 +
-max(w.z, 0): mostly directions above the desk, some for surfaces of other orientations. Texels are picked by inverting
-the cumulative sums of rows and of the texels in a row; within a texel a sample is uniform.
+Density. Half of the samples follow what arrives at the receiver, radiance times the weight of the direction, so that a
+lamp of one texel and the sky around it get samples by their light; half follow the weight alone, so that no sample
+stands for more than twice its share of the hemisphere and what objects reflect is sampled evenly. The weight is 0.3 +
+max(w.z, 0): mostly directions above the receiver, some for surfaces of other orientations. Texels are picked by
+inverting the cumulative sums of rows and of the texels in a row; within a texel a sample is uniform.
 
 Points. The first two dimensions of Sobol's sequence are a (0, 2)-sequence in base 2: every aligned block of 2^m
 consecutive points, and all blocks together, have one point in each elementary interval of their size. A block is a set:
@@ -31,13 +31,13 @@ import warp as wp
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pyramid import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
-from warp_ar.kernels.structs import RoomLamp
+from warp_ar.kernels.structs import Emitter
 
 wp.set_module_options({"enable_backward": False})
 
 PI = wp.constant(wp.float32(math.pi))
 SIDE_WEIGHT = wp.constant(wp.float32(0.3))
-"""Weight of directions that the desk does not see, beside the cosine of those that it does."""
+"""Weight of directions that the receiver does not see, beside the cosine of those that it does."""
 FAR_AWAY = wp.constant(wp.float32(1.0e30))
 """Distance of light that is part of the environment."""
 LAMP_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
@@ -49,8 +49,8 @@ TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
 
 @wp.struct
-class RoomSample:
-    """One direction of the room's light."""
+class EnvironmentSample:
+    """One direction of the environment."""
 
     direction: wp.vec3  # unit, world, as seen from where the environment was captured
     radiance: wp.vec3
@@ -69,7 +69,7 @@ class Incidence:
 
 
 @wp.func
-def sample_toward(sample: RoomSample, point: wp.vec3) -> Incidence:
+def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
     """A sample as ``point`` sees it: a lamp at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
     result = Incidence()
     result.direction = sample.direction
@@ -199,14 +199,14 @@ def draw_samples_kernel(
     # Out:
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[RoomSample],
+    samples_out: wp.array[EnvironmentSample],
 ):
     """Invert the cumulative sums of the mixture for one point."""
     index = wp.tid() + row_start
     height = environment.shape[0]
     width = environment.shape[1]
     total = rows[height - 1]
-    # Each kind of density gives half; a black room gives all to the weight alone.
+    # Each kind of density gives half; a black environment gives all to the weight alone.
     bright_share = wp.where(total[0] > 0.0, 0.5 / wp.max(total[0], 1.0e-37), 0.0)
     even_share = wp.where(total[0] > 0.0, 0.5, 1.0) / total[1]
     u = radical_inverse(wp.uint32(index)) + 0.5 / wp.float32(count)
@@ -251,7 +251,7 @@ def draw_samples_kernel(
     z = top + fraction * (bottom - top)
     phi = (2.0 * (wp.float32(column) + within) / wp.float32(width) - 1.0) * PI
     sine = wp.sqrt(wp.max((1.0 - z) * (1.0 + z), 0.0))
-    sample = RoomSample()
+    sample = EnvironmentSample()
     sample.direction = wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), z)
     sample.radiance = radiance
     solid_angle = (top - bottom) * 2.0 * PI / wp.float32(width)
@@ -272,7 +272,7 @@ def list_texels_kernel(
     # Out:
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[RoomSample],
+    samples_out: wp.array[EnvironmentSample],
 ):
     """Every texel of a map as a sample at its centre."""
     i, j = wp.tid()
@@ -284,7 +284,7 @@ def list_texels_kernel(
     z = 0.5 * (top + bottom)
     phi = (2.0 * (wp.float32(j) + 0.5) / wp.float32(width) - 1.0) * PI
     sine = wp.sqrt(wp.max((1.0 - z) * (1.0 + z), 0.0))
-    sample = RoomSample()
+    sample = EnvironmentSample()
     sample.direction = wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), z)
     sample.radiance = safe_radiance(environment[i, j])
     sample.measure = (top - bottom) * 2.0 * PI / wp.float32(width)
@@ -299,9 +299,9 @@ def list_texels_kernel(
 def place_lamps_kernel(
     # In:
     row_start: wp.int32,
-    lamps: wp.array[RoomLamp],
+    lamps: wp.array[Emitter],
     # Out:
-    samples_out: wp.array[RoomSample],
+    samples_out: wp.array[EnvironmentSample],
 ):
     """Give the samples that show a lamp the distance of the lamp that they are nearest to."""
     index = wp.tid() + row_start
@@ -318,7 +318,9 @@ def place_lamps_kernel(
             samples_out[index].distance = wp.clamp(lamp.distance, MIN_LAMP_DISTANCE, FAR_AWAY)
 
 
-def place_lamps(lamps: wp.array[RoomLamp], samples_out: wp.array[RoomSample], *, rows: Rows | None = None) -> None:
+def place_lamps(
+    lamps: wp.array[Emitter], samples_out: wp.array[EnvironmentSample], *, rows: Rows | None = None
+) -> None:
     """Turn the samples of near lamps from directions into places.
 
     A sample shows a lamp if it is as bright as clipping and within ``LAMP_COSINE`` of its direction.
@@ -363,7 +365,7 @@ def draw_samples(
     origin: wp.vec3,
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[RoomSample],
+    samples_out: wp.array[EnvironmentSample],
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -394,7 +396,7 @@ def list_texels(
     origin: wp.vec3,
     directions_out: wp.array[wp.vec3],
     flux_out: wp.array[wp.vec3],
-    samples_out: wp.array[RoomSample],
+    samples_out: wp.array[EnvironmentSample],
     *,
     rows: Rows | None = None,
 ) -> None:

@@ -13,7 +13,7 @@ import warp as wp
 from warp_ar.kernels.pyramid import reduce_latlong
 
 
-def made_up_room(height: int) -> np.ndarray:
+def made_up_environment(height: int) -> np.ndarray:
     """Dim walls, a window, a lamp of four degrees and a sun of half a degree, 512 rows or more, (rows, 2 rows, 3)."""
     fine = max(height, 512)
     theta = np.pi * (np.arange(fine)[:, None] + 0.5) / fine
@@ -30,9 +30,9 @@ def made_up_room(height: int) -> np.ndarray:
     return radiance.astype(np.float32)
 
 
-def rooms(height: int, device: Any) -> dict[str, wp.array]:
-    """Environments of ``height`` rows by name: the made-up room, and those in WARP_AR_SHARED/hdri."""
-    images = {"made up": made_up_room(height)}
+def environments(height: int, device: Any) -> dict[str, wp.array]:
+    """Environments of ``height`` rows by name: the made-up environment, and those in WARP_AR_SHARED/hdri."""
+    images = {"made up": made_up_environment(height)}
     for path in sorted(Path(os.environ.get("WARP_AR_SHARED", ""), "hdri").glob("*.exr")):
         images[path.stem] = OpenEXR.File(str(path)).channels()["RGB"].pixels.astype(np.float32)
     result = {}

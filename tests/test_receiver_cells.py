@@ -1,4 +1,4 @@
-"""Cells of the desk: the room's share, one bounce of virtual light, and how pixels look both up."""
+"""Cells of the desk: the environment's share, one bounce of virtual light, and how pixels look both up."""
 
 import dataclasses
 import math
@@ -11,15 +11,15 @@ import warp as wp
 from tests.error_model import check_error
 from tests.hard_cases.generators import frames
 from tests.hard_cases.rig import SIZE, Rig, assert_same_bits
-from tests.reference import desk_cells as reference
+from tests.reference import receiver_cells as reference
 from tests.reference import relight as reference_relight
-from tests.reference.room_shadow import sphere_form_factor
+from tests.reference.environment_shadow import sphere_form_factor
 from tests.test_composite import tables
-from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_room, point, records, shape
-from tests.test_room_shadow import draw, lamp_at, list_texels, sky, with_sun
-from warp_ar.kernels import desk_cells, relight, room_samples, summed_area
-from warp_ar.kernels.desk_cells import Patch
-from warp_ar.kernels.room_samples import RoomSample
+from tests.test_environment_shadow import draw, lamp_at, list_texels, sky, with_sun
+from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_environment, point, records, shape
+from warp_ar.kernels import environment_samples, receiver_cells, relight, summed_area
+from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.receiver_cells import Patch
 from warp_ar.kernels.structs import BOX, DIRECTIONAL, MESH, PLANE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
@@ -64,7 +64,7 @@ class View:
         lights=(ABOVE,),
         size=SIZE_OF_FRAME,
         rect=None,
-        room=WHITE,
+        surroundings=WHITE,
         frame=None,
         camera=CAMERA,
         turn=LOOK_DOWN,
@@ -77,7 +77,7 @@ class View:
         self.relight = relight.RelightConfig(
             "reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms
         )
-        self.config = desk_cells.CellConfig(self.relight)
+        self.config = receiver_cells.CellConfig(self.relight)
         self.size = size
         self.params = records(
             FrameParams,
@@ -97,15 +97,15 @@ class View:
         image = np.full((*size, 3), 128, np.uint8) if frame is None else frame
         self.frame, self.table = wp.array(image, dtype=wp.vec3ub), wp.zeros(size, wp.uint32)
         summed_area.sum_area(self.frame, self.table)
-        self.keys = records(KeyLight, {"direction": (0, 0, 1), "dominance": 0.0})
+        self.keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
         self.probes = records(Probe, *probes)
-        self.room = wp.array(constant_room(room), dtype=wp.vec3)
+        self.surroundings = wp.array(constant_environment(surroundings), dtype=wp.vec3)
         if irradiance is not None:
-            self.room = wp.array(irradiance, dtype=wp.vec3)
+            self.surroundings = wp.array(irradiance, dtype=wp.vec3)
 
     def desk(self, cells=None):
-        known = self.frame, tables()[0], self.table, self.probes, self.keys, self.room
-        return relight.make_desk(self.relight, *known, cells=cells)
+        known = self.frame, tables()[0], self.table, self.probes, self.keys, self.surroundings
+        return relight.make_receiver(self.relight, *known, cells=cells)
 
     def cells(self, stride):
         return tuple(-(-n // stride) for n in self.size)
@@ -116,8 +116,8 @@ class View:
         sums = None
         if parts > 1:
             poison = wp.vec3(math.nan, math.nan, math.nan)
-            sums = wp.full(desk_cells.share_sums_shape(parts, *share.shape), poison, dtype=wp.vec3)
-        desk_cells.share_room(
+            sums = wp.full(receiver_cells.share_sums_shape(parts, *share.shape), poison, dtype=wp.vec3)
+        receiver_cells.share_environment(
             self.config,
             self.params,
             self.rays,
@@ -137,7 +137,7 @@ class View:
 
     def send(self, stride=4, rows=None, out=None, cells=None):
         patches = wp.full(self.cells(stride), Patch(), dtype=Patch) if out is None else out
-        desk_cells.send_light(
+        receiver_cells.send_light(
             self.config, self.params, self.rays, self.scene, self.lights, self.desk(cells), stride, patches, rows=rows
         )
         return patches
@@ -145,13 +145,13 @@ class View:
     def gather(self, patches, patch_stride=4, stride=4, rows=None, out=None):
         listed, count = wp.full(patches.shape, Patch(), dtype=Patch), wp.full(patches.shape[0], 99, dtype=wp.int32)
         for band in rows or [None]:
-            desk_cells.list_patches(patches, listed, count, rows=band and (band[0] // 2, band[1] // 2))
+            receiver_cells.list_patches(patches, listed, count, rows=band and (band[0] // 2, band[1] // 2))
         if rows:
-            desk_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
+            receiver_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
         bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
         for band in rows or [None]:
-            desk_cells.gather_light(
+            receiver_cells.gather_light(
                 self.config,
                 self.params,
                 self.rays,
@@ -180,7 +180,7 @@ class View:
             self.probes,
             self.lights,
             self.keys,
-            self.room,
+            self.surroundings,
             out,
             cells=cells,
             rows=rows,
@@ -202,7 +202,7 @@ def middles(stride, size=SIZE_OF_FRAME):
 
 
 def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
-    cells = relight.DeskCells()
+    cells = relight.ReceiverCells()
     cells.share_stride = cells.bounced_stride = stride
     for name, values in (("share", share), ("bounced", bounced)):
         if values is not None:
@@ -229,7 +229,7 @@ def test_planes_leave_all_of_the_light_to_the_bit(device):
 
 @pytest.mark.parametrize("height", [0.06, 0.2], ids=["touching", "above"])
 def test_a_ball_takes_its_form_factor(device, height):
-    """White room; the ball reflects 0.2 of what it faces, which is white."""
+    """White environment; the ball reflects 0.2 of what it faces, which is white."""
     center, radius = (0.05, -0.02, height), 0.06
     share, surface = View(probes=[ball(center, radius, 0.2)]).share(list_texels(sky(1.0, (64, 128)))[2])
     expected = 1 - sphere_form_factor(POINTS, center, radius) * (1 - 0.2)
@@ -241,10 +241,12 @@ def test_a_ball_takes_its_form_factor(device, height):
 
 def test_a_hidden_lamp_leaves_what_grey_paper_sends(device):
     """One sample is all the light: hidden it leaves 0.5 x 0.7 of radiance 20, where nothing stands all of it."""
-    sample = records(RoomSample, {"direction": (0, 0, 1), "radiance": (20,) * 3, "measure": 0.1, "distance": 1e30})
-    share, _ = View((DESK, box((-0.04, -0.04, 0.2), (0.04, 0.04, 0.3))), room=0.7 * WHITE, camera=(0, 0, 0.15)).share(
-        sample
+    sample = records(
+        EnvironmentSample, {"direction": (0, 0, 1), "radiance": (20,) * 3, "measure": 0.1, "distance": 1e30}
     )
+    share, _ = View(
+        (DESK, box((-0.04, -0.04, 0.2), (0.04, 0.04, 0.3))), surroundings=0.7 * WHITE, camera=(0, 0, 0.15)
+    ).share(sample)
     inside = (np.abs(POINTS * 0.25)[..., :2] < 0.04).all(-1)[middles(4)]
     np.testing.assert_allclose(share[inside], GREY * 0.7 / 20, rtol=SUM_ERROR)
     assert (share[~inside] == 1.0).all()
@@ -275,11 +277,11 @@ def test_the_end_of_a_long_box_is_not_passed_by(device):
 
 def test_inside_a_box(device):
     """A camera and a desk in a box of grey paper: half of the light; the box's own faces are seen from behind."""
-    room = box((-3, -3, -1), (3, 3, 2))
-    share, surface = View((DESK, room)).share(draw(sky())[2])
+    surroundings = box((-3, -3, -1), (3, 3, 2))
+    share, surface = View((DESK, surroundings)).share(draw(sky())[2])
     assert (surface == 0).all()
     np.testing.assert_allclose(share, GREY, rtol=SUM_ERROR)
-    _, surface = View((room,)).share(draw(sky())[2])
+    _, surface = View((surroundings,)).share(draw(sky())[2])
     assert (surface == -1).all()
 
 
@@ -317,7 +319,7 @@ def brute_force(samples, size, boxes=(), balls=(), facing=1.0, stride=4):
         directions = np.where(near[:, None], way / distance[:, None], directions)
         measure = np.where(near, measure * (found["distance"].astype(float) / distance) ** 2, measure)
         distances = np.where(near, distance, np.inf)
-        out[index] = reference.share_room(
+        out[index] = reference.share_environment(
             points[index],
             np.array([0, 0, 1.0]),
             directions,
@@ -335,10 +337,10 @@ def test_share_matches_twin(device):
     """A sun, a lamp at a place, a box and a ball; the twin asks every sample at every cell."""
     environment = with_sun(9, 40, 300.0, np.float32(np.random.default_rng(1).uniform(0.2, 1, (32, 64, 3))))
     samples = draw(environment, 256)[2]
-    room_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
+    environment_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
     corners, (center, radius) = ((0.1, -0.1, 0), (0.22, 0.14, 0.08)), ((-0.1, 0.03, 0.05), 0.04)
     facing = np.array([0.6, 0.5, 0.4])
-    share, surface = View((DESK, box(*corners)), [ball(center, radius)], room=facing).share(samples)
+    share, surface = View((DESK, box(*corners)), [ball(center, radius)], surroundings=facing).share(samples)
     expected = brute_force(samples, SIZE_OF_FRAME, [corners], [(center, radius, 0.85)], facing)
     on_desk = surface == 0
     # A sample at an outline falls to either side in float32: a few cells of the desk differ by one of them.
@@ -353,7 +355,7 @@ def test_share_matches_twin(device):
 def test_threads_that_share_a_cell_find_the_same(device, parts):
     """First where a light shines, then where bounced light arrives as well; 100 samples are no multiple of 16."""
     samples = draw(with_sun(9, 40, 300.0))[2]
-    room_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
+    environment_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
     view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), [ball((-0.1, 0.03, 0.05), 0.04)], share=True)
     away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
     lit, dark = view.lights, records(Light, away)
@@ -401,7 +403,8 @@ def test_cells_that_are_found_already_stay_as_they_are(device, parts):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_share_agrees_with_random_directions(device, seed):
-    """An even room: the mean over 4,096 directions by the cosine, of what each meets, within five standard errors."""
+    """An even environment: the mean over 4,096 directions by the cosine, of what each meets, within five standard
+    errors."""
     rng = np.random.default_rng(seed)
     corners, (center, radius) = ((0.05, -0.1, 0), (0.2, 0.15, 0.2)), ((-0.1, 0.03, 0.05), 0.05)
     share, surface = View((DESK, box(*corners)), [ball(center, radius)]).share(list_texels(sky(1.0, (64, 128)))[2])
@@ -421,8 +424,8 @@ def test_share_agrees_with_random_directions(device, seed):
 def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
     trimesh.creation.box(bounds=[(0.1, -0.1, 0.0), (0.2, 0.1, 0.08)]).export(tmp_path / "box.ply")
     camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
-    things = Proxy("plane", size=(10.0, 10.0)), Proxy("mesh", file=tmp_path / "box.ply")
-    host = HostScene(Scene(camera, proxies=things), wp.get_device(device))
+    items = Proxy("plane", size=(10.0, 10.0)), Proxy("mesh", file=tmp_path / "box.ply")
+    host = HostScene(Scene(camera, proxies=items), wp.get_device(device))
     samples = draw(sky())[2]
     share, surface = View(scene=host.ray_scene).share(samples)
     expected, boxed = View((DESK, box((0.1, -0.1, 0), (0.2, 0.1, 0.08)))).share(samples)
@@ -439,7 +442,9 @@ def test_a_mesh_hides_as_the_box_that_it_is(device, tmp_path):
 def test_a_small_patch(device):
     """L A cos cos' / r^2."""
     at, normal, area = np.array([0.05, 0.02, 0.3]), np.array([0.96, 0.0, -0.28]), 1e-6
-    bounced, surface = View(room=0 * WHITE).gather(patches_of(at, normal, (0.5, 1.0, 2.0), area), patch_stride=48)
+    bounced, surface = View(surroundings=0 * WHITE).gather(
+        patches_of(at, normal, (0.5, 1.0, 2.0), area), patch_stride=48
+    )
     way = at - POINTS[middles(4)]
     r2 = (way**2).sum(-1)
     expected = area * way[..., 2] * np.maximum(-(way @ normal), 0) / r2**2
@@ -466,7 +471,7 @@ def test_at_the_edge_of_a_lit_strip(device):
 
 def test_nothing_receives_more_than_a_white_sky_of_its_radiance(device):
     """A patch as near as 1 mm, 100 times as large as it is far: pi L and no more, as a point it would give 10,000 L."""
-    bounced, _ = View(size=(5, 5), room=0 * WHITE).gather(
+    bounced, _ = View(size=(5, 5), surroundings=0 * WHITE).gather(
         patches_of((0, 0, 1e-3), (0, 0, -1), WHITE, 1e-2), patch_stride=5, stride=1
     )
     assert 0.99 * np.pi < bounced.max() <= np.pi * (1 + FLOAT_ERROR)
@@ -476,7 +481,7 @@ def test_nothing_receives_more_than_a_white_sky_of_its_radiance(device):
 def test_no_more_is_received_than_sent(device, height, area):
     """A patch of pi L A watts: from the frame, nearly all that a small one sees, comes nearly all."""
     patch = patches_of((0, 0, height), (0, 0, -1), WHITE, area)
-    bounced, _ = View(size=(96, 128), room=0 * WHITE).gather(patch, patch_stride=96, stride=1)
+    bounced, _ = View(size=(96, 128), surroundings=0 * WHITE).gather(patch, patch_stride=96, stride=1)
     received = bounced[..., 0].sum() * (CAMERA[2] / FOCAL) ** 2
     assert received <= np.pi * area
     if area < height**2:
@@ -491,7 +496,10 @@ def test_a_flat_surface_does_not_light_itself(device, seed):
     shift = np.array([60.0, -80.0, 0]) * (seed % 2)
     slab = {**shape(PLANE, shift, (5, 5, 0)), "rotation": turn}
     view = View(
-        (slab,), room=0 * WHITE, lights=[point(shift + np.array([0, 0, 0.3]), (50.0,) * 3)], camera=CAMERA + shift
+        (slab,),
+        surroundings=0 * WHITE,
+        lights=[point(shift + np.array([0, 0, 0.3]), (50.0,) * 3)],
+        camera=CAMERA + shift,
     )
     bounced, surface = view.gather(view.send(4))
     assert (surface == 0).all()
@@ -504,7 +512,7 @@ def test_gather_matches_twin(device):
     normals = rng.normal(size=(300, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     radiance, areas = rng.uniform(0, 1, (300, 3)), rng.uniform(1e-5, 1e-2, 300)
-    bounced, _ = View(room=0 * WHITE).gather(patches_of(positions, normals, radiance, areas), patch_stride=48)
+    bounced, _ = View(surroundings=0 * WHITE).gather(patches_of(positions, normals, radiance, areas), patch_stride=48)
     points = POINTS[middles(4)].reshape(-1, 3)
     up = np.broadcast_to((0, 0, 1.0), points.shape)
     expected = reference.gather_light(points, up, positions, normals, radiance * areas[:, None], areas)
@@ -513,17 +521,18 @@ def test_gather_matches_twin(device):
 
 
 def test_what_no_picture_shows_is_none(device):
-    """Over the room's light by less than 1 / 1024: nothing; in the dark every bit counts."""
+    """Over the environment by less than 1 / 1024: nothing; in the dark every bit counts."""
     patch = patches_of((0, 0, 0.3), (0, 0, -1), WHITE, 1e-4)
-    lit = View(room=0 * WHITE).gather(patch, patch_stride=48)[0]
-    kept = View(room=WHITE).gather(patch, patch_stride=48)[0]
-    limit = float(desk_cells.NEGLIGIBLE) * np.pi
+    lit = View(surroundings=0 * WHITE).gather(patch, patch_stride=48)[0]
+    kept = View(surroundings=WHITE).gather(patch, patch_stride=48)[0]
+    limit = float(receiver_cells.NEGLIGIBLE) * np.pi
     assert (lit > 0).all()
     assert (lit < 0.9 * limit).any()
     assert (kept[lit < 0.999 * limit] == 0).all()
     bright = patches_of((0, 0, 0.3), (0, 0, -1), 100 * WHITE, 1e-4)
     np.testing.assert_array_equal(
-        View(room=WHITE).gather(bright, patch_stride=48)[0], View(room=0 * WHITE).gather(bright, patch_stride=48)[0]
+        View(surroundings=WHITE).gather(bright, patch_stride=48)[0],
+        View(surroundings=0 * WHITE).gather(bright, patch_stride=48)[0],
     )
 
 
@@ -556,7 +565,7 @@ def test_lists_keep_the_order(device):
     values = np.zeros(areas.shape, np.dtype(Patch.numpy_dtype()))
     values["area"] = areas
     listed, count = wp.full(areas.shape, Patch(), dtype=Patch), wp.full(7, 99, dtype=wp.int32)
-    desk_cells.list_patches(wp.array(values, dtype=Patch), listed, count)
+    receiver_cells.list_patches(wp.array(values, dtype=Patch), listed, count)
     for row, found, number in zip(areas, listed.numpy()["area"], count.numpy(), strict=True):
         np.testing.assert_array_equal(found[:number], row[row > 0])
 
@@ -673,7 +682,7 @@ def full(view, samples=None, strides=(4, 4, 4), rows=None):
     share = share[0], wp.full(view.cells(strides[0]), 7, dtype=wp.int32)
     for band in rows or [None]:
         view.share(samples, strides[0], out=share, rows=band)
-    cells = relight.DeskCells()
+    cells = relight.ReceiverCells()
     cells.share, cells.share_surface, cells.share_stride = *share, strides[0]
     patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
     for band in rows or [None]:
@@ -723,8 +732,8 @@ def test_a_lit_floor_lights_the_wall_and_not_itself(device):
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])
 def test_any_size(device, size):
-    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    view = View((DESK, thing), [ball((0.15, 0, 0.03), 0.03)], size=size, share=True, bounced=True, **tilted())
+    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], size=size, share=True, bounced=True, **tilted())
     light, share, share_surface, bounced, surface = full(view, strides=(4, 8, 16))
     assert np.isfinite(light).all()
     assert ((share[share_surface >= 0] >= 0) & (share[share_surface >= 0] <= 1)).all()
@@ -733,8 +742,8 @@ def test_any_size(device, size):
 
 
 def test_bands_and_runs_give_the_same_bits(device):
-    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    view = View((DESK, thing), [ball((0.15, 0, 0.03), 0.03)], share=True, bounced=True, **tilted())
+    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], share=True, bounced=True, **tilted())
     once, again, bands = full(view), full(view), full(view, rows=[(0, 5), (5, 5), (5, 6), (6, 12)])
     for one, other, third in zip(once, again, bands, strict=True):
         assert one.tobytes() == other.tobytes() == third.tobytes()
@@ -746,7 +755,7 @@ def test_bands_and_runs_give_the_same_bits(device):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, -5.0, 1e38])
 @pytest.mark.parametrize("where", ["radiance", "irradiance"])
-def test_garbage_in_the_room(device, bad, where):
+def test_garbage_in_the_environment(device, bad, where):
     """Shares stay within 0..1, light finite and not negative."""
     samples = draw(sky())[2]
     irradiance = np.full((8, 16, 3), np.pi, np.float32)
@@ -755,10 +764,10 @@ def test_garbage_in_the_room(device, bad, where):
     else:
         values = samples.numpy()
         values["radiance"][7] = bad
-        samples = wp.array(values, dtype=RoomSample)
-    thing = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
+        samples = wp.array(values, dtype=EnvironmentSample)
+    item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
     probes = [ball((0.15, 0, 0.03), 0.03)]
-    view = View((DESK, thing), probes, irradiance=irradiance, share=True, bounced=True, **tilted())
+    view = View((DESK, item), probes, irradiance=irradiance, share=True, bounced=True, **tilted())
     light, share, known, bounced, surface = full(view, samples)
     assert ((share[known >= 0] >= 0) & (share[known >= 0] <= 1)).all()
     assert ((bounced[surface >= 0] >= 0) & np.isfinite(bounced[surface >= 0])).all()
@@ -777,13 +786,13 @@ def test_a_pixel_changes_only_what_its_patch_lights(device):
 
 # --- In the pipeline --------------------------------------------------------------------------------------------------
 
-RUNGS = ("bounce", "brute_force")
+METHODS = ("bounce", "brute_force")
 
 
-@pytest.mark.parametrize("rung", RUNGS)
-def test_eager_equals_replayed(device, rung):
+@pytest.mark.parametrize("method", METHODS)
+def test_eager_equals_replayed(device, method):
     pictures = frames(SIZE[1], SIZE[0])
-    with Rig(device, "relight", rung) as replayed, Rig(device, "relight", rung) as eager:
+    with Rig(device, "relight", method) as replayed, Rig(device, "relight", method) as eager:
         eager.pipeline._scheduler.run = eager.pipeline._scheduler._run_eager
         for name in ("noise", "noise", "white", "ramp", "noise"):
             np.testing.assert_array_equal(replayed.frame(pictures[name]), eager.frame(pictures[name]), err_msg=name)
@@ -792,11 +801,11 @@ def test_eager_equals_replayed(device, rung):
         assert eager.get("relight_bounced").max() > 0
 
 
-@pytest.mark.parametrize("rung", RUNGS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("rect", [(12, 20, 10, 30), (0, 36, 0, 48), (0, 5, 0, 48), (31, 36, 40, 48), (0, 0, 0, 0)])
-def test_nothing_of_an_earlier_frame_is_read(device, rung, rect):
+def test_nothing_of_an_earlier_frame_is_read(device, method, rect):
     """Cells and patches outside the rows that a frame's light reaches may hold anything."""
-    with Rig(device, "relight", rung) as rig:
+    with Rig(device, "relight", method) as rig:
         rig.frame(frames(SIZE[1], SIZE[0])["noise"])
         rig.set_params(light_rect=rect, direct_rect=rect)
         rig.pipeline._rects["light"] = rect
@@ -821,16 +830,16 @@ def test_nothing_of_an_earlier_frame_is_read(device, rung, rect):
 
 def test_which_proxies_face():
     camera = Camera(64, 48, FOCAL, FOCAL, 31.5, 23.5)
-    plane, thing = Proxy("plane", size=(1.0, 1.0)), Proxy("box", size=(0.1, 0.1, 0.1))
+    plane, item = Proxy("plane", size=(1.0, 1.0)), Proxy("box", size=(0.1, 0.1, 0.1))
     over = dataclasses.replace(plane, at=(0.0, 0.0, 0.5))
     ceiling, wall = (dataclasses.replace(over, rotate=(turn, 0.0, 0.0)) for turn in (180.0, 90.0))
     for proxies, expected in (
         ((plane,), False),
-        ((thing,), False),
+        ((item,), False),
         ((plane, over), False),
         ((plane, ceiling), True),
         ((plane, wall), True),
-        ((plane, thing), True),
-        ((thing, thing), True),
+        ((plane, item), True),
+        ((item, item), True),
     ):
         assert proxies_face(Scene(camera, proxies=proxies)) == expected

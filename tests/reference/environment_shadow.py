@@ -1,4 +1,4 @@
-"""Float64 twins of the room's samples and of the shadows that spheres cast on a plane under them."""
+"""Float64 twins of the environment's samples and of the shadows that spheres cast on a plane under them."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Lamps of the room that stand near: what surfaces away from the ball receive of them.
+"""Lamps of the environment that stand near: what surfaces away from the ball receive of them.
 
 The environment holds a lamp as the ball mirrors it to the camera, at a point c of its surface: direction d, distance D
 and power p, which is the irradiance of a surface at c that faces it. At a point x with normal n, the vector to the lamp
@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_ar.kernels.structs import RoomLamp
+from warp_ar.kernels.structs import Emitter
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,7 +44,7 @@ LEAST_TURN = wp.constant(wp.float32(1.0e-4))
 
 
 @wp.func
-def add_nearness(irradiance: wp.vec3, lamps: wp.array[RoomLamp], point: wp.vec3, normal: wp.vec3) -> wp.vec3:
+def add_nearness(irradiance: wp.vec3, lamps: wp.array[Emitter], point: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """Irradiance of the environment at a surface, with near lamps at their places; never negative."""
     result = irradiance
     for k in range(lamps.shape[0]):
@@ -60,7 +60,7 @@ def add_nearness(irradiance: wp.vec3, lamps: wp.array[RoomLamp], point: wp.vec3,
 
 
 @wp.func
-def turn_to_lamps(lamps: wp.array[RoomLamp], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
+def correct_parallax(lamps: wp.array[Emitter], point: wp.vec3, direction: wp.vec3) -> wp.vec3:
     """Unit direction in which the environment shows what is seen from a point along a unit direction."""
     spin = wp.vec3(0.0)
     weights = float(1.0)
