@@ -473,7 +473,8 @@ def _list_section(reports: Sequence[CaseReport]) -> str:
         "pixel: where methods approximate one quantity, the distance from the most exact; where they are models, "
         "the distance from the truth above that of the best. Grey: another method is no dearer and no worse everywhere."
         '</p><div class="card"><table><thead><tr><th>method</th><th style="text-align:left">what it does</th>'
-        f"<th>ms per frame</th><th>error</th><th>scenes</th></tr></thead><tbody>{''.join(body)}</tbody></table></div></section>"
+        "<th>ms per frame</th><th>error</th><th>scenes</th></tr></thead>"
+        f"<tbody>{''.join(body)}</tbody></table></div></section>"
     )
 
 
