@@ -197,7 +197,7 @@ def keys() -> Iterator[Key]:
         names = [name for own, name in _EXAMPLES if own == section.name]
         for name in names:
             unit, example, beside = _EXAMPLES[section.name, name]
-            meanings = [docs[name] for docs in map(field_docs, section.kinds) if name in docs]
+            meanings = [field_docs(kind)[name] for kind in section.kinds if name in field_docs(kind)]
             meaning = _MEANINGS.get((section.name, name)) or " / ".join(dict.fromkeys(meanings))
             yield Key(section.name, name, meaning, unit, _default(section, name), example, beside)
 
