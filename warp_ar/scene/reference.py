@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import functools
 import inspect
 import itertools
 from collections.abc import Iterator
@@ -175,7 +174,6 @@ _MEANINGS: Final[dict[tuple[str, str], str]] = {
 }
 
 
-@functools.cache
 def field_docs(kind: type[Any]) -> dict[str, str]:
     """Docstrings of a dataclass's fields: the strings that stand below them."""
     tree = ast.parse(inspect.getsource(inspect.getmodule(kind) or description))
