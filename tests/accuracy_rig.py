@@ -43,11 +43,11 @@ def report(case) -> case_report.CaseReport:
         np.clip(camera.astype(int) + rng.integers(0, add, camera.shape), 0, 255).astype(np.uint8) for add in (60, 5)
     ]
     rows = tuple(
-        sweep_module.Row(case.name, "diffuse", method, ms, ms + 3.0, error, flip, "last method", flip, flip, False)
+        sweep_module.Row(case.name, "irradiance", method, ms, ms + 3.0, error, flip, "last method", flip, flip, False)
         for method, ms, error, flip in (("top_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
     )
     wholes = tuple(
-        case_report.Whole(label, ms, flip, {"diffuse": "sh2"}, {index: image})
+        case_report.Whole(label, ms, flip, {"irradiance": "sh2"}, {index: image})
         for label, ms, flip, image in (
             ("paper", 10.0, 0.3, images[0]),
             (case_report.SAME_TIME, 9.0, 0.2, images[1]),
@@ -55,6 +55,6 @@ def report(case) -> case_report.CaseReport:
     )
     region = np.zeros(camera.shape[:2], bool)
     region[100:140, 60:90] = True
-    pictures = {("diffuse", "top_mip"): images[0], ("diffuse", "sh2"): images[1]}
+    pictures = {("irradiance", "top_mip"): images[0], ("irradiance", "sh2"): images[1]}
     named = dataclasses.replace(case, name="<made> & so on")
     return case_report.CaseReport(named, {index: images[1]}, rows, pictures, wholes, region)

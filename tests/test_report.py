@@ -26,6 +26,6 @@ def test_records_and_tables_hold_every_method(report):
 def test_cost_table_is_what_choices_read(report):
     made = report_module.make_cost_table([report, report], "cpu")
     errors = read_errors(json.loads(json.dumps(made)))
-    assert errors["diffuse"]["top_mip"] == pytest.approx(0.1)
-    assert errors["diffuse"]["sh2"] == 0.0
-    assert made["stage_errors"]["diffuse"] == {"top_mip": 0.3}
+    assert errors["irradiance"]["top_mip"] == pytest.approx(0.1)
+    assert errors["irradiance"]["sh2"] == 0.0
+    assert made["stage_errors"]["irradiance"] == {"top_mip": 0.3}

@@ -16,8 +16,8 @@ pytest.importorskip("flip_evaluator")
 
 
 def test_the_last_method_is_its_own_reference(case, device):
-    rows, pictures = sweep_module.sweep(case, setting("diffuse"), device, PRESETS["low"])
-    assert [row.method for row in rows] == list(setting("diffuse").methods)
+    rows, pictures = sweep_module.sweep(case, setting("irradiance"), device, PRESETS["low"])
+    assert [row.method for row in rows] == list(setting("irradiance").methods)
     assert rows[-1].stage_error == ArrayError(0.0, 0.0, 0.0)
     assert rows[-1].flip == 0.0
     assert rows[-1].error == 0.0

@@ -44,12 +44,12 @@ def test_presets_alone(tmp_path, monkeypatch, device):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["desk", "--presets", "--stage", "diffuse"], "--presets --stage diffuse: expected one of both"),
+        (["desk", "--presets", "--stage", "irradiance"], "--presets --stage irradiance: expected one of both"),
         (["desk", "--frames", "0"], "--frames 0: expected 1 or more"),
         (["desk", "--shrink", "0"], "--shrink 0: expected 1 or more"),
         (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),
         (["--truth", "TMP"], "expected folders with scene_"),
-        (["darken", "--stage", "diffuse", "--frames", "1"], "nothing to turn"),
+        (["darken", "--stage", "irradiance", "--frames", "1"], "nothing to turn"),
     ],
 )
 def test_bad_usage_is_one_line(arguments, message, tmp_path, capsys):

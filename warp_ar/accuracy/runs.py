@@ -33,8 +33,8 @@ NORMALS = (24, 48)
 _OUTPUT = {
     "unwrap": "probe_radiance",
     "recover": "environment",
-    "diffuse": "irradiance",
-    "specular": "specular_levels",
+    "irradiance": "irradiance",
+    "prefilter": "prefilter_levels",
     "relight": "physical_added",
     "environment_shadow": "shadow_ratio",
     "shade": "virtual",
