@@ -127,6 +127,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     table.add_column("median ms", justify="right")
     table.add_column("what it does, or why it is left out")
     summaries = {stage.name: stage.summary for stage in STAGES} | {TRACK: "finds the marker and the camera's pose"}
+    methods = {stage.name: stage.method_for(plan.features) for stage, _ in plan.stages} | {TRACK: "default"}
     for name in stage_names(plan):
         milliseconds = log.median_ms(name) if log is not None else None
         skipped = log.skipped(name) if log is not None else 0
@@ -134,7 +135,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
             "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
         )
         time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
-        table.add_row(name, plan.request.quality.method(name), state, time_text, summaries[name])
+        table.add_row(name, methods[name], state, time_text, summaries[name])
     for name, reason in left_out(plan):
         table.add_row(name, "", "left out", "", reason, style="dim")
     Console().print(table)
