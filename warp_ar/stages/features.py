@@ -97,7 +97,7 @@ def find_features(request: Request) -> Features:
     relight_method = quality.method("relight") if environment else FLAT
     lit_by_both = bool(environment and scene.lights and scene.proxies)
     emitters = recovered and quality.method("recover") == "shading"
-    by_series = quality.method("diffuse") == "sh2"
+    by_series = quality.method("irradiance") == "sh2"
     return Features(
         request=request,
         environment=environment,

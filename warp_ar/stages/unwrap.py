@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import probe
+from warp_ar.kernels import unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -63,12 +63,12 @@ class Unwrap(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Corners first, then texels between them."""
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
-        config = probe.ProjectConfig(tuple(kinds))
+        config = unwrap.ProjectConfig(tuple(kinds))
         method = self.method
         height = self.request.quality.environment_height
 
         def project(rows: Rows | None) -> None:
-            probe.project_corners(
+            unwrap.project_corners(
                 arrays["params"],
                 arrays["probes"],
                 arrays["rays"],
@@ -79,7 +79,7 @@ class Unwrap(Stage):
             )
 
         def gather(rows: Rows | None) -> None:
-            probe.gather_probe(
+            unwrap.gather_probe(
                 arrays["frame"],
                 arrays["decode"],
                 arrays["probes"],

@@ -20,7 +20,7 @@ def distant_light_reads(features: Features) -> tuple[str, ...]:
     """Resources that hold the forms of the environment that objects reflect."""
     config = features.distant
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
-    specular = ("specular_levels",) if config.specular else ()
+    specular = ("prefilter_levels",) if config.specular else ()
     return (*diffuse, *specular, *(("lamps",) if config.lamps and (diffuse or specular) else ()))
 
 
@@ -42,7 +42,7 @@ def make_distant_light(features: Features, arrays: Arrays, stage: str) -> Distan
     if config.diffuse == "map":
         distant.irradiance_map = arrays["irradiance_map"]
     if config.specular:
-        distant.levels = arrays["specular_levels"]
+        distant.levels = arrays["prefilter_levels"]
     distant.level_height = features.request.quality.environment_height
     if METALLIC_ROUGHNESS in config.models:
         table = arrays[f"{stage}_dfg"]
