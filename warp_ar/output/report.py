@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
 
 import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.accuracy.budget import AUTO, AutoPipeline
 from warp_ar.engine.graph import Plan
-from warp_ar.engine.pipeline import TRACK, Pipeline, Result
+from warp_ar.engine.pipeline import TRACK, Result
 from warp_ar.scene import Pose
 from warp_ar.stages import STAGES
 
@@ -20,10 +20,19 @@ from warp_ar.stages import STAGES
 WARM_UP = 3
 
 
+@runtime_checkable
+class Choosing(Protocol):
+    """One that changes its quality while frames run, to keep a budget."""
+
+    def status(self) -> Mapping[str, Any]:
+        """What it chose, and why."""
+
+
 class RunLog:
     """Collects poses and timings, frame by frame."""
 
-    def __init__(self, pipeline: Pipeline | AutoPipeline) -> None:
+    def __init__(self, pipeline: Any) -> None:
+        """``pipeline`` is a ``Pipeline``, or what holds one and changes it (``Choosing``)."""
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: dict[str, int] = {}
@@ -90,9 +99,9 @@ class RunLog:
         return {
             "device": str(self._pipeline.device),
             "warp": wp.__version__,
-            "quality": AUTO if isinstance(self._pipeline, AutoPipeline) else self._pipeline.quality.name,
+            "quality": "auto" if isinstance(self._pipeline, Choosing) else self._pipeline.quality.name,
             "fps": round(self.fps, 3),
-            **({"auto": self._pipeline.status()} if isinstance(self._pipeline, AutoPipeline) else {}),
+            **({"auto": self._pipeline.status()} if isinstance(self._pipeline, Choosing) else {}),
             "steps_ms": {name: round(milliseconds, 3) for name, milliseconds in self.steps().items()},
             "critical_path": max(self.steps(), key=self.steps().__getitem__, default=None),
             "frames": self._frames,
