@@ -16,12 +16,12 @@ from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Parser
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import WarpArError
+from warp_ar.input.exposures import bracket_ratios
 from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Request
-from warp_ar.stages.numerics import NUMERICS
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.stages.request import Request
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -48,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return EXIT_DONE
         scene = load_scene(options.scene)
         size = (scene.camera.width, scene.camera.height)
-        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size)))
+        exposures = bracket_ratios((scene.source and scene.source.exposures) or ())
+        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
     except WarpArError as error:
         print(f"warp_ar: {error}", file=sys.stderr)
         return EXIT_USAGE
@@ -59,7 +60,7 @@ def print_numerics() -> None:
     """Print the error model: per stage its precision, expected and measured worst error, and rows of hard cases."""
     table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
     for stage in STAGES:
-        numbers = NUMERICS[stage.name]
+        numbers = stage.numerics
         rows = " ".join(map(str, numbers.rows))
         table.add_row(stage.name, numbers.precision, numbers.expected, f"{numbers.measured:.1e}", rows)
     Console(width=None if sys.stdout.isatty() else 160).print(table)
