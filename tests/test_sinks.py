@@ -373,6 +373,27 @@ def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: 
 
 
 @pytest.mark.parametrize("name", VIDEOS)
+def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name: str) -> None:
+    # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
+    outcomes = set()
+    for free in range(96, 136, 4):
+        (disk / name).unlink(missing_ok=True)
+        (disk / "other").write_bytes(bytes((400 - free) * 1024))
+        rng, told = np.random.default_rng(0), ""
+        try:
+            with open_sink(disk / name, fps=24) as sink:
+                for _ in range(60):
+                    sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        except SinkError as error:
+            told = str(error)
+        assert len(levels(disk / name)) == sink.written
+        assert (sink.written == 60) == (told == "") or "finished" in told
+        outcomes.add(sink.written)
+    assert 60 in outcomes
+    assert len(outcomes) > 1
+
+
+@pytest.mark.parametrize("name", VIDEOS)
 def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
     with open_sink(disk / name, fps=24) as sink:
         for level in range(20):

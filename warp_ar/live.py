@@ -232,7 +232,7 @@ def serve_page(options: argparse.Namespace) -> int:
         )
 
     def ready(address: Address) -> None:
-        print(f"warp_ar: {scene.name} is at {address.url} (Ctrl-C ends it)", flush=True)
+        print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
         if not options.no_browser and local and _has_display():
