@@ -24,8 +24,8 @@ from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 from warp_ar.stages.request import Request
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out."
     )
@@ -36,8 +36,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
     )
     parser.add_argument("--numerics", action="store_true", help="print every stage's precision and worst error instead")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
     try:
-        options: argparse.Namespace = parser.parse_args(arguments)
+        options = make_parser().parse_args(arguments)
         if options.numerics:
             print_numerics()
             return EXIT_DONE
