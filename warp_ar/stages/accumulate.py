@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import accumulate
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.bracket import UNWRAPPED, merges
 from warp_ar.stages.unwrap import NO_PROBE
@@ -40,7 +40,7 @@ class Accumulate(Stage):
             "environment_radiance": ArraySpec(shape, wp.vec3),
             "environment_confidence": ArraySpec(shape, wp.float32),
             "environment_clipped": ArraySpec(shape, wp.vec3),
-            "accumulate_change": ArraySpec(environment.change_shape(*shape), wp.vec2),
+            "accumulate_change": ArraySpec(accumulate.change_shape(*shape), wp.vec2),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -49,7 +49,7 @@ class Accumulate(Stage):
         radiance, confidence, clipped = (arrays[name] for name in self.wiring.reads[:3])
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_change(
+            accumulate.measure_change(
                 radiance,
                 confidence,
                 arrays["environment_radiance"],
@@ -59,7 +59,7 @@ class Accumulate(Stage):
             )
 
         def accumulate(rows: Rows | None) -> None:
-            environment.accumulate_environment(
+            accumulate.accumulate_environment(
                 radiance,
                 confidence,
                 clipped,
