@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import change
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
@@ -201,7 +201,7 @@ class Recover(Stage):
             )
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_difference(
+            change.measure_difference(
                 arrays["environment"], arrays["recover_published"], arrays["recover_difference"], rows=rows
             )
 
