@@ -117,7 +117,7 @@ def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tup
             for method, line in own.items()
             if method != "brute_force"
         ]
-    frame = next(line["base_ms"] for line in lines if line.get("setting") == "diffuse")
+    frame = next(line["base_ms"] for line in lines if line.get("setting") == "irradiance")
     return (
         pareto_front(method_costs),
         frame,

@@ -103,7 +103,7 @@ def lobe_offset(height: int, level: int) -> int:
 
 
 def lobe_texels(height: int) -> int:
-    """Texels of all levels together: the length of ``specular_levels``."""
+    """Texels of all levels together: the length of ``prefilter_levels``."""
     return lobe_offset(height, lobe_count(height))
 
 

@@ -222,7 +222,7 @@ def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
         for index in range(60):  # the light settles, the tracker too
             result = pipeline(frames[0], time_seconds=index / 30)
         skipped = {name for name, timing in result.stages.items() if timing.skipped}
-    assert {"diffuse", "specular", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
+    assert {"irradiance", "prefilter", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
     assert "accumulate" not in skipped, "accumulation follows the clock"
 
 
@@ -256,7 +256,7 @@ def test_only_what_the_scene_calls_for_is_planned() -> None:
     assert stages(objects=(), lights=(), exposure=off) == set()
     assert stages(objects=(), lights=()) == {"expose"}, "plain scaling asks for nothing else"
     assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
-    assert {"shade", "visibility", "diffuse", "specular"}.isdisjoint(stages(objects=(), exposure=off))
+    assert {"shade", "visibility", "irradiance", "prefilter"}.isdisjoint(stages(objects=(), exposure=off))
     assert surroundings.isdisjoint(stages(probes=())), "without a ball there is no environment light to capture"
 
 

@@ -50,8 +50,8 @@ def case(frames: Frames) -> tradeoff.Case:
 
 
 def test_the_last_method_is_its_own_reference(case, device):
-    rows, pictures = tradeoff.sweep(case, setting("diffuse"), device, PRESETS["low"])
-    assert [row.method for row in rows] == list(setting("diffuse").methods)
+    rows, pictures = tradeoff.sweep(case, setting("irradiance"), device, PRESETS["low"])
+    assert [row.method for row in rows] == list(setting("irradiance").methods)
     assert rows[-1].stage_error == ArrayError(0.0, 0.0, 0.0)
     assert rows[-1].flip == 0.0
     assert rows[-1].error == 0.0
@@ -62,7 +62,7 @@ def test_the_last_method_is_its_own_reference(case, device):
 
 def test_sparse_runs_keep_the_light(case, device):
     """Frames before the one that counts may run at another quality without a trace."""
-    other = PRESETS["low"].with_methods(diffuse="sh4")
+    other = PRESETS["low"].with_methods(irradiance="sh4")
     full = tradeoff.run(case, PRESETS["low"], device, setting("recover"))
     sparse = tradeoff.run(case, PRESETS["low"], device, setting("recover"), between=other)
     np.testing.assert_array_equal(sparse.output, full.output)
@@ -141,11 +141,11 @@ def report(case) -> tradeoff.CaseReport:
         np.clip(camera.astype(int) + rng.integers(0, add, camera.shape), 0, 255).astype(np.uint8) for add in (60, 5)
     ]
     rows = tuple(
-        tradeoff.Row(case.name, "diffuse", method, ms, ms + 3.0, error, flip, "last method", flip, flip, False)
+        tradeoff.Row(case.name, "irradiance", method, ms, ms + 3.0, error, flip, "last method", flip, flip, False)
         for method, ms, error, flip in (("top_mip", 0.5, ArrayError(0.3, 2.0, -0.01), 0.1), ("sh2", 1.0, None, 0.0))
     )
     wholes = tuple(
-        tradeoff.Whole(label, ms, flip, {"diffuse": "sh2"}, {index: image})
+        tradeoff.Whole(label, ms, flip, {"irradiance": "sh2"}, {index: image})
         for label, ms, flip, image in (
             ("paper", 10.0, 0.3, images[0]),
             ("ours in the paper's time", 9.0, 0.2, images[1]),
@@ -153,7 +153,7 @@ def report(case) -> tradeoff.CaseReport:
     )
     region = np.zeros(camera.shape[:2], bool)
     region[100:140, 60:90] = True
-    pictures = {("diffuse", "top_mip"): images[0], ("diffuse", "sh2"): images[1]}
+    pictures = {("irradiance", "top_mip"): images[0], ("irradiance", "sh2"): images[1]}
     named = dataclasses.replace(case, name="<made> & so on")
     return tradeoff.CaseReport(named, {index: images[1]}, rows, pictures, wholes, region)
 
@@ -233,18 +233,18 @@ def test_records_and_tables_hold_every_method(report):
 def test_price_list_is_what_ladder_reads(report):
     made = tradeoff.make_cost_table([report, report], tradeoff.wp.get_device("cpu"))
     errors = read_errors(json.loads(json.dumps(made)))
-    assert errors["diffuse"]["top_mip"] == pytest.approx(0.1)
-    assert errors["diffuse"]["sh2"] == 0.0
-    assert made["stage_errors"]["diffuse"] == {"top_mip": 0.3}
+    assert errors["irradiance"]["top_mip"] == pytest.approx(0.1)
+    assert errors["irradiance"]["sh2"] == 0.0
+    assert made["stage_errors"]["irradiance"] == {"top_mip": 0.3}
 
 
 def test_choices_are_made_from_the_committed_list(report, monkeypatch):
     """Not from the errors of the case that they are scored on, unless there is no list yet."""
-    listed = {"diffuse": {"top_mip": 0.7, "sh2": 0.2}}
+    listed = {"irradiance": {"top_mip": 0.7, "sh2": 0.2}}
     monkeypatch.setattr(tradeoff, "load_errors", lambda: listed)
     assert tradeoff.listed_errors(report.rows) is listed
-    monkeypatch.setattr(tradeoff, "load_errors", lambda: {"diffuse": {"top_mip": 0.0, "sh2": 0.0}})
-    assert tradeoff.listed_errors(report.rows) == {"diffuse": {"top_mip": 0.1, "sh2": 0.0}}
+    monkeypatch.setattr(tradeoff, "load_errors", lambda: {"irradiance": {"top_mip": 0.0, "sh2": 0.0}})
+    assert tradeoff.listed_errors(report.rows) == {"irradiance": {"top_mip": 0.1, "sh2": 0.0}}
 
 
 # ------------------------------------------------------------------------------------------------------------ truth
@@ -281,7 +281,7 @@ def test_scaling_codes_is_scaling_radiance(scale):
 
 def test_in_turn_is_alone(case, device):
     """Qualities that run in turn do not touch each other."""
-    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(diffuse="sh4")}
+    qualities = {"a": PRESETS["low"], "b": PRESETS["low"].with_methods(irradiance="sh4")}
     times, images = tradeoff.run_in_turn(case, qualities, device, time.perf_counter)
     for label, quality in qualities.items():
         alone = tradeoff.run(case, quality, device)
@@ -322,12 +322,12 @@ def test_presets_alone(tmp_path, monkeypatch, device):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["desk", "--presets", "--stage", "diffuse"], "--presets --stage diffuse: expected one of both"),
+        (["desk", "--presets", "--stage", "irradiance"], "--presets --stage irradiance: expected one of both"),
         (["desk", "--frames", "0"], "--frames 0: expected 1 or more"),
         (["desk", "--shrink", "0"], "--shrink 0: expected 1 or more"),
         (["desk", "--stage", "colour", "--frames", "1"], "--stage colour: expected one of environment_height"),
         (["--truth", "TMP"], "expected folders with scene_"),
-        (["darken", "--stage", "diffuse", "--frames", "1"], "nothing to turn"),
+        (["darken", "--stage", "irradiance", "--frames", "1"], "nothing to turn"),
     ],
 )
 def test_bad_usage_is_one_line(arguments, message, tmp_path, capsys):

@@ -89,7 +89,7 @@ GOOD = [
     {"type": "show", "part": "object", "index": 1, "on": False},
     {"type": "effect", "name": "relief", "on": False},
     {"type": "quality", "name": "low"},
-    {"type": "method", "stage": "specular", "method": "box_mip"},
+    {"type": "method", "stage": "prefilter", "method": "box_mip"},
     {"type": "budget", "ms": 20.0},
     {"type": "budget", "ms": None},
     {"type": "compare", "other": "camera"},
@@ -276,9 +276,9 @@ def test_effects_are_left_out_of_what_is_shown() -> None:
     assert wanted.with_effect("exposure", False).shown_scene().exposure == Exposure()
     assert wanted.with_effect("relief", False).shown_quality().method("relight") == "flat"
     assert wanted.with_effect("environment_shadow", False).shown_quality().method("environment_shadow") == "none"
-    assert wanted.with_method("specular", "box_mip").shown_quality().method("specular") == "box_mip"
-    assert wanted.with_method("specular", "box_mip").with_method("specular", "").shown_quality() == PRESETS["low"]
-    for stage, method in [("specular", "best"), ("nonsense", "box_mip")]:
+    assert wanted.with_method("prefilter", "box_mip").shown_quality().method("prefilter") == "box_mip"
+    assert wanted.with_method("prefilter", "box_mip").with_method("prefilter", "").shown_quality() == PRESETS["low"]
+    for stage, method in [("prefilter", "best"), ("nonsense", "box_mip")]:
         with pytest.raises(UsageError):
             wanted.with_method(stage, method)
 
@@ -346,7 +346,7 @@ def test_what_the_dial_offers_is_what_it_chooses(known_errors: None, tmp_path: P
         errors = [choice["error"] for choice in record["choices"]]
         assert times == sorted(times)
         assert errors == sorted(errors, reverse=True)
-        assert "brute_force" in record["ladders"]["diffuse"]
+        assert "brute_force" in record["ladders"]["irradiance"]
         assert "reference" not in record["presets"], "brute force is not measured"
         for budget in (0.1, 18.0, 25.0, 500.0):
             setting.switch(budget)
@@ -377,7 +377,7 @@ def test_the_dial_turns_the_picture(known_errors: None, monkeypatch: pytest.Monk
         assert running.host.wanted().quality.name == "auto"
         running.edit(type="budget", ms=1.0)
         running.until(lambda: running.host.state_message()["auto"]["expected_error"] > best["expected_error"])
-        running.until(lambda: dict(running.host.wanted().quality.methods)["diffuse"] == "top_mip")
+        running.until(lambda: dict(running.host.wanted().quality.methods)["irradiance"] == "top_mip")
         # Undoing edits is not undoing the dial; choosing a preset is.
         running.edit(type="reset")
         assert running.host.wanted().quality.name == "auto"
@@ -571,7 +571,7 @@ def test_pipelines_are_built_while_frames_flow(device: str) -> None:
         running.edit(type="compare", other="paper")
         for index in range(6):
             running.edit(type="effect", name=("objects", "lights", "exposure")[index % 3], on=index > 2)
-            running.edit(type="method", stage="diffuse", method=("sh4", "sh2")[index % 2])
+            running.edit(type="method", stage="irradiance", method=("sh4", "sh2")[index % 2])
             running.until(lambda: not running.host.state_message()["building"])
             assert running.next().image.any()
         assert not [message for message in running.messages if message["type"] == "notice"]

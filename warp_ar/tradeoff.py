@@ -118,8 +118,8 @@ another map happen to meet, and how its energy is shared among lamps, would hide
 _OUTPUT = {
     "unwrap": "probe_radiance",
     "recover": "environment",
-    "diffuse": "irradiance",
-    "specular": "specular_levels",
+    "irradiance": "irradiance",
+    "prefilter": "prefilter_levels",
     "relight": "physical_added",
     "environment_shadow": "shadow_ratio",
     "shade": "virtual",

@@ -22,7 +22,7 @@ LIGHTS = generators.lights()
 WHOLE = (0, SIZE[1], 0, SIZE[0])
 SHADING = [
     (stage, method)
-    for stage in ("shade", "environment_shadow", "object_light", "mirror_ball")
+    for stage in ("shade", "environment_shadow", "near_field", "mirror_ball")
     for method in METHODS[stage]
 ]
 LIT = [(stage, method) for stage in ("relight", "shade", "mirror_ball") for method in METHODS[stage]]

@@ -55,12 +55,12 @@ _CONVERGING = (
     "edge_samples",
     "light_shadow",
     "unwrap",
-    "diffuse",
-    "specular",
+    "irradiance",
+    "prefilter",
     "environment_shadow",
     "mirror_ball",
 )
-_LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "environment_samples")
+_LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "irradiance", "prefilter", "environment_samples")
 SETTINGS: tuple[Setting, ...] = (
     Setting("environment_height", ("32", "64", "128", "256"), _LIGHT),
     Setting("edge_samples", ("1", "4", "16"), ("relight", "shade")),
@@ -90,7 +90,7 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
             "shading": "shared among lamps as shading and shadows in the frame tell",
         },
     ),
-    "diffuse": (
+    "irradiance": (
         "light that matt surfaces receive",
         {
             "top_mip": "a 4x8 map (the paper)",
@@ -100,7 +100,7 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
             "brute_force": "every texel for every direction",
         },
     ),
-    "specular": (
+    "prefilter": (
         "light that glossy surfaces reflect",
         {
             "box_mip": "a pyramid of means (the paper)",
@@ -159,8 +159,8 @@ NUMBERS = ("environment_height", "edge_samples")
 
 
 _LIGHT_ONLY = {
-    "diffuse": "sh2",
-    "specular": "box_mip",
+    "irradiance": "sh2",
+    "prefilter": "box_mip",
     "relight": "paper",
     "environment_shadow": "none",
     "shade": "environment",

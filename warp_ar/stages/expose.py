@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.kernels import exposure
+from warp_ar.kernels import expose
 from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import composite_config, exposes, layer_names, layers_of
@@ -49,17 +49,17 @@ class Expose(Stage):
             "expose_codes": ArraySpec((256,), wp.vec3ub),
         }
         if self.request.scene.exposure.scale == "auto":
-            strips = -(-height // exposure.AUTO_STRIDE)
-            specs["expose_levels"] = ArraySpec((strips, exposure.LEVELS), wp.int32)
+            strips = -(-height // expose.AUTO_STRIDE)
+            specs["expose_levels"] = ArraySpec((strips, expose.LEVELS), wp.int32)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
         composed = composite_config(layer_names(self.request))
-        config = exposure.ExposureConfig(
+        config = expose.ExposeConfig(
             "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
         )
-        exposure.make_expose_kernel(config, by_warps(device, self.request.size[0]))
+        expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         layers = layers_of(arrays)
@@ -68,16 +68,16 @@ class Expose(Stage):
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                exposure.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
+                expose.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
-            passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
+            passes.append(Pass(lambda rows: expose.adapt_scale(params, levels, scale)))
         else:
-            passes.append(Pass(lambda rows: exposure.read_scale(params, scale)))
-        passes.append(Pass(lambda rows: exposure.expose_codes(decode, encode, scale, codes)))
+            passes.append(Pass(lambda rows: expose.read_scale(params, scale)))
+        passes.append(Pass(lambda rows: expose.expose_codes(decode, encode, scale, codes)))
 
         def launch(rows: Rows | None) -> None:
-            exposure.expose(
+            expose.expose(
                 config,
                 params,
                 frame,

@@ -70,14 +70,14 @@ NUMERICS: dict[str, StageNumerics] = {
         0.0031,
         (4, 6, 10, 17),
     ),
-    "diffuse": StageNumerics(
+    "irradiance": StageNumerics(
         "float32 sums of sums over tables made in float64",
         1e-3,
         "a texel's spread by its second moment; sums 1e-6",
         0.00051,
         (4, 5, 6, 17, 18),
     ),
-    "specular": StageNumerics(
+    "prefilter": StageNumerics(
         "float32; versines, weights made in float64",
         5e-5,
         "sums over the map, powers with exponents up to 1e3",
@@ -115,7 +115,7 @@ NUMERICS: dict[str, StageNumerics] = {
         5.4e-06,
         (5, 6, 8, 13, 14, 17, 18),
     ),
-    "object_light": StageNumerics(
+    "near_field": StageNumerics(
         "float32",
         6e-2,
         "two rays of 64 at the picture's border see the desk or do not",

@@ -23,7 +23,7 @@ def distant_light_config(request: Request) -> DistantLightConfig:
     materials = [item.material for item in scene.objects]
     diffuse: DiffuseForm = "none"
     if scene.probes and any(map(reflects_diffusely, materials)):
-        diffuse = "sh" if request.quality.method("diffuse") == "sh2" else "map"
+        diffuse = "sh" if request.quality.method("irradiance") == "sh2" else "map"
     return DistantLightConfig(
         trace=trace_config(scene),
         models=tuple(sorted(set(map(material_model, materials)))),
@@ -38,7 +38,7 @@ def distant_light_config(request: Request) -> DistantLightConfig:
 def distant_light_reads(config: DistantLightConfig) -> tuple[str, ...]:
     """Resources that hold the forms of a ``DistantLightConfig``."""
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
-    specular = ("specular_levels",) if config.specular else ()
+    specular = ("prefilter_levels",) if config.specular else ()
     return (*diffuse, *specular, *(("lamps",) if config.lamps and (diffuse or specular) else ()))
 
 
@@ -55,7 +55,7 @@ def make_distant_light(config: DistantLightConfig, request: Request, arrays: Arr
     if config.diffuse == "map":
         distant.irradiance_map = arrays["irradiance_map"]
     if config.specular:
-        distant.levels = arrays["specular_levels"]
+        distant.levels = arrays["prefilter_levels"]
     distant.level_height = request.quality.environment_height
     if METALLIC_ROUGHNESS in config.models:
         table = arrays[f"{stage}_dfg"]

@@ -249,4 +249,4 @@ def relight_method(request: Request) -> str:
 
 def irradiance_name(request: Request) -> str:
     """Resource that holds the environment's irradiance at this quality."""
-    return "irradiance_sh" if request.quality.method("diffuse") == "sh2" else "irradiance_map"
+    return "irradiance_sh" if request.quality.method("irradiance") == "sh2" else "irradiance_map"

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import probe
+from warp_ar.kernels import unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 
@@ -20,7 +20,7 @@ class Unwrap(Stage):
     """Light of the current frame, with how far each direction can be trusted and how much of it clips."""
 
     name: ClassVar[str] = "unwrap"
-    methods: ClassVar[tuple[str, ...]] = probe.METHODS
+    methods: ClassVar[tuple[str, ...]] = unwrap.METHODS
     summary: ClassVar[str] = "reads the light off the mirror ball, exactly for a camera nearby"
 
     @classmethod
@@ -44,13 +44,13 @@ class Unwrap(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Corners first, then texels between them."""
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
-        config = probe.ProjectConfig(tuple(kinds))
+        config = unwrap.ProjectConfig(tuple(kinds))
         method = self.request.quality.method(self.name)
         method = method if method != "default" else "area"
         height = self.request.quality.environment_height
 
         def project(rows: Rows | None) -> None:
-            probe.project_corners(
+            unwrap.project_corners(
                 arrays["params"],
                 arrays["probes"],
                 arrays["rays"],
@@ -61,7 +61,7 @@ class Unwrap(Stage):
             )
 
         def gather(rows: Rows | None) -> None:
-            probe.gather_probe(
+            unwrap.gather_probe(
                 arrays["frame"],
                 arrays["decode"],
                 arrays["probes"],

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import object_light
+from warp_ar.kernels import near_field
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.ray_scene import reflects_glossily
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
@@ -27,7 +27,7 @@ MIRROR_SAMPLES = 4
 
 
 def lobe_width(material: Material) -> float:
-    """Width alpha of what a material mirrors, as ``kernels.object_light`` has it."""
+    """Width alpha of what a material mirrors, as ``kernels.near_field`` has it."""
     match material:
         case MetallicRoughnessMaterial():
             return material.roughness**2
@@ -36,10 +36,10 @@ def lobe_width(material: Material) -> float:
     return 0.0
 
 
-class ObjectLight(Stage):
+class NearField(Stage):
     """Light that reaches objects past each other, and what they mirror of the desk and of each other."""
 
-    name: ClassVar[str] = "object_light"
+    name: ClassVar[str] = "near_field"
     methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "what of the desk and of other objects virtual objects show"
 
@@ -65,10 +65,10 @@ class ObjectLight(Stage):
         config = distant_light_config(self.request)
         specs = {}
         if config.diffuse != "none":
-            specs["object_irradiance"] = specs["object_light_irradiance"] = ArraySpec((height, width), wp.vec3)
+            specs["object_irradiance"] = specs["near_field_irradiance"] = ArraySpec((height, width), wp.vec3)
         if config.specular:
-            specs["object_light_passed"] = ArraySpec((height, width), wp.vec4)
-            specs["object_mirrored"] = specs["object_light_mirrored"] = ArraySpec((height, width), wp.vec4)
+            specs["near_field_passed"] = ArraySpec((height, width), wp.vec4)
+            specs["object_mirrored"] = specs["near_field_mirrored"] = ArraySpec((height, width), wp.vec4)
         return {**specs, **distant_light_arrays(config, self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -76,8 +76,8 @@ class ObjectLight(Stage):
         layers = layer_names(self.request)
         forms = distant_light_config(self.request)
         widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
-        sharp = [width < object_light.SHARP_ALPHA for width in widths]
-        config = object_light.ObjectLightConfig(
+        sharp = [width < near_field.SHARP_ALPHA for width in widths]
+        config = near_field.NearFieldConfig(
             forms,
             COUNT,
             0 if all(sharp) else LOBE_COUNT,
@@ -86,8 +86,8 @@ class ObjectLight(Stage):
             "shadow_ratio" in layers,
             "physical_added" in layers,
         )
-        object_light.make_object_light_kernel(config)
-        object_light.make_filter_kernel(config)
+        near_field.make_near_field_kernel(config)
+        near_field.make_filter_kernel(config)
         distant = make_distant_light(forms, self.request, arrays, self.name)
         inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
         inputs += [arrays.get("shadow_ratio"), arrays.get("physical_added"), arrays["ray_scene"], distant]
@@ -96,14 +96,14 @@ class ObjectLight(Stage):
             arrays["hit_object"],
             arrays["hits"],
         ]
-        raw = [arrays.get(f"object_light_{name}") for name in ("irradiance", "mirrored", "passed")]
+        raw = [arrays.get(f"near_field_{name}") for name in ("irradiance", "mirrored", "passed")]
         out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
 
         def estimate(rows: Rows | None) -> None:
-            object_light.light_objects(config, *inputs, *raw, rows=rows)
+            near_field.light_objects(config, *inputs, *raw, rows=rows)
 
         def average(rows: Rows | None) -> None:
-            object_light.filter_object_light(
+            near_field.filter_near_field(
                 config,
                 arrays["params"],
                 arrays["ray_scene"],

@@ -1,4 +1,4 @@
-"""Specular: the environment as glossy materials reflect it, from mirror to matt."""
+"""The environment as glossy materials reflect it, from mirror to matt."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def scene_lobe(scene: Scene) -> prefilter.Lobe:
     return "phong" if kinds == {PhongMaterial} else "ggx"
 
 
-class Specular(Stage):
+class Prefilter(Stage):
     """Prefilters the environment with lobes of growing width."""
 
-    name: ClassVar[str] = "specular"
+    name: ClassVar[str] = "prefilter"
     methods: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis32", "fis128", "brute_force")
     summary: ClassVar[str] = "the environment filtered for glossy reflection, level by level"
 
@@ -42,7 +42,7 @@ class Specular(Stage):
             return LeftOut("the scene has no probe, so the environment is unknown")
         if not glossy_materials(request.scene):
             return LeftOut("no virtual object has a glossy material")
-        return Wiring(("environment",), ("specular_levels",))
+        return Wiring(("environment",), ("prefilter_levels",))
 
     @property
     def _mirrors_only(self) -> bool:
@@ -52,27 +52,27 @@ class Specular(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
-        specs = {"specular_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
+        specs = {"prefilter_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
         if self.method != "brute_force" and not self._mirrors_only:
-            specs["specular_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
-            specs["specular_blocks_done"] = ArraySpec((1,), wp.int32)
+            specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
+            specs["prefilter_blocks_done"] = ArraySpec((1,), wp.int32)
         if self.method not in ("box_mip", "brute_force") and not self._mirrors_only:
-            specs["specular_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
-            specs["specular_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
+            specs["prefilter_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
+            specs["prefilter_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Launches of the method; weights and samples are made here, once."""
         height = self.request.quality.environment_height
         lobe = scene_lobe(self.request.scene)
-        environment, levels = arrays["environment"], arrays["specular_levels"]
+        environment, levels = arrays["environment"], arrays["prefilter_levels"]
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]
         if self.method == "brute_force":
             return [Pass(lambda rows: prefilter.integrate_lobes(environment, lobe, levels, rows=rows), rows=texels)]
 
-        box, blocks_done = arrays["specular_pyramid"], arrays["specular_blocks_done"]
+        box, blocks_done = arrays["prefilter_pyramid"], arrays["prefilter_blocks_done"]
         isotropic = self.method != "box_mip"
         passes = [Pass(lambda rows: pyramid.build_pyramid(environment, blocks_done, box, isotropic=isotropic))]
         if self.method in ("box_mip", "energy_mip"):
@@ -90,7 +90,7 @@ class Specular(Stage):
                 Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels)
             )
         if isotropic:
-            row_energy, energy = arrays["specular_row_energy"], arrays["specular_energy"]
+            row_energy, energy = arrays["prefilter_row_energy"], arrays["prefilter_energy"]
             passes += [
                 Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
                 Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),

@@ -1,4 +1,4 @@
-"""Diffuse: the irradiance of every orientation from the environment."""
+"""The irradiance of every orientation from the environment."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 %
 CLUSTERS = (10, 20)
 
 
-def diffuse_output(quality: Quality) -> str:
+def irradiance_output(quality: Quality) -> str:
     """Name of the resource that holds irradiance at this quality: ``irradiance_sh`` or ``irradiance_map``."""
-    return "irradiance_sh" if quality.method(Diffuse.name) == "sh2" else "irradiance_map"
+    return "irradiance_sh" if quality.method(Irradiance.name) == "sh2" else "irradiance_map"
 
 
-class Diffuse(Stage):
+class Irradiance(Stage):
     """Filters the environment with the cosine lobe."""
 
-    name: ClassVar[str] = "diffuse"
+    name: ClassVar[str] = "irradiance"
     methods: ClassVar[tuple[str, ...]] = ("top_mip", "sh2", "sh4", "clusters", "brute_force")
     summary: ClassVar[str] = "irradiance of the environment for every orientation"
 
@@ -38,7 +38,7 @@ class Diffuse(Stage):
             return LeftOut("the scene has no probe, so the environment is unknown")
         if not scene.lights and not any(reflects_diffusely(item.material) for item in scene.objects):
             return LeftOut("no virtual object is diffuse, and no virtual light asks for the desk's reflectance")
-        return Wiring(("environment",), (diffuse_output(request.quality),))
+        return Wiring(("environment",), (irradiance_output(request.quality),))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance, and sums on the way to it."""
@@ -47,17 +47,17 @@ class Diffuse(Stage):
             size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
             return {"irradiance_map": ArraySpec(size, wp.vec3)}
         if self.method == "sh2":
-            return {"irradiance_sh": ArraySpec((9,), wp.vec3), "diffuse_row_sums": ArraySpec((height, 5), wp.vec3)}
+            return {"irradiance_sh": ArraySpec((9,), wp.vec3), "irradiance_row_sums": ArraySpec((height, 5), wp.vec3)}
         if self.method == "sh4":
             return {
                 "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
-                "diffuse_row_sums": ArraySpec((height, 9), wp.vec3),
-                "diffuse_coefficients": ArraySpec((25,), wp.vec3),
+                "irradiance_row_sums": ArraySpec((height, 9), wp.vec3),
+                "irradiance_coefficients": ArraySpec((25,), wp.vec3),
             }
         count = math.prod(self._blocks())
         return {
             "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
-            "diffuse_clusters": ArraySpec((count,), irradiance.Cluster, irradiance.Cluster()),
+            "irradiance_clusters": ArraySpec((count,), irradiance.Cluster, irradiance.Cluster()),
         }
 
     def _blocks(self) -> tuple[int, int]:
@@ -75,20 +75,20 @@ class Diffuse(Stage):
         if self.method in ("sh2", "sh4"):
             order = 2 if self.method == "sh2" else 4
             tables = irradiance.make_sh_tables(*environment.shape, order, device)
-            sums = arrays["diffuse_row_sums"]
+            sums = arrays["irradiance_row_sums"]
             if self.method == "sh2":
                 sh = arrays["irradiance_sh"]
                 return [
                     Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, sh)),
                     Pass(lambda rows: irradiance.window_sh(sh)),
                 ]
-            coefficients, target = arrays["diffuse_coefficients"], arrays["irradiance_map"]
+            coefficients, target = arrays["irradiance_coefficients"], arrays["irradiance_map"]
             return [
                 Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, coefficients)),
                 Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
             ]
         blocks = self._blocks()
-        clusters, target = arrays["diffuse_clusters"], arrays["irradiance_map"]
+        clusters, target = arrays["irradiance_clusters"], arrays["irradiance_map"]
         return [
             Pass(lambda rows: irradiance.gather_clusters(environment, blocks, clusters, rows=rows), rows=blocks[0]),
             Pass(lambda rows: irradiance.sum_clusters(clusters, target, rows=rows), rows=MAP_SIZE[0]),

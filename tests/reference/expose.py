@@ -1,4 +1,4 @@
-"""Float64 twins of ``warp_ar.kernels.exposure``."""
+"""Float64 twins of ``warp_ar.kernels.expose``."""
 
 import numpy as np
 

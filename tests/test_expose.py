@@ -5,9 +5,9 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import composite as reference_composite
-from tests.reference import exposure as reference
+from tests.reference import expose as reference
 from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params, tables
-from warp_ar.kernels import color, exposure, summed_area
+from warp_ar.kernels import color, expose, summed_area
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
 BIN = 2.0**0.125
@@ -25,11 +25,11 @@ def run(
     table, scale_array = wp.zeros(shape, wp.uint32), wp.zeros(1, wp.float32)
     codes, image = wp.zeros(256, wp.vec3ub), wp.zeros(shape, wp.vec3ub)
     summed_area.sum_area(frame_array, table)
-    exposure.read_scale(params, scale_array)
-    exposure.expose_codes(decode, encode, scale_array, codes)
+    expose.read_scale(params, scale_array)
+    expose.expose_codes(decode, encode, scale_array, codes)
     over = make_arrays(virtual, added, ratio, mirrored)
-    config = exposure.ExposureConfig(method, layers)
-    exposure.expose(
+    config = expose.ExposeConfig(method, layers)
+    expose.expose(
         config,
         params,
         frame_array,
@@ -61,13 +61,13 @@ def disc(size=96, radius=20):
 
 
 @pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
-@pytest.mark.parametrize("method", exposure.METHODS)
+@pytest.mark.parametrize("method", expose.METHODS)
 def test_scale_one_is_the_identity(device, method, transfer):
     frame = make_layers()[0]
     np.testing.assert_array_equal(run(frame, 1.0, method, transfer=transfer), frame)
 
 
-@pytest.mark.parametrize("method", exposure.METHODS)
+@pytest.mark.parametrize("method", expose.METHODS)
 @pytest.mark.parametrize("frame", [disc(), np.full((20, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
 def test_scale_zero_is_black(device, frame, method):
     np.testing.assert_array_equal(run(frame, 0.0, method), 0)
@@ -83,7 +83,7 @@ def test_plain_scales_linear_light(device, scale):
 @pytest.mark.parametrize("scale", SCALES)
 def test_box_matches_twin(device, scale):
     frame = np.concatenate([disc(48, 10), make_layers(2)[0][:, :40].repeat(2, 0)], axis=1)
-    gains = reference.gains(frame, scale, exposure.largest_box(frame.shape[0]))
+    gains = reference.gains(frame, scale, expose.largest_box(frame.shape[0]))
     exact = reference_color.encoded_srgb(np.clip(linear(frame) * gains[..., None] * np.float64(scale), 0.0, 1.0))
     check_error("expose", run(frame, scale), exact)
 
@@ -91,7 +91,7 @@ def test_box_matches_twin(device, scale):
 @pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])
 def test_layers_are_composed_before_they_are_exposed(device, scale):
     frame, *layers = make_layers(3)
-    gains = reference.gains(frame, scale, exposure.largest_box(H))
+    gains = reference.gains(frame, scale, expose.largest_box(H))
     total = reference_composite.compose(linear(frame) * gains[..., None], *layers)
     exact = reference_color.encoded_srgb(np.clip(scale * total, 0.0, 1.0))
     check_error("expose", run(frame, scale, "box", CONFIGS[15], *layers), exact)
@@ -170,14 +170,14 @@ def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=Non
     frame = np.zeros((*added.shape[:2], 3), np.uint8) if frame is None else frame
     height, width = frame.shape[:2]
     params = make_params(*4 * [(0, height, 0, width)], time_step=time_step)
-    levels = wp.zeros((-(-height // exposure.AUTO_STRIDE), exposure.LEVELS), wp.int32)
+    levels = wp.zeros((-(-height // expose.AUTO_STRIDE), expose.LEVELS), wp.int32)
     scale = wp.array([start], dtype=wp.float32)
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
-    layers = exposure.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
+    layers = expose.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
     for _ in range(frames):
         over = make_arrays(virtual, added, None, mirrored)
-        exposure.count_levels(layers, params, frame, decode, over, levels)
-        exposure.adapt_scale(params, levels, scale)
+        expose.count_levels(layers, params, frame, decode, over, levels)
+        expose.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
 
 
@@ -200,7 +200,7 @@ def test_auto_does_nothing_without_need(device, level):
 
 def test_auto_is_bounded_and_finite(device):
     for level in (1e6, np.inf, np.nan):
-        assert auto(spot(level)) in (1.0, exposure.MIN_AUTO_SCALE)
+        assert auto(spot(level)) in (1.0, expose.MIN_AUTO_SCALE)
 
 
 def test_auto_ignores_what_darkening_cannot_help(device):

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from bench.common import measure, paired_ratio, report
-from warp_ar.kernels import probe
+from warp_ar.kernels import unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import BOX, FrameParams, Material, Probe, RayScene, Shape, Texture
 
@@ -64,7 +64,7 @@ def run_case(case: Case, device: Any) -> None:
     ball["radius"], ball["reflectance"] = RADIUS, 0.85
     x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
     picture = np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
-    scene, config = empty_scene(case.boxes), probe.ProjectConfig((BOX,) if case.boxes else ())
+    scene, config = empty_scene(case.boxes), unwrap.ProjectConfig((BOX,) if case.boxes else ())
     params, ball = wp.array(params, dtype=FrameParams), wp.array(ball, dtype=Probe)
     rays = wp.array(np.stack([x, y], -1) / focal, dtype=wp.vec2)
     table, frame = wp.array(decode_table("srgb"), dtype=wp.vec3), wp.array(picture, dtype=wp.vec3ub)
@@ -74,10 +74,10 @@ def run_case(case: Case, device: Any) -> None:
     confidence = wp.zeros(shape, dtype=wp.float32)
 
     def project() -> None:
-        probe.project_corners(params, ball, rays, scene, corners, config=config)
+        unwrap.project_corners(params, ball, rays, scene, corners, config=config)
 
     def gather() -> None:
-        probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method=case.method)
+        unwrap.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method=case.method)
 
     # Right before fast: the map of a constant frame is constant.
     frame.fill_(wp.vec3ub(100, 100, 100))

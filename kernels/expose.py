@@ -66,9 +66,9 @@ from warp_ar.kernels.codes import (
 from warp_ar.kernels.color import decode, encode
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.probe import is_clipped
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.summed_area import box_mean
+from warp_ar.kernels.unwrap import is_clipped
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,7 +101,7 @@ NO_LAYERS = CompositeConfig()
 
 
 @dataclasses.dataclass(frozen=True)
-class ExposureConfig:
+class ExposeConfig:
     """What is compiled into the kernel."""
 
     method: Literal["plain", "box", "declipped"] = "plain"
@@ -235,7 +235,7 @@ def adapt_scale_kernel(
 
 
 @functools.cache
-def make_expose_kernel(config: ExposureConfig, warps: bool) -> wp.Kernel:
+def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
     """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
     read_layers = make_read_layers(config.layers)
 
@@ -385,7 +385,7 @@ def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array
 
 
 def expose(
-    config: ExposureConfig,
+    config: ExposeConfig,
     params: wp.array,
     frame: wp.array,
     decode_table: wp.array,

@@ -87,7 +87,7 @@ SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
 
 
 @dataclasses.dataclass(frozen=True)
-class ObjectLightConfig:
+class NearFieldConfig:
     """What is compiled into the kernel."""
 
     distant: DistantLightConfig
@@ -130,7 +130,7 @@ def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float
 
 
 @functools.cache
-def make_look_near(config: ObjectLightConfig) -> wp.Function:
+def make_look_near(config: NearFieldConfig) -> wp.Function:
     """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
 
     The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
@@ -179,7 +179,7 @@ def make_look_near(config: ObjectLightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
+def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
     """``mirror_pixel(...) -> vec4``: mean radiance that a mirror shows within a pixel, and 1; zero if no ray leaves it.
 
     Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
@@ -226,10 +226,10 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
                         FAR,
                     )
                     if shown[3] <= 0.0:
-                        distant = distant_mirrored(
+                        beyond = distant_mirrored(
                             distant, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
                         )
-                        shown = wp.vec4(distant[0], distant[1], distant[2], 1.0)
+                        shown = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
                     total += shown
         return total / wp.max(total[3], 1.0)
 
@@ -237,7 +237,7 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
+def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     look_near = make_look_near(config)
     surface_at = make_surface(config.distant.models, config.distant.textures)
@@ -246,7 +246,7 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
     lobes = config.lobe_count
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
-    def object_light_kernel(
+    def near_field_kernel(
         row_start: wp.int32,
         # In:
         params: wp.array[FrameParams],
@@ -377,24 +377,24 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                 turned = outward
                                 if wp.static(config.distant.lamps):
                                     turned = correct_parallax(distant.lamps, hit.point, outward)
-                                distant = sample_levels(distant.levels, turned, level, distant.level_height)
-                                missed = (1.0 - near[3]) * distant
-                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
+                                beyond = sample_levels(distant.levels, turned, level, distant.level_height)
+                                missed = (1.0 - near[3]) * beyond
+                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
                 mirrored = mirrored / wp.max(leaving, 1.0)
                 passed = passed / wp.max(leaving, 1.0)
             mirrored_out[i, j] = mirrored
             passed_out[i, j] = passed
 
-    return object_light_kernel
+    return near_field_kernel
 
 
 @functools.cache
-def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
-    """Kernel of ``filter_object_light``."""
+def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
+    """Kernel of ``filter_near_field``."""
     side = config.side
 
     @wp.kernel(module="unique", enable_backward=False)
-    def filter_object_light_kernel(
+    def filter_near_field_kernel(
         row_start: wp.int32,
         # In:
         params: wp.array[FrameParams],
@@ -453,11 +453,11 @@ def make_filter_kernel(config: ObjectLightConfig) -> wp.Kernel:
             near[3] = 1.0 - left
             mirrored_out[i, j] = near
 
-    return filter_object_light_kernel
+    return filter_near_field_kernel
 
 
 def light_objects(
-    config: ObjectLightConfig,
+    config: NearFieldConfig,
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     frame: wp.array2d[wp.vec3ub],
@@ -498,7 +498,7 @@ def light_objects(
     """
     stride = 0 if samples is None else samples.shape[0] // config.side**2
     launch_rows(
-        make_object_light_kernel(config),
+        make_near_field_kernel(config),
         rays.shape,
         [
             params,
@@ -520,8 +520,8 @@ def light_objects(
     )
 
 
-def filter_object_light(
-    config: ObjectLightConfig,
+def filter_near_field(
+    config: NearFieldConfig,
     params: wp.array[FrameParams],
     scene: RayScene,
     hit_object: wp.array2d[wp.int32],

@@ -6,12 +6,12 @@ import pytest
 import warp as wp
 
 from tests.error_model import check_error
-from tests.reference import object_light as reference
+from tests.reference import near_field as reference
 from tests.test_composite import tables
 from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import object_light, shade
+from warp_ar.kernels import near_field, shade
 from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
@@ -50,7 +50,7 @@ def run(
     )
     # As the stage has it: what no material needs is not compiled.
     lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
-    config = object_light.ObjectLightConfig(forms, COUNT, lobes, samples, SIDE, ratio is not None, added is not None)
+    config = near_field.NearFieldConfig(forms, COUNT, lobes, samples, SIDE, ratio is not None, added is not None)
     params = records(
         FrameParams,
         {
@@ -81,7 +81,7 @@ def run(
     frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
     irradiance, mirrored, passed = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4), wp.zeros((H, W), wp.vec4)
     layers = [None if layer is None else wp.array(layer, dtype=wp.vec3) for layer in (ratio, added)]
-    object_light.light_objects(
+    near_field.light_objects(
         config,
         params,
         rays,
@@ -101,7 +101,7 @@ def run(
     if filtered:
         raw = irradiance, mirrored, passed
         irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
-        object_light.filter_object_light(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
+        near_field.filter_near_field(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
     return irradiance.numpy(), mirrored.numpy(), hit_object.numpy(), hits.numpy(), drawn
 
 
@@ -137,7 +137,7 @@ def test_matches_the_twin(device, code):
         found_here.append(irradiance[row, column, 0])
         expected_here.append(expected)
     assert len(found_here) > 10
-    check_error("object_light", found_here, expected_here)
+    check_error("near_field", found_here, expected_here)
 
 
 def test_dark_desk_darkens_the_flanks_not_the_top(device):
@@ -239,8 +239,8 @@ def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
 @wp.kernel(enable_backward=False)
 def _width_kernel(cosine: wp.array[wp.float32], alpha: wp.float32, exponent: wp.float32, out: wp.array2d[wp.float32]):
     i = wp.tid()
-    out[0, i] = object_light.ggx_ray_width(cosine[i], alpha)
-    out[1, i] = object_light.phong_ray_width(cosine[i], exponent, alpha)
+    out[0, i] = near_field.ggx_ray_width(cosine[i], alpha)
+    out[1, i] = near_field.phong_ray_width(cosine[i], exponent, alpha)
 
 
 def test_share_follows_the_light(device):
@@ -260,14 +260,14 @@ def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rec
     forms = DistantLightConfig(
         TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False
     )
-    config = object_light.ObjectLightConfig(forms, COUNT, 4, 1, SIDE, False, False)
+    config = near_field.NearFieldConfig(forms, COUNT, 4, 1, SIDE, False, False)
     scene = RayScene()
     scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
     scene.materials = records(Material, *[{"model": model, "base_texture": -1} for model in models])
     hits = np.zeros(found.shape, np.dtype(Hit.numpy_dtype()))
     hits["normal"] = normals
     outputs = wp.zeros((height, width), wp.vec3), wp.zeros((height, width), wp.vec4)
-    object_light.filter_object_light(
+    near_field.filter_near_field(
         config,
         records(FrameParams, {"object_rect": rect or (0, height, 0, width)}),
         scene,
@@ -357,7 +357,7 @@ def test_stage_follows_the_method_of_shade():
     for method, expected in (("environment", False), ("one_bounce", True)):
         quality = PRESETS["medium"].with_methods(shade=method)
         plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
-        assert ("object_light" in {stage.name for stage, _ in plan.stages}) == expected
+        assert ("near_field" in {stage.name for stage, _ in plan.stages}) == expected
     bare = dataclasses.replace(scene, objects=())
     plan = make_plan(Request(bare, quality, (scene.camera.width, scene.camera.height)))
-    assert "no virtual object" in dict(plan.left_out)["object_light"]
+    assert "no virtual object" in dict(plan.left_out)["near_field"]

@@ -7,7 +7,7 @@ import warp as wp
 
 from bench.bench_composite import H, W, frame_and_layers
 from bench.common import measure, report
-from warp_ar.kernels import composite, exposure, summed_area
+from warp_ar.kernels import composite, expose, summed_area
 
 LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.CompositeConfig(virtual=True, added=True)))
 
@@ -24,13 +24,13 @@ def main(device: str) -> None:
     summed_area.sum_area(frame, table)
     for name, layers in LAYERS:
         contenders = {}
-        for method in exposure.METHODS:
+        for method in expose.METHODS:
 
-            def call(config: exposure.ExposureConfig = exposure.ExposureConfig(method, layers)) -> None:  # noqa: B008
-                exposure.read_scale(params, scale)
-                exposure.expose_codes(decode, encode, scale, codes)
+            def call(config: expose.ExposeConfig = expose.ExposeConfig(method, layers)) -> None:  # noqa: B008
+                expose.read_scale(params, scale)
+                expose.expose_codes(decode, encode, scale, codes)
                 inputs = (params, frame, decode, encode, over, table, scale, codes, image)
-                exposure.expose(config, *inputs, declipped=declipped)
+                expose.expose(config, *inputs, declipped=declipped)
 
             call()
             if not layers.virtual:  # black stays black, nothing that was not clipped brightens

@@ -7,8 +7,8 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.reference import latlong as latlong_reference
-from tests.reference import probe as reference
-from warp_ar.kernels import environment, probe
+from tests.reference import unwrap as reference
+from warp_ar.kernels import environment, unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import (
     BOX,
@@ -75,12 +75,12 @@ def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
     kinds = tuple(sorted({shape["kind"] for shape in shapes})) if kinds is None else kinds
     corners = wp.zeros((height + 1, 2 * height + 1, len(balls)), dtype=wp.vec3)
     rays = wp.array(view.rays().astype(np.float32), dtype=wp.vec2)
-    config = probe.ProjectConfig(kinds)
-    probe.project_corners(make_params(view), make_probes(balls), rays, make_scene(shapes), corners, config=config)
+    config = unwrap.ProjectConfig(kinds)
+    unwrap.project_corners(make_params(view), make_probes(balls), rays, make_scene(shapes), corners, config=config)
     return corners
 
 
-def unwrap(
+def unwrapped(
     view, frame, balls=(BALL,), *, method="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
 ):
     corners = project(view, balls, shapes, kinds, height)
@@ -90,7 +90,7 @@ def unwrap(
     table = wp.array(decode_table(transfer), dtype=wp.vec3)
     frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
     for band in rows or [None]:
-        probe.gather_probe(
+        unwrap.gather_probe(
             frame, table, make_probes(balls), corners, radiance, confidence, clipped, method=method, rows=band
         )
     return radiance.numpy(), confidence.numpy(), clipped.numpy()
@@ -113,18 +113,18 @@ def smooth_light(d):
 @wp.kernel(enable_backward=False)
 def normal_kernel(distance: wp.array[wp.float32], psi: wp.array[wp.vec2], normal_out: wp.array[wp.vec2]):
     i = wp.tid()
-    normal_out[i] = probe.reflecting_normal(distance[i], psi[i][0], psi[i][1])
+    normal_out[i] = unwrap.reflecting_normal(distance[i], psi[i][0], psi[i][1])
 
 
 # ---- closed form ----
 
 
-@pytest.mark.parametrize("method", probe.METHODS)
+@pytest.mark.parametrize("method", unwrap.METHODS)
 @pytest.mark.parametrize("code", [1, 90, 255])
 def test_furnace_to_the_bit(device, method, code):
     """A constant frame is a constant environment, exactly, whatever was seen how well."""
     view = look(0.4)
-    radiance, confidence, _ = unwrap(view, constant_frame(view, code), method=method)
+    radiance, confidence, _ = unwrapped(view, constant_frame(view, code), method=method)
     expected = decode_table("srgb")[code] / np.float32(REFLECTANCE)
     seen = confidence > 0
     assert (confidence[seen] < 0.5).any()
@@ -157,7 +157,7 @@ def test_straight_back_and_blind(device):
     np.testing.assert_allclose(corners[HEIGHT // 2, HEIGHT, :2], view.principal, atol=PIXEL)
     d = latlong_reference.directions(HEIGHT, 2 * HEIGHT)
     angle = np.arccos(np.clip(d @ [1.0, 0.0, 0.0], -1, 1))
-    _, confidence, _ = unwrap(view, constant_frame(view, 100), [ball])
+    _, confidence, _ = unwrapped(view, constant_frame(view, 100), [ball])
     blind = angle > reference.blind_angle(0.5 / 0.035)
     assert blind.sum() > 0
     assert (confidence[blind] == 0).all()
@@ -183,20 +183,20 @@ def test_corners_match_twin(device, distortion):
     check_error("unwrap", got[~blind], expected[~blind])
 
 
-@pytest.mark.parametrize("method", probe.METHODS)
+@pytest.mark.parametrize("method", unwrap.METHODS)
 def test_gather_matches_twin(device, method):
     """On noise, which forgives no wrong pixel. A sample exactly between two pixels may go to either in ``nearest``."""
     view = look(0.35, size=(200, 150), focal=280.0)
     frame = np.random.default_rng(6).integers(0, 256, (150, 200, 3)).astype(np.uint8)
-    got = unwrap(view, frame, method=method, height=16, transfer="linear")
+    got = unwrapped(view, frame, method=method, height=16, transfer="linear")
     expected = reference.gather(
         frame,
         decode_table("linear"),
         REFLECTANCE,
         reference.corners(view, CENTER, RADIUS, 16),
         method,
-        probe.RIM_START,
-        probe.RIM_WIDTH,
+        unwrap.RIM_START,
+        unwrap.RIM_WIDTH,
     )
     agree = np.abs(got[0] - expected[0]).max(-1) < SAMPLE
     assert agree.mean() > 0.999
@@ -210,8 +210,8 @@ def test_gather_matches_twin(device, method):
 def test_bands_equal_the_whole(device):
     view = look(0.35)
     frame = np.random.default_rng(7).integers(0, 256, (240, 320, 3)).astype(np.uint8)
-    whole = unwrap(view, frame)
-    bands = unwrap(view, frame, rows=[(0, 5), (5, 6), (6, HEIGHT)])
+    whole = unwrapped(view, frame)
+    bands = unwrapped(view, frame, rows=[(0, 5), (5, 6), (6, HEIGHT)])
     assert all((a == b).all() for a, b in zip(whole, bands, strict=True))
 
 
@@ -228,13 +228,13 @@ def test_specialised_equals_general(device):
 
 
 @pytest.mark.parametrize("distance", [0.15, 0.5, 2.0])
-@pytest.mark.parametrize("method", probe.METHODS)
+@pytest.mark.parametrize("method", unwrap.METHODS)
 def test_ramp_is_where_it_belongs(device, method, distance):
     """Hard cases 2 and 4: seam, poles and perspective. One texel of shift would be 0.035, an orthographic map 0.06 at
     0.15 m."""
     view = look(distance, focal=min(0.8 * 110 * distance / RADIUS, 900.0), size=(400, 400))
     frame = encode(reference.render(view, [BALL], smooth_light, lambda d: np.ones_like(d)))
-    radiance, confidence, _ = unwrap(view, frame, method=method, transfer="linear")
+    radiance, confidence, _ = unwrapped(view, frame, method=method, transfer="linear")
     expected = smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT))
     sure = confidence > 0.5
     assert sure.mean() > 0.6
@@ -268,8 +268,8 @@ def test_nothing_of_the_background_bleeds_in(device, distance, background, shift
     )
     center = true.principal
     tracked = look(distance, focal=500.0, principal=(center[0] + shift[0], center[1] + shift[1]))
-    for method in probe.METHODS:
-        radiance, confidence, _ = unwrap(tracked, frame, method=method, transfer="linear")
+    for method in unwrap.METHODS:
+        radiance, confidence, _ = unwrapped(tracked, frame, method=method, transfer="linear")
         seen = confidence > 0
         assert seen.mean() > 0.7
         assert np.ptp(radiance[seen], axis=0).max() == 0.0
@@ -283,8 +283,8 @@ def test_light_is_a_mean_over_the_footprint(device):
     frame = np.repeat(checker[..., None], 3, -1)
     ball = (CENTER, RADIUS, (1.0, 1.0, 1.0))
     spread = {}
-    for method in probe.METHODS:
-        radiance, confidence, clipped = unwrap(view, frame, [ball], method=method, transfer="linear", height=16)
+    for method in unwrap.METHODS:
+        radiance, confidence, clipped = unwrapped(view, frame, [ball], method=method, transfer="linear", height=16)
         sure = (confidence > 0.9) & (np.abs(np.arange(16) - 7.5) < 6)[:, None]
         spread[method] = radiance[sure].std()
         assert clipped[sure].mean() == pytest.approx(0.5, abs=0.06)
@@ -303,8 +303,8 @@ def test_partly_outside_the_frame(device):
     centre, _ = view.project([CENTER])
     cut = reference.View(view.position, CENTER, principal=(float(view.principal[0] - centre[0, 0]), view.principal[1]))
     frame = encode(reference.render(cut, [BALL], smooth_light, lambda d: np.ones_like(d)))
-    radiance, confidence, _ = unwrap(cut, frame, transfer="linear")
-    whole = unwrap(view, encode(reference.render(view, [BALL], smooth_light, np.ones_like)), transfer="linear")[1]
+    radiance, confidence, _ = unwrapped(cut, frame, transfer="linear")
+    whole = unwrapped(view, encode(reference.render(view, [BALL], smooth_light, np.ones_like)), transfer="linear")[1]
     assert 0.35 < (confidence > 0.5).sum() / (whole > 0.5).sum() < 0.55
     error = np.abs(radiance - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[confidence > 0.5]
     assert error.max() < 0.03
@@ -319,7 +319,7 @@ def test_camera_where_it_cannot_see_a_ball(device, position):
     confidence."""
     view = look(0.4)
     view.position = np.array(position)
-    radiance, confidence, clipped = unwrap(view, constant_frame(view, 200))
+    radiance, confidence, clipped = unwrapped(view, constant_frame(view, 200))
     assert np.isfinite(radiance).all()
     assert np.isfinite(clipped).all()
     assert (confidence == 0).all()
@@ -328,14 +328,14 @@ def test_camera_where_it_cannot_see_a_ball(device, position):
 def test_ball_behind_the_camera(device):
     view = look(0.4)
     view.rotation = view.rotation * [1, -1, -1]
-    _, confidence, _ = unwrap(view, constant_frame(view, 200))
+    _, confidence, _ = unwrapped(view, constant_frame(view, 200))
     assert (confidence == 0).all()
 
 
 def test_near_plane(device):
     """Hard case 3: a camera one millimetre off the ball sees a small cap of it, and says so in finite numbers."""
     view = reference.View((0.036, 0.0, 0.0), (0.0, 0.0, 0.0))
-    radiance, confidence, _ = unwrap(view, constant_frame(view, 90), [((0.0, 0.0, 0.0), 0.035, (1.0, 1.0, 1.0))])
+    radiance, confidence, _ = unwrapped(view, constant_frame(view, 90), [((0.0, 0.0, 0.0), 0.035, (1.0, 1.0, 1.0))])
     assert np.isfinite(radiance).all()
     assert (radiance[confidence > 0] == decode_table("srgb")[90]).all()
     assert (confidence > 0.9).any()
@@ -345,7 +345,7 @@ def test_a_ball_eight_pixels_across(device):
     """Hard case 3: little is known, and what is known is right."""
     view = look(2.0, focal=4.0 * 2.0 / RADIUS)
     frame = encode(reference.render(view, [BALL], smooth_light, np.ones_like, samples=8))
-    radiance, confidence, _ = unwrap(view, frame, transfer="linear")
+    radiance, confidence, _ = unwrapped(view, frame, transfer="linear")
     seen = confidence > 0
     assert 0.05 < seen.mean() < 0.4
     assert confidence.max() < 0.7
@@ -423,8 +423,8 @@ def test_hidden_by_a_proxy(device, kind):
     pixels, _ = view.project(corners)
     hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
     frame = cv2.fillConvexPoly(frame.copy(), hull, (255, 255, 255), cv2.LINE_AA, 4)
-    free = unwrap(view, frame, transfer="linear")
-    radiance, confidence, _ = unwrap(view, frame, shapes=[shape], transfer="linear")
+    free = unwrapped(view, frame, transfer="linear")
+    radiance, confidence, _ = unwrapped(view, frame, shapes=[shape], transfer="linear")
     seen = confidence > 0
     grey = free[0][(free[1] > 0.9)].min(0)
     assert free[0][free[1] > 0].max() > 1.0  # it does stand in the way
@@ -438,7 +438,7 @@ def test_what_stands_behind_or_carries_the_ball_hides_nothing(device):
     table = {"kind": PLANE, "position": (0.0, 0.0, 0.0), "extent": (1.0, 1.0, 0.0)}
     behind = {"kind": BOX, "position": (0.1, 0.1, 0.05), "extent": (0.1, 0.02, 0.05)}
     frame = constant_frame(view, 100)
-    assert (unwrap(view, frame, shapes=[table, behind])[1] == unwrap(view, frame)[1]).all()
+    assert (unwrapped(view, frame, shapes=[table, behind])[1] == unwrapped(view, frame)[1]).all()
 
 
 def test_of_several_balls_the_one_that_sees_speaks(device):
@@ -446,13 +446,13 @@ def test_of_several_balls_the_one_that_sees_speaks(device):
     other = ((0.16, -0.16, 0.035), 0.02, (0.5, 0.6, 0.7))
     view = look(0.4, focal=500.0)
     frame = encode(reference.render(view, [BALL, other], smooth_light, np.ones_like))
-    both = unwrap(view, frame, [BALL, other], transfer="linear")
-    single = [unwrap(view, frame, [ball], transfer="linear") for ball in (BALL, other)]
+    both = unwrapped(view, frame, [BALL, other], transfer="linear")
+    single = [unwrapped(view, frame, [ball], transfer="linear") for ball in (BALL, other)]
     assert (both[1] <= np.maximum(single[0][1], single[1][1]) + 1e-6).all()
     sure = both[1] > 0.5
     error = np.abs(both[0] - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[sure]
     assert error.max() < 0.04
-    order = unwrap(view, frame, [other, BALL], transfer="linear")
+    order = unwrapped(view, frame, [other, BALL], transfer="linear")
     np.testing.assert_allclose(order[0], both[0], atol=1e-6)
 
 
@@ -460,8 +460,8 @@ def test_hidden_ball_leaves_the_word_to_the_other(device):
     far, near = ((0.0, 0.3, 0.0), 0.03, (0.5, 0.5, 0.5)), ((0.0, 0.0, 0.0), 0.05, (1.0, 1.0, 1.0))
     view = reference.View((0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
     frame = constant_frame(view, 128)
-    assert (unwrap(view, frame, [far])[1] > 0).any()
-    radiance, confidence, _ = unwrap(view, frame, [far, near])
+    assert (unwrapped(view, frame, [far])[1] > 0).any()
+    radiance, confidence, _ = unwrapped(view, frame, [far, near])
     assert (radiance[confidence > 0] == decode_table("srgb")[128]).all()
 
 
@@ -473,9 +473,9 @@ def test_balls_vote_by_their_pixels(device):
     frame[:, : view.width // 2] = 255 if view.project([large[0]])[0][0, 0] < view.width / 2 else 0
     frame[:, view.width // 2 :] = 255 - frame[:, :1]
     for balls in ([large, small], [small, large]):
-        radiance, confidence, _ = unwrap(view, frame, balls, transfer="linear")
+        radiance, confidence, _ = unwrapped(view, frame, balls, transfer="linear")
         sure = confidence > 0.98
-        both = sure & (unwrap(view, frame, [small], transfer="linear")[1] > 0.9)
+        both = sure & (unwrapped(view, frame, [small], transfer="linear")[1] > 0.9)
         assert both.sum() > 200
         # The balls are seen 12 degrees apart: their densities differ by a few percent more.
         assert np.median(radiance[both]) == pytest.approx(16 / 17, abs=0.01)
@@ -486,7 +486,7 @@ def test_clipped_share(device, code, share):
     view = look(0.4)
     frame = constant_frame(view, 10)
     frame[..., 1] = code
-    _, confidence, clipped = unwrap(view, frame)
+    _, confidence, clipped = unwrapped(view, frame)
     assert (clipped[confidence > 0] == [0.0, share, 0.0]).all()
 
 
@@ -495,7 +495,7 @@ def test_a_channel_that_chroma_lowered_counts_beside_one_that_clips(device, code
     view = look(0.4)
     frame = constant_frame(view, 10)
     frame[:] = codes
-    _, confidence, clipped = unwrap(view, frame)
+    _, confidence, clipped = unwrapped(view, frame)
     assert (clipped[confidence > 0] == shares).all()
 
 
@@ -508,7 +508,7 @@ def test_a_lens_that_folds_over_shows_nothing_twice(device):
     ball = ((0.4 * np.cos(beyond), 0.4 * np.sin(beyond), 0.0), 0.035, (1.0, 1.0, 1.0))
     pixels, _ = view.project([ball[0]])
     assert 0 <= pixels[0, 0] < view.width  # the formula alone would find it
-    assert (unwrap(view, constant_frame(view, 50), [ball])[1] == 0).all()
+    assert (unwrapped(view, constant_frame(view, 50), [ball])[1] == 0).all()
 
 
 def test_far_from_the_origin(device):
@@ -526,7 +526,7 @@ def test_far_from_the_origin(device):
 def test_unknown_method(device):
     view = look(0.4)
     with pytest.raises(ValueError, match="expected bilinear, area"):
-        unwrap(view, constant_frame(view, 0), method="cubic")
+        unwrapped(view, constant_frame(view, 0), method="cubic")
 
 
 # ---- real and path-traced pictures ----
@@ -556,7 +556,7 @@ def test_light_directions_of_real_photographs(device, shared, number):
     focal = radius * np.sqrt(distance**2 - 1.0)
     view = reference.View((0, 0, distance), (0, 0, 0), (columns, rows), focal, principal=(x - 0.5, rows - 0.5 - y))
     view.rotation = np.diag([1.0, -1.0, -1.0])
-    radiance, confidence, _ = unwrap(view, image, [((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))], height=64)
+    radiance, confidence, _ = unwrapped(view, image, [((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))], height=64)
     lights = wp.zeros(1, dtype=KeyLight)
     cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec4)
     environment.find_key_lights(filled(radiance, confidence), wp.zeros(64, dtype=wp.vec4), cells, lights)
@@ -589,7 +589,7 @@ def test_light_of_path_traced_desks(device, shared, case, index):
     view.position, view.rotation = -rotation.T @ pose["t"], rotation.T
     view.principal = (camera["cx"], camera["cy"])
     height = 64
-    radiance, confidence, clipped = unwrap(
+    radiance, confidence, clipped = unwrapped(
         view, image, [(ball["center"], ball["radius"], ball["reflectance"])], height=height
     )
     true = np.load(folder / "env" / f"{index:04d}.npy").astype(np.float32)
