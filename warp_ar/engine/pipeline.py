@@ -29,7 +29,8 @@ from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
-from warp_ar.scene.ray_scene import HostScene, Outline, Rect, screen_rects, skeleton
+from warp_ar.scene.ray_scene import HostScene, skeleton
+from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
 from warp_ar.stages.base import Arrays, Request, Rows
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 
