@@ -19,3 +19,8 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise the message as an error of usage."""
         raise UsageError(f"{message}; see {self.prog} --help")
+
+
+def printable(text: str) -> str:
+    """Text from a file or a name, with control characters written out: a terminal would obey them."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

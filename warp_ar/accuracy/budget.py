@@ -17,9 +17,9 @@ only what errs less by ``GAIN`` is worth a change, and only after it would have 
 choice a setting moves at most one method in ``SETTING_SECONDS``, and all move until they are where they were to go, or
 the budget is exceeded; of a mixed move that would not fit, what saves goes first.
 
-**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few frames
-that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if not, the
-choice is made anew.
+**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
+frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
+not, the choice is made anew.
 """
 
 from __future__ import annotations

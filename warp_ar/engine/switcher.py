@@ -123,7 +123,11 @@ class PipelineSwitcher:
                 self._go_over(ready)
         return self.pipeline
 
-    def follow(self, target: Target, *, wait: bool = False) -> Pipeline | None:
+    def shows(self, target: Target) -> bool:
+        """Whether the next frame is lit as a target asks for."""
+        return self._shown is target
+
+    def follow(self, target: Target, *, prepare: Prepare = Pipeline.warm_up, wait: bool = False) -> Pipeline | None:
         """``want`` and ``take`` in one; with ``wait`` the pipeline is built on this thread, now.
 
         Raises:
@@ -133,9 +137,9 @@ class PipelineSwitcher:
             self._drop_building()
             self._wanted = target
             ready = self._ready()
-            self._go_over(self._build(target, self._prepare)[0] if ready is None else ready)
+            self._go_over(self._build(target, prepare)[0] if ready is None else ready)
             return self.pipeline
-        self.want(target)
+        self.want(target, prepare)
         return self.take()
 
     def open(self, target: Target) -> Pipeline:
@@ -158,6 +162,7 @@ class PipelineSwitcher:
 
     def _start(self) -> None:
         assert self._builder is not None
+        assert self._wanted is not None
         self._building = self._builder.submit(self._build, self._wanted, self._prepare)
 
     def _build(self, target: Target, prepare: Prepare) -> tuple[Pipeline, Any]:
@@ -202,7 +207,7 @@ class PipelineSwitcher:
     def _dispose(self, pipeline: Pipeline) -> None:
         """Let a pipeline go, on the builder's thread: frames do not wait for it."""
         assert self._builder is not None
-        self._builder.submit(_let_go, pipeline)
+        self._builder.submit(let_go, pipeline)
 
     def _drop_building(self) -> None:
         if self._building is not None:
@@ -240,8 +245,8 @@ def _fits(pipeline: Pipeline, target: Target) -> bool:
     return same and request.exposures == bracket_ratios(target.exposures) and pipeline.update(target.scene)
 
 
-def _let_go(pipeline: Pipeline) -> None:
-    """Free a pipeline's arrays now.
+def let_go(pipeline: Pipeline) -> None:
+    """Close a pipeline and free its arrays now; it cannot be used again.
 
     Its arrays, stages and scheduler refer to each other, so they would wait for the garbage collector, which counts
     objects: a pipeline is few objects and many megabytes. Results that refer to arrays keep those.
@@ -256,4 +261,4 @@ def _let_go(pipeline: Pipeline) -> None:
 
 def _close_built(building: Future[tuple[Pipeline, Any]]) -> None:
     if building.exception() is None:
-        _let_go(building.result()[0])
+        let_go(building.result()[0])
