@@ -71,6 +71,7 @@ class Lighting:
         self._first: Target | None = None
         self._then: Target | None = None
         self._place: Any = None
+        self._settled = False
         self._progress: tuple[str, int, int] | None = None
         self.plan: Plan | None = None
         """What lights the frames."""
@@ -88,7 +89,8 @@ class Lighting:
     @property
     def changing(self) -> bool:
         """Whether the frames are about to be lit by another pipeline."""
-        return self._main.busy or self._first is not None
+        followed = self._followed
+        return not self._settled or followed is None or followed[0] is not self._controls.wanted
 
     @property
     def compare_ready(self) -> bool:
@@ -104,7 +106,7 @@ class Lighting:
 
     def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
         """Note what is to be built from now on."""
-        self._followed = wanted, compare, feed
+        self._followed, self._settled = (wanted, compare, feed), False
         now = self._now = make_target(wanted, feed)
         self._then = dataclasses.replace(now, quality=PRESETS[compare]) if compare in PRESETS else None
         elsewhere = self._place != _place(now) and now.quality.name not in _AS_QUICK
@@ -128,6 +130,7 @@ class Lighting:
             if self._first is not None:
                 self._first = None  # what is wanted itself may do
             else:
+                self._settled = True
                 self._notify(messages.notice(error))
                 self._give_up()
                 controls.change(lambda _: self._good)
@@ -151,7 +154,7 @@ class Lighting:
             if self._first is not None:
                 self._first = None
             else:
-                self._good = wanted
+                self._good, self._settled = wanted, True
 
     def _warm_up(self, pipeline: Pipeline) -> None:
         """Load the kernels of a new pipeline; viewers are told how far that is."""
