@@ -27,6 +27,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.errors import SceneError
+from warp_ar.files import is_file, read_text
 
 wp.set_module_options({"enable_backward": False})
 
@@ -171,15 +172,16 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
     if name in ("srgb", "linear") or name.startswith("gamma:"):
         return np.repeat(_formula(name, np.arange(256) / 255.0)[:, None], 3, axis=1)
     path = pathlib.Path(transfer)
-    if not path.is_file():
+    if not is_file(path):
         raise SceneError(
             f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
         )
+    text = read_text(path, SceneError, expected="256 lines of three linear values")
     try:
         values = np.array(
             [
                 [float(word) for word in line.replace(",", " ").split()]
-                for line in path.read_text().splitlines()
+                for line in text.splitlines()
                 if line.strip()
             ]
         )
