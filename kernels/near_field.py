@@ -43,8 +43,9 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.color import brightness
 from warp_ar.kernels.emitters import correct_parallax
-from warp_ar.kernels.environment_samples import EnvironmentSample, brightness, sample_toward, sobol_second
+from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import Surface, make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels

@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
-from warp_ar.engine.pipeline import Pipeline, Result, resample_light
+from warp_ar.engine.carried_light import resample_light
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError
 from warp_ar.input.sources import Synthetic
 from warp_ar.input.tracking import TrackState
@@ -446,7 +447,7 @@ def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, 
             monkeypatch.setattr(HostScene, "light_outline", lambda self, bounced=False: outline(self, bounced=True))
         with Pipeline(scene, device=device, quality=quality) as pipeline:
             pictures.append([pipeline(frame).image.copy() for frame in frames[:2]])
-            params = pipeline._block.host("params")
+            params = pipeline.inputs.block.host("params")
             looked.append((params["direct_rect"].tolist(), params["light_rect"].tolist()))
     assert looked[0][0] != looked[0][1] == looked[1][0] == looked[1][1]
     np.testing.assert_array_equal(pictures[0], pictures[1])

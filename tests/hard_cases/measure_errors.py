@@ -1,4 +1,4 @@
-"""How far float32 kernels are from their float64 twins: the figures that ``warp_ar.stages.numerics`` prints.
+"""How far float32 kernels are from their float64 twins: the figures that stand in the stages' ``Numerics``.
 
 python -m tests.hard_cases.measure_errors
 
@@ -17,9 +17,9 @@ from tests.error_model import worst
 TWINS = (
     "tests/test_unwrap.py::test_corners_match_twin",
     "tests/test_unwrap.py::test_gather_matches_twin",
-    "tests/test_environment.py::test_accumulation_matches_twin",
-    "tests/test_environment.py::test_fill_matches_twin",
-    "tests/test_environment.py::test_irradiance_is_that_of_a_facing_surface",
+    "tests/test_accumulate.py::test_accumulation_matches_twin",
+    "tests/test_fill.py::test_fill_matches_twin",
+    "tests/test_key_lights.py::test_irradiance_is_that_of_a_facing_surface",
     "tests/test_bracket.py::test_twin",
     "tests/test_recover.py::test_transfer_agrees_with_its_twin",
     "tests/test_irradiance.py::test_projection_is_the_twin_s",

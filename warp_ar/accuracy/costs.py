@@ -102,12 +102,20 @@ def measure_costs(
         clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
             ratio in which the base's stands to the time that passes.
     """
-    steps = measure_steps(scene, image, pose, device, size, settings, clock)
+    return finish_steps(measure_steps(scene, image, pose, device, size, settings, clock))
+
+
+def finish_steps(steps: Generator[float, None, Costs], advance: Callable[[float], None] = lambda share: None) -> Costs:
+    """Take all steps of ``measure_steps``; ``advance`` is told the share of the work that each was."""
+    done = 0.0
     while True:
         try:
-            next(steps)
+            share = next(steps)
         except StopIteration as end:
+            advance(1.0 - done)
             return cast(Costs, end.value)
+        advance(share - done)
+        done = share
 
 
 def measure_steps(

@@ -16,8 +16,8 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
 from warp_ar.input.exposures import bracket_ratios
 from warp_ar.input.sources import Frame
-from warp_ar.stages.base import Request
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import Image
 from warp_ar.viewer.controls import CAMERA, Controls, Feed, Notify
