@@ -115,6 +115,7 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
         {
             "flat": "on a grey desk",
             "paper": "blended by the frame's brightness (the paper)",
+            "directional": "the same, as far as the environment's light has a direction",
             "relief": "the paper's blend, relief told from paint",
             "reflectance": "on the reflectance that frame and environment light give",
             "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
@@ -147,7 +148,8 @@ WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
         "clipped pixels at a shorter exposure",
         {
             "plain": "scaled",
-            "box": "scaled less where surroundings clip too (the paper)",
+            "paper": "scaled less where surroundings clip too (the paper)",
+            "box": "the same, by one stop at most",
             "glow": "from the glow around them",
             "ball": "from the glow and the ball's view of the same lamp",
         },

@@ -18,7 +18,7 @@ class Expose(Stage):
     """Composes the picture and scales its light, over-exposed regions by what they are guessed to have been."""
 
     name = "expose"
-    methods = ("plain", "box", "glow", "ball")
+    methods = ("plain", "paper", "box", "glow", "ball")
     remembers = ("expose_scale",)
     summary = "another exposure: over-exposed regions keep what they can be guessed to have had"
 
@@ -57,7 +57,7 @@ class Expose(Stage):
         """The scale, the codes, the picture."""
         composed = composite_config(layer_names(self.request))
         config = expose.ExposeConfig(
-            "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
+            self.method if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
         )
         expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
@@ -97,6 +97,10 @@ class Expose(Stage):
 
 
 def uses_table(request: Request) -> bool:
-    """Whether darkening looks at a pixel's surroundings: only the box does, and only where light is taken away."""
+    """Whether darkening looks at a pixel's surroundings: only boxes do, and only where light is taken away."""
     scale = request.scene.exposure.scale
-    return exposes(request) and request.quality.method("expose") == "box" and (isinstance(scale, str) or scale < 1.0)
+    return (
+        exposes(request)
+        and request.quality.method("expose") in expose.BOXES
+        and (isinstance(scale, str) or scale < 1.0)
+    )

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels import summed_area
+from warp_ar.kernels.relight import READINGS
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
 from warp_ar.stages.composite import layer_names
 from warp_ar.stages.expose import uses_table
@@ -25,7 +26,7 @@ class SummedArea(Stage):
     def wire(cls, request: Request) -> Wiring | LeftOut:
         """Wired for darkening by the paper's box, and for relief against its surroundings."""
         lit = "physical_added" in layer_names(request)
-        relief = lit and relight_method(request) not in ("flat", "paper")
+        relief = lit and relight_method(request) not in ("flat", *READINGS)
         if not uses_table(request) and not relief:
             return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
         return Wiring(("frame",), ("summed_area",))
