@@ -34,7 +34,7 @@ from warp_ar.kernels.structs import FrameParams, RayScene
 from warp_ar.kernels.visibility import intersect_mesh
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.scene.geometry import torus_mesh
+from warp_ar.scene.shapes import torus_mesh
 from warp_ar.stages.quality import PRESETS, Quality
 
 CLIP_FRAMES = 48

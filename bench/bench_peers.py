@@ -24,8 +24,8 @@ from warp_ar.kernels import summed_area, unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.kernels.wide_bvh import walk_closest
-from warp_ar.scene.geometry import torus_mesh
 from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.shapes import torus_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}
 RAYS = (480, 640)

@@ -1,4 +1,4 @@
-"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/costs.md`` and the README.
+"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/accuracy.md`` and the README.
 
 It reads ``bench/results/*_costs.jsonl``, which ``python -m bench costs`` prints, and the errors of
 ``warp_ar/accuracy/cost_table.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
@@ -162,7 +162,7 @@ def main() -> None:
     presets = json.loads((ROOT / "bench" / "results" / "presets.json").read_text(encoding="utf-8"))
     if not cpu:
         sys.exit("write_cost_tables: no bench/results/cpu_costs.jsonl; make it with python -m bench costs --device cpu")
-    page = ROOT / "docs" / "costs.md"
+    page = ROOT / "docs" / "accuracy.md"
     scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
     replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
     replace(page, "methods", method_table(cpu, cuda, listed))

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,11 +9,14 @@ from tests.reference import environment as reference
 from tests.reference import latlong
 from warp_ar.kernels import environment
 from warp_ar.kernels.structs import FrameParams, KeyLight
+from warp_ar.scene import Camera, Marker, Probe, Scene
 from warp_ar.stages.accumulate import Accumulate
-from warp_ar.stages.base import Arrays, LeftOut, Request, Wiring
+from warp_ar.stages.base import Arrays, LeftOut, Wiring
+from warp_ar.stages.features import find_features
 from warp_ar.stages.fill import Fill
 from warp_ar.stages.key_lights import KeyLights
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 from warp_ar.stages.unwrap import Unwrap
 
 # Float32 sums and exponentials, a few roundings each.
@@ -343,17 +348,16 @@ def test_difference_in_units_of_the_tolerance(device, scale, offset, moved):
     assert (rows.numpy().max() > 1) == moved
 
 
-def request(height=16):
-    import dataclasses
-    import types
-
+def features(height=16, balls=1):
     quality = dataclasses.replace(PRESETS["medium"].with_methods(recover="clipped"), environment_height=height)
-    return Request(types.SimpleNamespace(probes=(1,), proxies=()), quality, (64, 48))
+    camera, ball = Camera(64, 48, 50.0, 50.0, 31.5, 23.5), Probe((0.0, 0.0, 0.04), 0.04)
+    scene = Scene(camera=camera, marker=Marker(size=0.08), probes=(ball,) * balls)
+    return find_features(Request(scene, quality, (64, 48)))
 
 
 def build(kind, arrays, device):
-    wiring = kind.wire(request())
-    stage = kind(request(), wiring)
+    wiring = kind.wire(features())
+    stage = kind(features(), wiring)
     for name, spec in stage.arrays().items():
         arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
     return stage, stage.build(arrays, wp.get_device(device))
@@ -396,7 +400,7 @@ def test_stages_wire_up(device):
     available = {"frame", "pose", "clock"}
     arrays = Arrays()
     for kind in kinds:
-        wiring = kind.wire(request())
+        wiring = kind.wire(features())
         assert isinstance(wiring, Wiring)
         assert set(wiring.reads) <= available
         available |= set(wiring.writes)
@@ -404,10 +408,7 @@ def test_stages_wire_up(device):
         assert set(wiring.writes) <= set(stage.arrays())
         assert all(name in wiring.writes or name.startswith(kind.name) for name in stage.arrays())
         assert passes
-    import types
-
-    empty = Request(types.SimpleNamespace(probes=()), PRESETS["medium"], (64, 48))
-    assert all(isinstance(kind.wire(empty), LeftOut) for kind in kinds)
+    assert all(isinstance(kind.wire(features(balls=0)), LeftOut) for kind in kinds)
 
 
 # ---- key lights ----

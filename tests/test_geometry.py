@@ -16,17 +16,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.geometry import (
-    Mesh,
-    box_mesh,
-    load_mesh,
-    load_texture,
-    rotation_matrix,
-    silhouette_tolerance,
-    smooth_normals,
-    sphere_mesh,
-    torus_mesh,
-)
+from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals
+from warp_ar.scene.mesh_files import load_mesh, load_texture
+from warp_ar.scene.shapes import box_mesh, silhouette_tolerance, sphere_mesh, torus_mesh
 
 # A few float64 roundings of numbers up to one.
 ROUNDING = 1e-14

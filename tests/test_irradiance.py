@@ -7,12 +7,15 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import irradiance as reference
 from tests.reference import latlong
+from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import irradiance, pyramid
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.scene import loads_scene
-from warp_ar.stages.base import Arrays, LeftOut, Request
-from warp_ar.stages.irradiance import Irradiance, irradiance_output
+from warp_ar.stages.base import Arrays
+from warp_ar.stages.features import find_features
+from warp_ar.stages.irradiance import Irradiance
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 # The best public renderer keeps a white furnace within this.
 FURNACE = 5e-4
@@ -110,8 +113,8 @@ def run_method(radiance, method, normals, bands=1):
     environment = upload(radiance)
     quality = PRESETS["medium"].with_methods(irradiance=method)
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
-    request = Request(loads_scene(SCENE), quality, (64, 48))
-    stage = Irradiance(request, Irradiance.wire(request))
+    features = find_features(Request(loads_scene(SCENE), quality, (64, 48)))
+    stage = Irradiance(features, Irradiance.wire(features))
     arrays = Arrays()
     arrays.add("environment", environment)
     for name, spec in stage.arrays().items():
@@ -123,7 +126,7 @@ def run_method(radiance, method, normals, bands=1):
         else:
             for band in range(bands):
                 step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
-    output = arrays[irradiance_output(quality)]
+    output = arrays[features.irradiance]
     return evaluate(evaluate_sh_kernel if output.ndim == 1 else evaluate_map_kernel, output, normals)
 
 
@@ -408,10 +411,8 @@ def test_tables_reject_an_order_they_lack(device):
 
 def test_a_scene_without_diffuse_material_leaves_the_stage_out():
     mirror = SCENE.replace('model = "lambert"', 'model = "mirror"')
-    left_out = Irradiance.wire(Request(loads_scene(mirror), PRESETS["medium"], (64, 48)))
-    assert isinstance(left_out, LeftOut)
-    assert "no virtual object is diffuse" in left_out.reason
-    wiring = Irradiance.wire(Request(loads_scene(SCENE), PRESETS["medium"], (64, 48)))
-    assert wiring.writes == ("irradiance_map",)
-    wiring = Irradiance.wire(Request(loads_scene(SCENE), PRESETS["paper"], (64, 48)))
-    assert wiring.writes == ("irradiance_map",)
+    left_out = make_plan(Request(loads_scene(mirror), PRESETS["medium"], (64, 48))).left_out
+    assert "no virtual object is diffuse" in dict(left_out)["irradiance"]
+    for preset in ("medium", "paper"):
+        plan = make_plan(Request(loads_scene(SCENE), PRESETS[preset], (64, 48)))
+        assert dict(plan.stages)[Irradiance].writes == ("irradiance_map",)

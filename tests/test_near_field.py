@@ -17,8 +17,8 @@ from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
 from warp_ar.scene import load_scene
-from warp_ar.stages.base import Request
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 # Sampling error of one set of 64 for a cosine lobe of any direction.
 FURNACE_ERROR = 0.15

@@ -8,12 +8,15 @@ from tests.error_model import check_error
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
+from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import prefilter, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.scene import loads_scene
-from warp_ar.stages.base import Arrays, LeftOut, Request
+from warp_ar.stages.base import Arrays
+from warp_ar.stages.features import find_features
 from warp_ar.stages.prefilter import Prefilter, scene_lobe
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 # The best public prefilter keeps a white furnace within this.
 FURNACE = 5e-4
@@ -96,7 +99,8 @@ def run(radiance, method, lobe="ggx", bands=1):
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
     request = Request(scene(lobe), quality, (64, 48))
     assert scene_lobe(request.scene) == ("ggx" if lobe == "mirror" else lobe)
-    stage = Prefilter(request, Prefilter.wire(request))
+    features = find_features(request)
+    stage = Prefilter(features, Prefilter.wire(features))
     arrays = Arrays()
     arrays.add("environment", environment)
     for name, spec in stage.arrays().items():
@@ -390,9 +394,9 @@ def test_a_white_metal_keeps_a_white_furnace_white(device):
 
 
 def test_a_scene_without_gloss_leaves_the_stage_out():
-    left_out = Prefilter.wire(Request(scene("lambert"), PRESETS["medium"], (64, 48)))
-    assert left_out == LeftOut("no virtual object has a glossy material")
-    assert isinstance(Prefilter.wire(Request(scene(), PRESETS["medium"], (64, 48))), LeftOut)
+    for scenery in (scene("lambert"), scene()):
+        left_out = make_plan(Request(scenery, PRESETS["medium"], (64, 48))).left_out
+        assert dict(left_out)["prefilter"] == "no virtual object has a glossy material"
 
 
 def test_the_lobe_is_that_of_the_scene():
@@ -401,5 +405,5 @@ def test_the_lobe_is_that_of_the_scene():
 
 
 def test_a_scene_of_mirrors_filters_nothing():
-    request = Request(scene("mirror"), PRESETS["medium"], (64, 48))
-    assert set(Prefilter(request, Prefilter.wire(request)).arrays()) == {"prefilter_levels"}
+    features = find_features(Request(scene("mirror"), PRESETS["medium"], (64, 48)))
+    assert set(Prefilter(features, Prefilter.wire(features)).arrays()) == {"prefilter_levels"}

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from warp_ar import scene as sc
 from warp_ar.errors import SceneError, WarpArError
-from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene, loads_scene
+from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_calibration, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 
 CAMERA = """

@@ -19,3 +19,9 @@ class SinkError(WarpArError, RuntimeError):
 
 class UsageError(WarpArError, ValueError):
     """An option or argument, on the command line or in a call, has a value that cannot be used."""
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong, on one line, without the path that the message around it names already."""
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(text).split())

@@ -363,15 +363,15 @@ MUTATIONS = (
     Mutation(
         16,
         "frames of a folder may have any size",
-        "warp_ar/input/sources.py",
-        "            _check_size(image, self.size, str(path), index)\n",
+        "warp_ar/input/frame_folder.py",
+        "            check_size(image, self.size, str(path), index)\n",
         "",
         "tests/test_sources.py::test_size_that_changes_is_named",
     ),
     Mutation(
         16,
         "of 16 bits the upper 8",
-        "warp_ar/input/sources.py",
+        "warp_ar/input/frame_folder.py",
         "((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)",
         "(picture >> 8).astype(np.uint8)",
         "tests/test_sources.py::test_grey_alpha_and_16_bit_become_rgb",

@@ -32,7 +32,8 @@ from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
 from warp_ar.kernels import recover
 from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
-from warp_ar.scene.geometry import Mesh, load_mesh, rotation_matrix
+from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.ray_scene import HostScene, trace_config
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])

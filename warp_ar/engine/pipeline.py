@@ -29,9 +29,11 @@ from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
-from warp_ar.scene.ray_scene import HostScene, Outline, Rect, screen_rects, skeleton
-from warp_ar.stages.base import Arrays, Request, Rows
+from warp_ar.scene.ray_scene import HostScene, skeleton
+from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
+from warp_ar.stages.base import Arrays, Rows
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
+from warp_ar.stages.request import Request
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the environment from frame to frame."""
@@ -176,7 +178,7 @@ class Pipeline:
         exposures: Sequence[float] = (),
         bands: int | None = None,
         profile: bool = False,
-        waits: bool = False,
+        synchronous: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -190,8 +192,8 @@ class Pipeline:
                 shown; the others tell what clips in it.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
-            waits: Whether a frame waits for the light that is estimated from it. A camera's frames should not: that
-                light then takes effect some frames later.
+            synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
+                that light then takes effect some frames later.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -204,7 +206,7 @@ class Pipeline:
         self.quality = resolve_quality(quality)
         self._longest = max(exposures, default=1.0)
         ratios = bracket_ratios(exposures)
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, waits))
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -220,7 +222,7 @@ class Pipeline:
             self._add_inputs()
             self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
             if self.plan.needs("short_frames"):
-                self._short = ShortFrames(self.plan.request, self._arrays, self.device)
+                self._short = ShortFrames(self.plan.features, self._arrays, self.device)
 
     def __enter__(self) -> Pipeline:
         return self

@@ -53,7 +53,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from warp_ar.input.tracking import printed_cells
+from warp_ar.input.marker_pattern import printed_cells
 from warp_ar.kernels.recover import LOST, SurfacePoint
 from warp_ar.scene import Scene
 from warp_ar.scene.geometry import rotation_matrix

@@ -46,8 +46,8 @@ from warp_ar.scene.description import (
     SourceSpec,
     Vec3,
 )
-from warp_ar.scene.geometry import MESH_SUFFIXES
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
 
 _TOP_KEYS: Final = ("schema", "name")

@@ -11,8 +11,8 @@ import warp as wp
 from warp_ar.kernels import prefilter, pyramid
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
-from warp_ar.stages.environment_shadow import bounces_light
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -30,24 +30,37 @@ class Prefilter(Stage):
     """Prefilters the environment with lobes of growing width."""
 
     name: ClassVar[str] = "prefilter"
-    methods: ClassVar[tuple[str, ...]] = ("box_mip", "energy_mip", "fis32", "fis128", "brute_force")
+    methods: ClassVar[Mapping[str, str]] = {
+        "box_mip": "a pyramid of means (the paper)",
+        "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
+        "fis32": "32 importance samples per texel",
+        "fis128": "128 importance samples per texel",
+        "brute_force": "every texel for every direction and width",
+    }
     summary: ClassVar[str] = "the environment filtered for glossy reflection, level by level"
+    subject: ClassVar[str] = "light that glossy surfaces reflect"
+    unread: ClassVar[str] = "no virtual object has a glossy material"
+    converges: ClassVar[bool] = True
+    settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    unseen_method: ClassVar[str | None] = "box_mip"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; versines, weights made in float64",
+        bound=5e-5,
+        cause="sums over the map, powers with exponents up to 1e3",
+        measured=4.7e-07,
+        rows=(4, 5, 6, 8, 17, 18),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Read the environment, write the levels."""
-        if not request.scene.objects:
-            return LeftOut("the scene has no virtual object")
-        if not request.scene.probes:
-            return LeftOut("the scene has no probe, so the environment is unknown")
-        if not glossy_materials(request.scene):
-            return LeftOut("no virtual object has a glossy material")
-        return Wiring(("environment",), ("prefilter_levels",))
+        return Wiring(("environment",), ("prefilter_levels",)) if features.environment else LeftOut(NO_BALL)
 
     @property
     def _mirrors_only(self) -> bool:
         mirrors = all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
-        return mirrors and not bounces_light(self.request)
+        # Light that objects reflect onto the receiver is read as a wide lobe of every material.
+        return mirrors and not self.features.shadowed
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Levels, and the pyramid that the levels are made from."""

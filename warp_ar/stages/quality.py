@@ -115,7 +115,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
 DEFAULT_PRESET = "medium"
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
 """Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included. A preset errs
-least by the cost table within ``SHARE`` of its budget: docs/costs.md gives the rule and what departs from it,
+least by the cost table within ``SHARE`` of its budget: docs/accuracy.md gives the rule and what departs from it,
 ``python -m bench.write_cost_tables`` applies it. ``paper`` is the paper's method, ``reference`` the last methods that
 end within a lifetime: neither has a budget."""
 SHARE = 0.8

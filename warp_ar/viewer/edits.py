@@ -24,7 +24,7 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.geometry import load_mesh
+from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.viewer.protocol import EFFECTS

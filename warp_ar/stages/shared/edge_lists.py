@@ -8,7 +8,8 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.edges import EdgeLists
-from warp_ar.stages.base import Arrays, ArraySpec, Request
+from warp_ar.stages.base import Arrays, ArraySpec
+from warp_ar.stages.request import Request
 
 LISTED_SHARE = 16
 """Edges that can be listed: one pixel in so many."""
