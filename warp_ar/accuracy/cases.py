@@ -18,8 +18,8 @@ from warp_ar.input.sources import Frame, open_source
 from warp_ar.input.tracking import Tracker
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.stages.request import Request
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
