@@ -222,7 +222,7 @@ _DARK = {"soft": "#a9acb1", "ink": "#ececea", "line": "#303236", "card": "#1c1e2
 
 def stand_alone(svg: str) -> str:
     """A chart as a file of its own, with the colours that the page would give it."""
-    light = ";".join(f"--{name}:{color}" for name, color in _COLORS.items())
+    light = ";".join(f"--{name}:{color}" for name, color in (_COLORS | {"card": "#ffffff"}).items())
     dark = ";".join(f"--{name}:{color}" for name, color in _DARK.items())
     style = (
         f"<style>svg{{{light};background:var(--card);font-family:sans-serif}}"

@@ -33,6 +33,8 @@ OURS = ("medium", "high")
 """Presets that stand beside the paper's."""
 GRID = 0.05
 """Metres between the lines of figure 5's ground plane."""
+CARD = 0.85
+"""Half the side of a printed card, in sides of its marker."""
 BAND = 2
 """Rows above and below a profile's that it is the mean of."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -201,7 +203,7 @@ def _shown(radiance: npt.NDArray[Any], size: tuple[int, int]) -> Image:
 
 def figure_3(context: Context) -> PaperFigure:
     """The environment map and its filtered form."""
-    case = context.case("desk")
+    case = context.case("torus")
     size = (180, 360)
     found = {name: _maps(context, case, PRESETS[name]) for name in ("paper", "high")}
     # What the filtered map of the paper's own environment should be: the cosine lobe, texel by texel.
@@ -250,8 +252,27 @@ def _luminance(case: Case, image: Image) -> npt.NDArray[np.float64]:
     return np.asarray(linear @ _LUMINANCE)
 
 
+def _plane_points(case: Case, index: int) -> tuple[npt.NDArray[np.float64], Mask]:
+    """Where the pixels of a frame see the first proxy, (H, W, 2) metres, and whether they do."""
+    pose, plane = case.poses[index], case.scene.proxies[0]
+    assert pose is not None
+    rays = pixel_rays(case.scene.camera).astype(np.float64)
+    world = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ pose.rotation
+    position = -pose.rotation.T @ pose.translation
+    reach = (plane.at[2] - position[2]) / world[..., 2]
+    points = (position + reach[..., None] * world)[..., :2]
+    return points, np.asarray((reach > 0.0) & (np.abs(points) < 0.5 * np.asarray(plane.size)).all(-1))
+
+
 def _profile_row(case: Case, index: int, region: Mask) -> tuple[int, slice]:
-    """Row of a frame, with its columns, on which structure in a region varies most: it crosses the wire."""
+    """Row of a frame, with its columns, on which structure in a region varies most: it crosses the wire.
+
+    Only what lies to the right of the printed card: the card's pattern is paint.
+    """
+    points, _ = _plane_points(case, index)
+    card = (np.abs(points) < CARD * case.scene.marker.size).all(-1)
+    region = region.copy()
+    region[:, : np.nonzero(card.any(0))[0][-1] + 1] = False
     luminance = _luminance(case, case.frames[index].image)
     widths = region.sum(1)
     rows = np.nonzero(widths >= max(0.7 * widths.max(), 8))[0]
@@ -269,17 +290,9 @@ def figure_5(context: Context) -> PaperFigure:
     """The physical scene and its model."""
     case = context.case("wire_coincident")
     index = case.shown[-1]
-    camera, pose = case.frames[index].image, case.poses[index]
-    assert pose is not None
-    rays = pixel_rays(case.scene.camera).astype(np.float64)
-    world = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ pose.rotation
-    position = -pose.rotation.T @ pose.translation
-    plane = case.scene.proxies[0]
-    reach = (plane.at[2] - position[2]) / world[..., 2]
-    points = position + reach[..., None] * world
-    extent = np.asarray(plane.size)
-    inside = (reach > 0.0) & (np.abs(points[..., :2]) < 0.5 * extent).all(-1)
-    cells = np.floor(points[..., :2] / GRID).astype(int)
+    camera = case.frames[index].image
+    points, inside = _plane_points(case, index)
+    cells = np.floor(points / GRID).astype(int)
     edges = np.zeros(inside.shape, bool)
     edges[:, 1:] |= (cells[:, 1:] != cells[:, :-1]).any(-1)
     edges[1:] |= (cells[1:] != cells[:-1]).any(-1)
