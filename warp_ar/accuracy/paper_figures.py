@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -33,6 +34,8 @@ OURS = ("medium", "high")
 """Presets that stand beside the paper's."""
 GRID = 0.05
 """Metres between the lines of figure 5's ground plane."""
+FULL = 0.4
+"""Share of the brightest added light from which a pixel lies well inside the light's cone."""
 CARD = 0.85
 """Half the side of a printed card, in sides of its marker."""
 BAND = 2
@@ -264,6 +267,15 @@ def _plane_points(case: Case, index: int) -> tuple[npt.NDArray[np.float64], Mask
     return points, np.asarray((reach > 0.0) & (np.abs(points) < 0.5 * np.asarray(plane.size)).all(-1))
 
 
+def _lit_region(case: Case, index: int) -> Mask:
+    """Pixels well inside the virtual light's cone, holes closed: its edge is no structure of the surface."""
+    gain = _luminance(case, case.truth[index]) - _luminance(case, case.frames[index].image)
+    size = max(gain.shape[0] // 30, 3)
+    smooth = cv2.GaussianBlur(gain, (0, 0), 0.3 * size)
+    lit = (smooth > FULL * np.quantile(smooth, 0.99)).astype(np.uint8)
+    return np.asarray(cv2.morphologyEx(lit, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8)) > 0)
+
+
 def _profile_row(case: Case, index: int, region: Mask) -> tuple[int, slice]:
     """Row of a frame, with its columns, on which structure in a region varies most: it crosses the wire.
 
@@ -301,7 +313,7 @@ def figure_5(context: Context) -> PaperFigure:
     flat = turn(PRESETS["paper"], {"relight": "flat"})
     shown = run(case, flat, context.device, between=light_only(flat), timed=1).images[index]
     region = region_of(case, index, case.truth[index])
-    row, columns = _profile_row(case, index, region)
+    row, columns = _profile_row(case, index, _lit_region(case, index))
     before = _luminance(case, camera)
     knows = _band(_luminance(case, shown) - before, row, columns)
     sees = _band(before, row, columns)
@@ -337,13 +349,16 @@ def _structure(values: npt.NDArray[np.float64]) -> float:
 def figure_6(context: Context) -> PaperFigure:
     """Intensity profiles across the wire."""
     pictures: list[Image] = []
+    line: tuple[int, slice] | None = None  # both clips are of one frame: the same line crosses the same wire
     rows, plots = [], []
     for scene, where in (("wire_coincident", "coincident"), ("wire_opposing", "opposing")):
         case = context.case(scene)
         index = case.shown[-1]
         camera, truth = case.frames[index].image, case.truth[index]
         region = region_of(case, index, truth)
-        row, columns = _profile_row(case, index, region)
+        if line is None:
+            line = _profile_row(case, index, _lit_region(case, index))
+        row, columns = line
         shown = {"truth": truth}
         for label, quality in {
             "alpha blending": turn(PRESETS["paper"], {"relight": "flat"}),
