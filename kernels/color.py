@@ -179,11 +179,7 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
     text = read_text(path, SceneError, expected="256 lines of three linear values")
     try:
         values = np.array(
-            [
-                [float(word) for word in line.replace(",", " ").split()]
-                for line in text.splitlines()
-                if line.strip()
-            ]
+            [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
         )
     except ValueError as error:
         raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None

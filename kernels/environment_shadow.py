@@ -151,9 +151,8 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                         if (virtual_mask & bit) != wp.uint64(0):
                             other = Hit()
                             other.shape = -1
-                            if (
-                                wp.static(secondary_count == config.count)
-                                or block * wp.static(chunk) + k < wp.static(secondary_count)
+                            if wp.static(secondary_count == config.count) or block * wp.static(chunk) + k < wp.static(
+                                secondary_count
                             ):
                                 other = closest_object(scene, origin, direction, reach)
                                 if other.shape >= 0:

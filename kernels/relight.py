@@ -9,13 +9,21 @@ What Kd and the response are makes the methods, with N.L = max(normal . wi, 0):
 
 ``flat``: what plain alpha blending of a lit proxy does. Kd is a grey constant, response = N.L.
 
-``paper``: [DH04] section 4.2 to the letter. The *additive factor* is N.L, the *multiplicative factor* m the frame's
-intensity, alpha the dot product of the virtual light's direction and the brightest physical direction. The text asks
-for m at alpha = 1, for the additive factor at 0 and for the inverse of m at -1; the printed shader's lerp, (1 -
-alpha) N.L + alpha m, gives 2 N.L - m at -1: weight two for the flat term and a light twice as bright, which the text
-does not mean. The text's three cases are met, continuously, by weighting with |alpha|:
+``paper``: [DH04] section 4.2 to the letter. The *additive factor* is N.L, the *multiplicative factor* m the intensity
+of the video, and alpha "the dot product of the virtual light vector and the brightest physical lighting vector". "When
+the dot product is close to one, most of the contribution is from the multiplicative factor, when it is close to zero,
+the contribution is from the additive factor, and when it is negative one, the inverse of the multiplicative factor is
+used":
 
     response = (1 - |alpha|) N.L + |alpha| (m if alpha > 0 else 1 - m).                                            (1)
+
+What the text leaves open is a ``Reading``. Taken are: m in video values, the codes that the shader samples over 255,
+for no camera's curve is mentioned; the three cases of the text above the printed shader's lerp, (1 - alpha) N.L +
+alpha m, which gives 2 N.L - m at -1; and alpha as it is, for the remark of section 4.4 that several lights end as plain
+blending is an observation, not a step of the shader. docs/paper.md says what the other readings give.
+
+``directional``: (1) with the frame's linear luminance for m, and alpha times the directionality of the environment's
+dominant light: where the light is ambient, or comes from rivals, it says nothing about bumps and ``flat`` remains.
 
 ``relief``: (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark receiver
 and shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes the pixel's
@@ -46,8 +54,8 @@ the irradiance by virtual light that lit proxies send to each other is added to 
 
     added += Kd / pi * E_bounced.                                                                                  (5)
 
-Where the environment is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key
-light's directionality.
+Where the environment is ambient its light says nothing about bumps: alpha in (2), and in (1) for ``directional``, is
+multiplied by the key light's directionality.
 
 Edges. A light without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
 lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
@@ -62,6 +70,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import warp as wp
@@ -75,7 +85,7 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
-from warp_ar.kernels.summed_area import box_mean
+from warp_ar.kernels.summed_area import box_mean, intensity
 from warp_ar.kernels.visibility import (
     FAR,
     Hit,
@@ -90,8 +100,32 @@ from warp_ar.kernels.visibility import (
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("flat", "paper", "relief", "reflectance")
+METHODS = ("flat", "paper", "directional", "relief", "reflectance")
 """Cheapest first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How equation (1) takes what the paper's text leaves open; the defaults are the letter of the text."""
+
+    values: Literal["video", "linear"] = "video"
+    """Of the multiplicative factor: codes over 255 as the shader samples them, or linear luminance."""
+    blend: Literal["text", "shader"] = "text"
+    """The three cases of the text, or the printed shader's lerp, which differs where alpha is negative."""
+    weighted: bool = False
+    """Whether alpha is multiplied by the directionality of the environment's light (section 4.4)."""
+
+
+READINGS: Mapping[str, Reading] = MappingProxyType(
+    {
+        "paper": Reading(),
+        "directional": Reading("linear", weighted=True),
+        "paper_linear": Reading("linear"),
+        "paper_shader": Reading(blend="shader"),
+        "paper_weighted": Reading(weighted=True),
+    }
+)
+"""Ways to take equation (1), by name: the two methods, and readings that docs/paper.md compares with ``paper``."""
 
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
 """Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
@@ -118,8 +152,8 @@ _BALL = wp.constant(-2 << (_MASKED + 1))
 class RelightConfig:
     """What is compiled into the kernel."""
 
-    method: Literal["flat", "paper", "relief", "reflectance"]
-    """How the receiver responds."""
+    method: str
+    """How the receiver responds: one of ``METHODS`` or ``READINGS``."""
     trace: TraceConfig
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
@@ -138,14 +172,21 @@ class RelightConfig:
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ValueError(f"method: {self.method!r} is none of {', '.join(METHODS)}")
+        known = dict.fromkeys((*METHODS, *READINGS))
+        if self.method not in known:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
         check_edge_samples(self.edge_samples)
 
 
 @wp.func
-def printed_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Equation (1)."""
+def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.float32) -> wp.float32:
+    """The lerp of [DH04]'s fragment shader as printed; light is not taken away."""
+    return wp.max((1.0 - alpha) * n_dot_l + alpha * multiplicative, 0.0)
+
+
+@wp.func
+def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Equation (1), [DH04] section 4.2."""
     weight = wp.min(wp.abs(alpha), 1.0)
     multiplicative = wp.where(alpha > 0.0, intensity, 1.0 - intensity)
     return (1.0 - weight) * n_dot_l + weight * multiplicative
@@ -235,7 +276,7 @@ class Matter:
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
     """``find_matter(scene, receiver, hit, row, col, mirror) -> Matter``; arguments as those of ``direct_lighting``."""
-    method = config.method
+    method, reading = config.method, READINGS.get(config.method)
 
     @wp.func(module="unique")
     def find_matter(
@@ -250,8 +291,11 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
             radiance = wp.cw_div(radiance, mirror)
         matter.key = receiver.key_lights[0].direction
         matter.directionality = receiver.key_lights[0].directionality
-        if wp.static(method == "paper"):
-            matter.m = luminance(radiance)
+        if wp.static(reading is not None):
+            if wp.static(reading is not None and reading.values == "video"):
+                matter.m = wp.float32(intensity(receiver.frame[row, col])) / 255.0
+            else:
+                matter.m = luminance(radiance)
         else:
             around = luminance(radiance)
             if not is_mirrored:
@@ -297,7 +341,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter = make_find_matter(config)
-    method = config.method
+    method, reading = config.method, READINGS.get(config.method)
 
     @wp.func(module="unique")
     def direct_lighting(
@@ -343,8 +387,13 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                     known = True
                     matter = find_matter(scene, receiver, hit, row, col, mirror)
                 alpha = wp.dot(light.wi, matter.key)
-                if wp.static(method == "paper"):
-                    response = printed_response(n_dot_l, matter.m, alpha * matter.directionality)
+                if wp.static(reading is not None):
+                    if wp.static(reading is not None and reading.weighted):
+                        alpha = alpha * matter.directionality
+                    if wp.static(reading is not None and reading.blend == "shader"):
+                        response = shader_response(n_dot_l, matter.m, alpha)
+                    else:
+                        response = text_response(n_dot_l, matter.m, alpha)
                 elif wp.static(method == "relief"):
                     response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
                 else:

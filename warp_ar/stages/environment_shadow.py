@@ -70,9 +70,7 @@ class EnvironmentShadow(Stage):
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the desk under the environment"
-    subject: ClassVar[str] = (
-        "shadows of virtual objects in the environment, and light reflected onto the receiver"
-    )
+    subject: ClassVar[str] = "shadows of virtual objects in the environment, and light reflected onto the receiver"
     converges: ClassVar[bool] = True
     unseen_method: ClassVar[str | None] = "none"
     numerics: ClassVar[Numerics] = Numerics(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+from warp_ar.kernels.expose import BOXES
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
 from warp_ar.scene.ray_scene import (
@@ -106,7 +107,7 @@ def find_features(request: Request) -> Features:
         merged=recovered and len(request.exposures) > 1,
         layers=layers,
         exposed=exposed,
-        boxed=darkened and quality.method("expose") == "box",
+        boxed=darkened and quality.method("expose") in BOXES,
         declipped=darkened and quality.method("expose") in ("glow", "ball"),
         declipped_by_ball=quality.method("expose") == "ball" and recovered,
         relight_method=relight_method,

@@ -48,6 +48,7 @@ class Relight(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey desk",
         "paper": "blended by the frame's brightness (the paper)",
+        "directional": "the same, as far as the environment's light has a direction",
         "relief": "the paper's blend, relief told from paint",
         "reflectance": "on the reflectance that frame and environment light give",
         "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
