@@ -336,9 +336,12 @@ def disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
     """A disk of 400 kB."""
     place = tmp_path / "disk"
     place.mkdir()
-    mounted = sys.platform == "linux" and not subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)], check=False, capture_output=True
-    ).returncode
+    mounted = (
+        sys.platform == "linux"
+        and not subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)], check=False, capture_output=True
+        ).returncode
+    )
     if not mounted:
         pytest.skip("no small disk can be mounted here")
     yield place

@@ -56,6 +56,7 @@ from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import BOARD
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import Lit
+from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
 from warp_ar.viewer.lighting import make_target
@@ -830,10 +831,12 @@ class Site:
 
 
 @contextlib.asynccontextmanager
-async def served(scene: Scene | None = None, **address: Any) -> AsyncIterator[Site]:
+async def served(
+    scene: Scene | None = None, header_seconds: float = HEADER_SECONDS, **address: Any
+) -> AsyncIterator[Site]:
     ready: asyncio.Event = asyncio.Event()
     make = functools.partial(Host, scene or page_scene(), device="cpu", quality="low")
-    server = Server(make, Address(port=0, **address))
+    server = Server(make, Address(port=0, **address), header_seconds=header_seconds)
     task = asyncio.create_task(server.serve(lambda _: ready.set()))
     waiting = asyncio.create_task(ready.wait())
     await asyncio.wait({task, waiting}, return_when=asyncio.FIRST_COMPLETED)

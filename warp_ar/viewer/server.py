@@ -78,6 +78,11 @@ _HEADERS: Final = {
 }
 
 
+def own_headers() -> dict[str, str]:
+    """Headers of every answer, refusals too."""
+    return dict(_HEADERS)
+
+
 def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
     """JPEG of an RGB picture."""
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
@@ -191,7 +196,7 @@ class Server:
         self._starting: asyncio.Future[Host] | None = None
         self.ended = True
         """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
-        self.gate = Gate(_HEADERS, header_seconds=header_seconds)
+        self.gate = Gate(own_headers(), header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
         self.app.on_response_prepare.append(self._add_headers)
         self.app.add_routes(
