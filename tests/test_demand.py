@@ -202,9 +202,12 @@ PATHS: dict[str, tuple[Frame, ...]] = {
     "view": (*[(*SHOWN, 0, SHORT)] * 2, *[("away", True, "on", 1, SHORT)] * 3, *[(*SHOWN, 1, SHORT)] * 2),
     "from nothing": (*[(*BARE, 0, SHORT)] * 3, *[(*SHOWN, 0, SHORT)] * 2),
     "drift": (*[(*SHOWN, 0, SHORT)] * 3, *[(*BARE, 1, SHORT)] * 8, *[(*SHOWN, 1, SHORT)] * 4),
-    "long": (*[(*SHOWN, 0, SHORT)] * 4, *[(*BARE, 0, LONG)] * 6, *[(*BARE, 1, LONG)] * 3, *[(*SHOWN, 1, SHORT)] * 6),
+    "half": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 2, SHORT)] * 5, *[(*SHOWN, 2, SHORT)] * 2),
+    "half for long": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 1, SHORT)] * 14, *[(*SHOWN, 1, SHORT)] * 2),
+    "long": (*[(*SHOWN, 0, SHORT)] * 2, *[(*BARE, 0, LONG)] * 6, *[(*BARE, 1, LONG)] * 3, *[(*SHOWN, 1, SHORT)] * 6),
 }
-"""What is left out of some frames comes back: every reason; light that moves on meanwhile, a little and for long."""
+"""What is left out of some frames comes back: every reason; light that moves on meanwhile, read by nothing or by half of
+what reads it, a little and for long."""
 
 
 def number_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,8 +243,8 @@ def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.Monk
             now += step
             pipeline(pictures()[picture], time_seconds=now, pose=POSES[pose])
             asked.append(round(16 * float(pipeline.arrays["recover_excess"].numpy()[0, 0, 0])))
-    # Three at the start; in the first bare frame what is virtual is cleared; then one at once, when it is back.
-    assert asked == [1, 2, 3, 3, *[3] * 9, *[4] * 6]
+    # Three at the start, for in the first bare frame what is virtual is cleared; then one at once, when it is back.
+    assert asked == [1, 2, 3, *[3] * 8, *[4] * 6]
 
 
 def test_reasons_are_those_of_the_frame() -> None:
