@@ -95,7 +95,7 @@ QUALITIES = {
     "every": make_quality(),
     "high": dataclasses.replace(PRESETS["high"], environment_height=16),
 }
-"""The least that stands on the environment; recovery that nothing but objects and lights needs; what balls show, too."""
+"""The least that stands on the environment; recovery that only objects and lights need; what balls show, too."""
 FAR = (4.0, 0.0, 0.3)
 """Metres: where nothing of it is in any picture, or near anything in one."""
 
@@ -204,7 +204,7 @@ PATHS: dict[str, tuple[Frame, ...]] = {
     "drift": (*[(*SHOWN, 0, SHORT)] * 3, *[(*BARE, 1, SHORT)] * 8, *[(*SHOWN, 1, SHORT)] * 4),
     "half": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 2, SHORT)] * 5, *[(*SHOWN, 2, SHORT)] * 2),
     "half for long": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 1, SHORT)] * 14, *[(*SHOWN, 1, SHORT)] * 2),
-    "long": (*[(*SHOWN, 0, SHORT)] * 2, *[(*BARE, 0, LONG)] * 6, *[(*BARE, 1, LONG)] * 3, *[(*SHOWN, 1, SHORT)] * 6),
+    "long": (*[(*SHOWN, 0, SHORT)] * 2, *[(*BARE, 1, LONG)] * 9, *[(*SHOWN, 1, SHORT)] * 6),
 }
 """What is left out of some frames comes back: every reason; light that moves on meanwhile, read by nothing or by half of
 what reads it, a little and for long."""

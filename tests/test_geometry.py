@@ -414,7 +414,7 @@ def test_missing_files(tmp_path: pathlib.Path) -> None:
         load_texture(tmp_path / "none.png")
     for content in (b"", b"hello"):
         (tmp_path / "words.png").write_bytes(content)
-        with pytest.raises(SceneError, match="an image is needed|no image; use PNG"):
+        with pytest.raises(SceneError, match=r"an image is needed|no image; use PNG"):
             load_texture(tmp_path / "words.png")
 
 

@@ -193,7 +193,6 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.viewer.host import Host
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -220,7 +219,10 @@ def serve_page(options: argparse.Namespace) -> int:
     )
     port = DEFAULT_PORT if options.port is None else options.port
 
-    def make_host(**callbacks: Any) -> Host:
+    def make_host(**callbacks: Any) -> Any:
+        # On the page's own thread, when it is served already: it loads Warp and all that uses it.
+        from warp_ar.viewer.host import Host
+
         return Host(
             scene,
             source=options.source,
@@ -232,7 +234,7 @@ def serve_page(options: argparse.Namespace) -> int:
         )
 
     def ready(address: Address) -> None:
-        print(f"warp_ar: {scene.name} is at {address.url} (Ctrl-C ends it)", flush=True)
+        print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
         if not options.no_browser and local and _has_display():
@@ -241,13 +243,19 @@ def serve_page(options: argparse.Namespace) -> int:
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server(make_host, Address(options.host, port, token, tls))
+    code = EXIT_DONE
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
-    except Terminated:
-        raise
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return EXIT_DONE
+    except KeyboardInterrupt as error:
+        code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
+    finally:
+        if not server.ended:
+            # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped: threads
+            # would be waited for at the end of Python. All files are closed and temporary folders gone by now.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    return code
 
 
 def _print_choice(pipeline: AutoPipeline) -> None:

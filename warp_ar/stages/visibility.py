@@ -23,6 +23,7 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import make_visible
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -44,7 +45,7 @@ class Visibility(Stage):
         """Left out of scenes without virtual objects."""
         if not features.request.scene.objects:
             return LeftOut(NO_OBJECT)
-        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hit_depth", "hits"))
+        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def idle(self, reach: Reach) -> str | None:
         """Without an object in the picture no pixel sees one."""
@@ -63,9 +64,9 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        outputs = [arrays[name] for name in ("hit_object", "hit_depth", "hits")]
+        visible = make_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
-            trace_pixels(config, *inputs, *outputs, rows=rows)
+            trace_pixels(config, *inputs, visible, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
