@@ -22,7 +22,7 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
-from warp_ar.stages.base import Arrays, Rows
+from warp_ar.stages.base import Arrays, Reach, Rows
 
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
@@ -94,6 +94,7 @@ class FrameInputs:
         add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
         for name in RECTS:
             add(f"{name}_rows", functools.partial(self._rows, name))
+        add("reach", self.reach)
         add("seconds", lambda: float(params["time"][0]))
 
     def close(self) -> None:
@@ -182,6 +183,13 @@ class FrameInputs:
     def _rows(self, name: str) -> Rows:
         """Rows of one of ``RECTS`` in this frame."""
         return self.rects[name][:2]
+
+    def reach(self) -> Reach:
+        """What of this frame virtual things can reach."""
+        rects = (self.rects[name] for name in RECTS)
+        objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
+        shines = bool(self.block.host("lights")["intensity"].any())
+        return Reach(objects=objects, shines=shines, light=light, shadows=shadows, balls=balls)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

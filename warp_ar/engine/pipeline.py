@@ -87,6 +87,7 @@ class Pipeline:
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
 
@@ -102,6 +103,7 @@ class Pipeline:
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -132,7 +134,9 @@ class Pipeline:
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with exclusive(self.device), wp.ScopedDevice(self.device):
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
-            self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+            self._scheduler = Scheduler(
+                self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
+            )
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.features, self._arrays, self.device)
 

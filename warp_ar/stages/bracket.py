@@ -19,6 +19,7 @@ class Bracket(Stage):
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
     unread: ClassVar[str] = "nothing asks for the environment"
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=2e-6,

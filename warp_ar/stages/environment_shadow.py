@@ -15,7 +15,19 @@ from warp_ar.kernels import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
@@ -103,6 +115,10 @@ class EnvironmentShadow(Stage):
         if METHODS[quality.method(cls.name)].bounce == "traced":
             reads.append("frame")
         return Wiring(tuple(reads), ("shadow_ratio",))
+
+    def idle(self, reach: Reach) -> str | None:
+        """Far from objects the environment is as it was."""
+        return None if reach.shadows else "no virtual object is near anything in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""

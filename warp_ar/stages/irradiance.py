@@ -11,6 +11,7 @@ import warp as wp
 from warp_ar.kernels import irradiance, pyramid
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
 TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
@@ -75,7 +76,7 @@ class Irradiance(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Launches of the method, and the tables that they need."""
-        environment = arrays["environment"]
+        environment = settled_environment(arrays, device)
         if self.method == "top_mip":
             top = arrays["irradiance_map"]
             return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]

@@ -12,7 +12,7 @@ from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.picture import make_picture
@@ -89,6 +89,13 @@ class MirrorBall(Stage):
         if "shadow_ratio" in layers:
             reads.add("shadow_ratio")
         return Wiring(tuple(sorted(reads)), ("mirrored",))
+
+    def idle(self, reach: Reach) -> str | None:
+        """A ball may show what is out of the picture itself."""
+        if not reach.balls:
+            return "no mirror ball is in the picture"
+        dark = not reach.shines and not self.request.scene.objects
+        return "no virtual light has any power" if dark else None
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""

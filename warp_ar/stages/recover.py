@@ -47,6 +47,8 @@ class _Progress:
     """Frames since the last estimate was begun."""
     last: float = 0.0
     """When that was, seconds."""
+    rested: bool = False
+    """Whether nothing has read the environment since."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,11 +225,17 @@ class Recover(Stage):
         now, seconds = self._progress, self._arrays["seconds"]()
         now.frames += 1
         now.waited += 1
+        rested, now.rested = now.rested, False
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
-        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and now.waited >= EVERY_FRAME)
+        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and (rested or now.waited >= EVERY_FRAME))
         if self._asks:
             now.waited, now.last = 0, seconds
+
+    def rest(self) -> None:
+        """No estimate is begun or takes effect; the first frame that needs one begins it at once."""
+        self._asks = self._arrives = False
+        self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
         """Begin to solve, and wait for it where it takes effect at once."""

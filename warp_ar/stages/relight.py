@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
@@ -86,6 +86,12 @@ class Relight(Stage):
     def runs_after(self) -> tuple[str, ...]:
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
         return () if self.features.near_field else ("environment_shadow",)
+
+    def idle(self, reach: Reach) -> str | None:
+        """Without power, or out of the picture, light adds nothing."""
+        if not reach.shines:
+            return "no virtual light has any power"
+        return None if reach.light else "virtual light falls on nothing in the picture"
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""

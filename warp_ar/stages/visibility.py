@@ -9,7 +9,19 @@ import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import make_visible
 from warp_ar.stages.shared.rows import GrowingRows
@@ -34,6 +46,10 @@ class Visibility(Stage):
         if not features.request.scene.objects:
             return LeftOut(NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
+
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture no pixel sees one."""
+        return None if reach.objects else OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
