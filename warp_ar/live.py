@@ -338,7 +338,7 @@ def light_clip(options: argparse.Namespace) -> int:
                 say(words)
         log = RunLog(session.pipeline)
         try:
-            with lights or NullSink(), sink, handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"):
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
                 _light_frames(options, session, log, sink, lights, stop)
             if log.count < MARKER_PATIENCE and stop.code is None:
                 _check_marker(log, session.scene, live=source.live)
