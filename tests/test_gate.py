@@ -222,7 +222,7 @@ def test_refusals_have_the_headers_of_the_page_and_no_traceback(capfd: pytest.Ca
                 reader, writer = await asyncio.open_connection("127.0.0.1", port_of(site.url))
                 writer.write(request)
                 head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), PATIENCE)
-                assert head.startswith(f"HTTP/1.1 {status}".encode()) or head.startswith(f"HTTP/1.0 {status}".encode())
+                assert head.startswith((f"HTTP/1.1 {status}".encode(), f"HTTP/1.0 {status}".encode()))
                 for name, value in own_headers().items():
                     assert f"{name}: {value}".encode() in head, (request[:40], name)
                 writer.close()

@@ -27,6 +27,7 @@ from warp_ar.command_line import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
+    EXIT_USAGE,
     Parser,
     Terminated,
     handling,
@@ -248,13 +249,17 @@ def serve_page(options: argparse.Namespace) -> int:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
     except KeyboardInterrupt as error:
         code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
-    finally:
-        if not server.ended:
-            # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped: threads
-            # would be waited for at the end of Python. All files are closed and temporary folders gone by now.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+    except WarpArError as error:
+        if server.ended:
+            raise
+        say(error)
+        code = EXIT_USAGE
+    if not server.ended:
+        # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
+        # would wait for its thread. All files are closed and temporary folders gone by now.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     return code
 
 
