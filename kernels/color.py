@@ -41,8 +41,8 @@ _NEXT = wp.constant(ENCODE_KEYS)
 _THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
 CLIPPING_CODE = wp.constant(254)  # video codecs and JPEG bring a clipped 255 back as 254 now and then
-# Chroma at half the resolution (4:2:0) lowers the clipped blue of a small lamp to 239 to 252 (measured in H.264). Where
-# another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
+# Chroma at half the resolution (4:2:0) lowers the clipped blue of a small emitter to 239 to 252 (measured in H.264).
+# Where another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
 BESIDE_CLIPPING_CODE = wp.constant(248)
 
 
@@ -179,11 +179,7 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
     text = read_text(path, SceneError, expected="256 lines of three linear values")
     try:
         values = np.array(
-            [
-                [float(word) for word in line.replace(",", " ").split()]
-                for line in text.splitlines()
-                if line.strip()
-            ]
+            [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
         )
     except ValueError as error:
         raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None

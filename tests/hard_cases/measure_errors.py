@@ -37,7 +37,7 @@ TWINS = (
     "tests/test_mirror_ball.py::test_matches_twin",
     "tests/test_composite.py::test_matches_twin",
     "tests/test_declip.py::test_matches_twin",
-    "tests/test_expose.py::test_box_matches_twin",
+    "tests/test_expose.py::test_boxes_match_their_twins",
 )
 """Tests that call ``tests.error_model.check_error``."""
 

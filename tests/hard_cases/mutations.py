@@ -225,11 +225,11 @@ MUTATIONS = (
     ),
     Mutation(
         10,
-        "the printed shader's plain lerp: weight two at alpha = -1",
+        "the printed shader's plain lerp: weight two for the flat term at alpha = -1",
         "kernels/relight.py",
         "    weight = wp.min(wp.abs(alpha), 1.0)\n",
         "    weight = wp.min(alpha, 1.0)\n",
-        "tests/test_relight.py::test_paper_is_exact_at_its_three_cases",
+        "tests/test_relight.py::test_paper_in_its_three_cases_by_hand",
     ),
     Mutation(
         10,

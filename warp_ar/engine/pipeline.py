@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
+import numbers
+import os
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -53,6 +56,19 @@ def resolve_quality(quality: str | Quality) -> Quality:
     return PRESETS[quality]
 
 
+def _check_number(name: str, value: object, above: float = -math.inf) -> None:
+    """Raise UsageError if an argument is no finite number, or not above a bound."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
+        right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
+        raise UsageError(f"{name} = {value!r}: expected {right}")
+
+
+def _check_exposure(scene: Scene) -> None:
+    scale = scene.exposure.scale
+    if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
+        raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
+
+
 class Pipeline:
     """Lights frames: call it with one frame after another of one camera.
 
@@ -91,6 +107,10 @@ class Pipeline:
             UsageError: An argument that cannot be used.
             SceneError: The scene's camera does not fit ``size``.
         """
+        for exposure in exposures:
+            _check_number("exposures", exposure, above=0.0)
+        _check_exposure(scene)
+        self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
         self.scene = dataclasses.replace(scene, camera=self.camera)
@@ -126,10 +146,22 @@ class Pipeline:
 
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
+        if self._closed or os.getpid() != self._process:
+            return  # a fork has neither the threads nor the device
+        self._closed = True
         if self._renderer is not None:
             self._renderer.shutdown()
         self.inputs.close()
         self._scheduler.close()
+
+    def _check_usable(self) -> None:
+        if self._closed:
+            raise UsageError("the pipeline is closed; make another one")
+        if os.getpid() != self._process:
+            raise UsageError(
+                f"the pipeline was made in process {self._process}, of which this one is a fork without its "
+                "threads and its device; make another one here, or start processes by spawn"
+            )
 
     @property
     def scheduler(self) -> Scheduler:
@@ -156,7 +188,10 @@ class Pipeline:
 
         Raises:
             SceneError: The scene's camera does not fit the size of the frames.
+            UsageError: The pipeline is closed, or another process's.
         """
+        self._check_usable()
+        _check_exposure(scene)
         self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
         if skeleton(scene) != skeleton(self.scene):
@@ -172,10 +207,12 @@ class Pipeline:
 
     def warm_up(self) -> None:
         """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline."""
+        self._check_usable()
         self._scheduler.warm_up()
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
+        self._check_usable()
         self._finish()
         other._finish()
         self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
@@ -206,7 +243,8 @@ class Pipeline:
             exposure_time: Seconds; None means the longest of the pipeline's exposures.
 
         Raises:
-            UsageError: The image has another size or type.
+            UsageError: The image has another size or type, a number is not finite, the pipeline is closed, or it is
+                another process's.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=False)
 
@@ -230,6 +268,13 @@ class Pipeline:
         self, image: Any, time_seconds: float | None, pose: Pose | None, exposure_time: float | None, *, ahead: bool
     ) -> Result:
         """Look at a frame and have it rendered, by this thread or, if ``ahead``, by another where it is the host's."""
+        self._check_usable()
+        if time_seconds is not None:
+            _check_number("time_seconds", time_seconds)
+        if exposure_time is not None:
+            _check_number("exposure_time", exposure_time, above=0.0)
+        if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
+            raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         host_image = self._accept(image)
         handed_over = ahead and host_image is not None
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
