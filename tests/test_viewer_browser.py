@@ -313,17 +313,17 @@ def test_dragging_switching_and_the_budget(open_tab: Callable[..., Tab], artefac
     page.screenshot(path=artefacts / "time.png")
 
     # The budget says at once what a time buys and how far off that is; the picture follows.
-    set_budget = "v => { const r = document.getElementById('budget'); r.value = v; r.dispatchEvent(new Event('input')); }"
-    page.evaluate(set_budget, 900)
+    slide = "v => { const r = document.getElementById('budget'); r.value = v; r.dispatchEvent(new Event('input')); }"
+    page.evaluate(slide, 900)
     tab.until("document.querySelectorAll('#buys li').length > 5", "the methods that it buys")
     costly = page.inner_text("#buys")
-    page.evaluate(set_budget, 0)
+    page.evaluate(slide, 0)
     assert page.inner_text("#buys") != costly, "the methods do not follow the hand"
     assert re.search(r"This buys about [\d.]+ ms a frame, [\d.]+ FLIP off the best", page.inner_text("#budget-note"))
     tab.until("warpAr.scene.quality === 'auto' && warpAr.state.budget === 1", "the budget's own quality")
     tab.until("warpAr.state.auto.settings.environment_shadow === 'none'", "the cheapest methods")
     tab.until("document.querySelector('#stages li[data-stage=environment_shadow]').classList.contains('out')")
-    page.evaluate(set_budget, 600)
+    page.evaluate(slide, 600)
     page.wait_for_timeout(1000)
     page.screenshot(path=artefacts / "budget.png")
     page.click("#budget-on")

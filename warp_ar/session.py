@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.accuracy.budget import AutoPipeline
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
 from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.scene import Scene, SourceSpec, load_calibration, load_scene
-from warp_ar.stages.quality import DEFAULT_PRESET, Quality
+from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
 
 
 def _where(spec: SourceSpec) -> str | int | Path:
