@@ -293,7 +293,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         matter.directionality = receiver.key_lights[0].directionality
         if wp.static(reading is not None):
             if wp.static(reading is not None and reading.values == "video"):
-                matter.m = wp.float32(intensity(receiver.frame[row, col])) / 255.0
+                matter.m = wp.float32(intensity(receiver.picture.frame[row, col])) / 255.0
             else:
                 matter.m = luminance(radiance)
         else:
