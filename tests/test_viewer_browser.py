@@ -33,7 +33,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 
-PATIENCE = 90.0  # seconds that anything may take on a busy machine
+PATIENCE = 180.0  # seconds that anything may take on a busy machine
 FRAMES = 48
 BITS, CELL = 8, 12  # the time code: squares along the picture's bottom edge, black or white
 # Half way between black and white, which JPEG moves by a few levels.

@@ -401,7 +401,8 @@ class Server:
         sender = asyncio.create_task(self._send_safely(viewer))
         try:
             viewer.tell(json.dumps(self._hello()))
-            for message in host.greetings():
+            # Not here: to tell how large a mesh is, its file is read.
+            for message in await asyncio.get_running_loop().run_in_executor(self._hands, host.greetings):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(host.light()))
             await self._receive(viewer)
