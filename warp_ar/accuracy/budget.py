@@ -61,12 +61,7 @@ from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
-from warp_ar.stages.quality import Quality
-
-AUTO = "auto"
-"""Name of the quality that this file is about."""
-DEFAULT_BUDGET_MS = 33.0
-"""Thirty frames per second."""
+from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 
 AIM = 0.9
 """Share of the budget that is planned for at first, and when there is too much to do."""

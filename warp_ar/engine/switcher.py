@@ -136,8 +136,12 @@ class PipelineSwitcher:
         if wait and target is not self._shown:
             self._drop_building()
             self._wanted = target
-            ready = self._ready()
-            self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            try:
+                ready = self._ready()
+                self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            except WarpArError:
+                self._wanted = self._shown
+                raise
             return self.pipeline
         self.want(target, prepare)
         return self.take()

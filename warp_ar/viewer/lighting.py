@@ -101,7 +101,8 @@ class Lighting:
         """What is being built, for a line on the page; None while nothing is."""
         if not self.busy:
             return None
-        name, done, count = self._progress or (self._now.quality.name, 0, 0)
+        target = self._then if self._then is not None and not self.changing else self._first or self._now
+        name, done, count = self._progress or (target.quality.name, 0, 0)
         return {"quality": name, "done": done, "count": count}
 
     def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
