@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.input.tracking import printed_cells
+from warp_ar.input.marker_pattern import printed_cells
 from warp_ar.kernels.recover import SurfacePoint
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.scene import Scene
