@@ -154,11 +154,11 @@ class EvidenceConfig:
     """In which irradiance counts."""
     block: float = 0.12
     """Metres of a surface that count, or not, together."""
-    response: float = 0.05
+    response: float = 0.02
     """Standard deviation of the logarithm of the response's exponent."""
-    white: float = 0.03
+    white: float = 0.02
     """The same of the card's reflectance."""
-    ball: float = 0.03
+    ball: float = 0.02
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
