@@ -162,11 +162,11 @@ class EvidenceConfig:
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
-    doubt: float = 0.5
+    doubt: float = 1.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
     share: float = 0.1
     """Of draws that an estimate may be too much for."""
-    safety: float = 0.9
+    safety: float = 1.0
     """Of what the others allow."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
