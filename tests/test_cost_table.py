@@ -40,7 +40,7 @@ def test_turning_changes_nothing_else():
 
 
 def test_bad_turns_are_refused():
-    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected top_mip"):
+    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected sphere_mip"):
         turn(PRESETS["medium"], {"irradiance": "sh9"})
     with pytest.raises(UsageError, match="nothing called 'colour'"):
         turn(PRESETS["medium"], {"colour": "red"})

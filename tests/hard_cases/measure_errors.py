@@ -17,6 +17,7 @@ from tests.error_model import worst
 TWINS = (
     "tests/test_unwrap.py::test_corners_match_twin",
     "tests/test_unwrap.py::test_gather_matches_twin",
+    "tests/test_sphere_map.py::test_matches_twin",
     "tests/test_environment.py::test_accumulation_matches_twin",
     "tests/test_environment.py::test_fill_matches_twin",
     "tests/test_environment.py::test_irradiance_is_that_of_a_facing_surface",

@@ -19,11 +19,13 @@ from warp_ar.stages.prefilter import Prefilter
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.relight import Relight
 from warp_ar.stages.shade import Shade
+from warp_ar.stages.sphere_map import SphereMap
 from warp_ar.stages.summed_area import SummedArea
 from warp_ar.stages.unwrap import Unwrap
 from warp_ar.stages.visibility import Visibility
 
 STAGES: tuple[type[Stage], ...] = (
+    SphereMap,
     Unwrap,
     Bracket,
     Accumulate,
