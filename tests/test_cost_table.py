@@ -153,4 +153,11 @@ def test_price_list_is_checked():
     with pytest.raises(UsageError, match=r"errors\.irradiance\.sh2 is -1"):
         read_errors({"errors": {"irradiance": {"sh2": -1}}})
     errors = read_errors({"errors": {"irradiance": {"top_mip": 0.5, "sh4": 0.1}}})
-    assert errors["irradiance"] == {"top_mip": 0.5, "sh2": 0.5, "sh4": 0.1, "clusters": 0.1, "brute_force": 0.1}
+    assert errors["irradiance"] == {
+        "sphere_mip": 0.0,
+        "top_mip": 0.5,
+        "sh2": 0.5,
+        "sh4": 0.1,
+        "clusters": 0.1,
+        "brute_force": 0.1,
+    }
