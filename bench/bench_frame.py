@@ -131,7 +131,7 @@ def floors(pipeline: Pipeline, bandwidth: float) -> dict[str, float]:
     """Least milliseconds of each stage: its bytes over the copy bandwidth, or its rays over the rate of bare rays."""
     width, height = pipeline.size
     pixels, arrays = width * height, pipeline.arrays
-    params = pipeline._block.host("params")[0]
+    params = pipeline.inputs.block.host("params")[0]
     objects, lit = _area(params["object_rect"]), _area(params["light_rect"])
     texels = 2 * pipeline.quality.environment_height**2
     moved = {

@@ -69,12 +69,11 @@ from warp_ar.kernels.codes import (
     set_code,
     store_codes,
 )
-from warp_ar.kernels.color import decode, encode
+from warp_ar.kernels.color import decode, encode, is_clipped
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.summed_area import box_mean
-from warp_ar.kernels.unwrap import is_clipped
 
 wp.set_module_options({"enable_backward": False})
 

@@ -19,11 +19,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe
-from warp_ar.kernels.unwrap import is_clipped, mix, project
+from warp_ar.kernels.unwrap import mix
 
 wp.set_module_options({"enable_backward": False})
 

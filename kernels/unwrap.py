@@ -30,10 +30,11 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene, vec8
+from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
 
 wp.set_module_options({"enable_backward": False})
@@ -48,27 +49,10 @@ RIM_WIDTH = 1.5
 
 MAX_SAMPLES = wp.constant(8)  # per side of a texel
 HALF_DENSITY = wp.constant(wp.float32(4.0))  # pixels per steradian: a ball of 8 pixels across
-CLIPPING_CODE = wp.constant(254)  # video codecs and JPEG bring a clipped 255 back as 254 now and then
-# Chroma at half the resolution (4:2:0) lowers the clipped blue of a small lamp to 239 to 252 (measured in H.264). Where
-# another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
-BESIDE_CLIPPING_CODE = wp.constant(248)
 NEWTON_STEPS = wp.constant(12)  # 2 to 4 are taken from half a metre; more only where the camera almost touches the ball
 CONVERGED = wp.constant(wp.float32(1.0e-7))  # squared angle: 0.02 degrees, which the step then taken squares once more
 FOLD_TOLERANCE = wp.constant(wp.float32(3.0))  # pixels
 CONTACT = wp.constant(wp.float32(0.02))  # radii: what touches the ball does not hide the point that it touches
-
-
-@wp.func
-def distort(point: wp.vec2, k: vec8) -> wp.vec2:
-    """Where the lens puts a normalised image point: OpenCV's rational model, k = k1 k2 p1 p2 k3 k4 k5 k6."""
-    x = point[0]
-    y = point[1]
-    r2 = x * x + y * y
-    radial = (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-    return wp.vec2(
-        x * radial + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x),
-        y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y,
-    )
 
 
 @wp.func
@@ -113,16 +97,6 @@ def any_perpendicular(axis: wp.vec3) -> wp.vec3:
     if wp.abs(axis[0]) > 0.6:
         other = wp.vec3(0.0, 1.0, 0.0)
     return wp.normalize(wp.cross(axis, other))
-
-
-@wp.func
-def project(params: FrameParams, from_camera: wp.vec3) -> wp.vec3:
-    """Pixel and depth of a point given relative to the camera in world axes; only a positive depth has a pixel."""
-    p = wp.transpose(params.world_from_camera) * from_camera
-    if p[2] <= 0.0:
-        return wp.vec3(0.0, 0.0, p[2])
-    at = distort(wp.vec2(p[0] / p[2], p[1] / p[2]), params.distortion)
-    return wp.vec3(params.focal[0] * at[0] + params.principal[0], params.focal[1] * at[1] + params.principal[1], p[2])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,18 +249,6 @@ def project_corners(
         [corners_out],
         rows=rows,
         device=corners_out.device,
-    )
-
-
-@wp.func
-def is_clipped(code: wp.vec3ub) -> wp.vec3:
-    """1 in the channels that are at clipping."""
-    largest = wp.max(wp.max(wp.int32(code[0]), wp.int32(code[1])), wp.int32(code[2]))
-    from_code = wp.where(largest >= CLIPPING_CODE, BESIDE_CLIPPING_CODE, CLIPPING_CODE)
-    return wp.vec3(
-        wp.where(wp.int32(code[0]) >= from_code, 1.0, 0.0),
-        wp.where(wp.int32(code[1]) >= from_code, 1.0, 0.0),
-        wp.where(wp.int32(code[2]) >= from_code, 1.0, 0.0),
     )
 
 

@@ -245,8 +245,8 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
         for setting in a:
             if a[setting] == b[setting]:
                 continue
-            ladder = machine.controller._ladders[setting]
-            assert abs(ladder.index(a[setting]) - ladder.index(b[setting])) == 1
+            methods = machine.controller._methods[setting]
+            assert abs(methods.index(a[setting]) - methods.index(b[setting])) == 1
             assert now - moved.get(setting, -1.0) >= SETTING_SECONDS - 1e-9
             moved[setting] = now
 
@@ -320,8 +320,8 @@ def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
     for shown in range(count or 100):
         # As in ``show_again``: stages rest where nothing changes, and their times with them.
         pipeline(image - (shown % 2) * (image // 8), time_seconds=shown / FPS)
-        if pipeline._building is not None:
-            pipeline._building.result()
+        if pipeline._switcher.busy:
+            pipeline._switcher._building.result()
         if not count and pipeline.status()["changes"]:
             return
 

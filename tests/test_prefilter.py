@@ -9,7 +9,7 @@ from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import prefilter, pyramid
+from warp_ar.kernels import guards, prefilter, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays
@@ -329,7 +329,7 @@ def test_bad_texels_are_contained(device, method):
     values = run(radiance, method).numpy()
     assert np.isfinite(values).all()
     assert (values >= 0).all()
-    assert values.max() <= float(pyramid.MAX_RADIANCE) * 4
+    assert values.max() <= float(guards.MAX_RADIANCE) * 4
 
 
 @pytest.mark.parametrize("method", METHODS)

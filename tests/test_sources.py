@@ -403,7 +403,7 @@ def test_empty_and_foreign_files(tmp_path: pathlib.Path) -> None:
     (tmp_path / "text.mp4").write_text("This is not a video. " * 100)
     assert "cannot be read as a video" in error_of(tmp_path / "text.mp4")
     (tmp_path / "text.txt").write_text("This is not a video. " * 100)
-    assert "no video stream, only text" in error_of(tmp_path / "text.txt")
+    assert "cannot be read as a video" in error_of(tmp_path / "text.txt")
 
 
 def test_sound_alone_is_no_video(tmp_path: pathlib.Path) -> None:

@@ -8,7 +8,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import latlong as latlong_reference
 from tests.reference import unwrap as reference
-from warp_ar.kernels import environment, unwrap
+from warp_ar.kernels import fill, key_lights, unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import (
     BOX,
@@ -534,11 +534,11 @@ def test_unknown_method(device):
 
 def filled(radiance, confidence):
     height, width = confidence.shape
-    levels = wp.zeros(environment.fill_level_offsets(height, width)[-1], dtype=wp.vec4)
+    levels = wp.zeros(fill.fill_level_offsets(height, width)[-1], dtype=wp.vec4)
     out = wp.zeros((height, width), dtype=wp.vec3)
-    environment.seed_fill(wp.array(radiance, dtype=wp.vec3), wp.array(confidence, dtype=wp.float32), levels)
-    environment.push_pull(levels, height, width)
-    environment.finish_fill(levels, out)
+    fill.seed_fill(wp.array(radiance, dtype=wp.vec3), wp.array(confidence, dtype=wp.float32), levels)
+    fill.push_pull(levels, height, width)
+    fill.finish_fill(levels, out)
     return out
 
 
@@ -558,8 +558,8 @@ def test_light_directions_of_real_photographs(device, shared, number):
     view.rotation = np.diag([1.0, -1.0, -1.0])
     radiance, confidence, _ = unwrapped(view, image, [((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))], height=64)
     lights = wp.zeros(1, dtype=KeyLight)
-    cells = wp.zeros(environment.CELL_SUMS, dtype=wp.vec4)
-    environment.find_key_lights(filled(radiance, confidence), wp.zeros(64, dtype=wp.vec4), cells, lights)
+    cells = wp.zeros(key_lights.SECTOR_SUMS, dtype=wp.vec4)
+    key_lights.find_key_lights(filled(radiance, confidence), wp.zeros(64, dtype=wp.vec4), cells, lights)
     light = lights.numpy()[0]
     cosine = light["direction"] @ expected / np.linalg.norm(expected)
     assert np.degrees(np.arccos(min(cosine, 1.0))) < 1.0

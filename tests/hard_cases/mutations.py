@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         6,
         "negative light accumulates",
-        "kernels/environment.py",
+        "kernels/guards.py",
         "    if wp.min(radiance) < 0.0:\n        return 0.0\n",
         "",
         f"{HARD}test_row06_garbage.py::test_what_is_no_light_is_gone_with_its_frame",
@@ -153,7 +153,7 @@ MUTATIONS = (
     Mutation(
         6,
         "filters take texels as they are",
-        "kernels/pyramid.py",
+        "kernels/guards.py",
         "    if value > 0.0:  # false for NaN\n        return wp.min(value, MAX_RADIANCE)\n    return 0.0\n",
         "    return value\n",
         f"{HARD}test_row06_garbage.py::test_any_map_gives_finite_light",
@@ -177,10 +177,10 @@ MUTATIONS = (
     Mutation(
         7,
         "a running mean that loses a little every frame",
-        "kernels/environment.py",
+        "kernels/accumulate.py",
         "        m = m + a * (x - m)\n",
         "        m = 0.99999 * m + a * (x - m)\n",
-        "tests/test_environment.py::test_no_drift_over_ten_thousand_frames",
+        "tests/test_accumulate.py::test_no_drift_over_ten_thousand_frames",
     ),
     Mutation(
         7,
@@ -234,10 +234,10 @@ MUTATIONS = (
     Mutation(
         10,
         "the strongest light of an even environment dominates it",
-        "kernels/environment.py",
+        "kernels/key_lights.py",
         "light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)",
         "light.directionality = alone",
-        "tests/test_environment.py::test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share",
+        "tests/test_key_lights.py::test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share",
     ),
     Mutation(
         11,
@@ -427,7 +427,7 @@ MUTATIONS = (
     Mutation(
         18,
         "holes are filled by a mean that is not normalised",
-        "kernels/environment.py",
+        "kernels/fill.py",
         "                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
         "                mean += (weight / area) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
         f"{HARD}test_row18_energy.py::test_a_constant_environment_under_any_mask",

@@ -44,7 +44,7 @@ from warp_ar.stages.request import Request
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""
 ENVIRONMENT_HEIGHT = 16
-MAY_BE_INFINITE = ("hit_depth", "lamps.distance")
+MAY_BE_INFINITE = ("lamps.distance",)
 """Outputs that are documented to be infinite where there is nothing, or nothing near."""
 
 

@@ -118,7 +118,7 @@ def furnace_for(rig_for):
 
     def made(stage, method, material):
         rig = rig_for(stage, method)
-        scene = rig.pipeline._host_scene.ray_scene
+        scene = rig.pipeline.inputs.host_scene.ray_scene
         for array in (scene.materials, scene.proxies):
             used.append((array, array.numpy().copy()))
         records = scene.materials.numpy().copy()

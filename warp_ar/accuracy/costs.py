@@ -25,6 +25,7 @@ import warp as wp
 from warp_ar.accuracy.cost_table import MethodCost, Scales, Setting, chosen, light_only, turn
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
+from warp_ar.engine.switcher import let_go
 from warp_ar.input.tracking import Tracker
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import PRESETS, Quality
@@ -215,6 +216,7 @@ def _time_stages(
                 break
         worked = time.process_time() - begun
         on_cpu = pipeline.device.is_cpu
+    let_go(pipeline)
     if spread and on_cpu:
         return {NOW_AND_THEN: worked_ms(worked / count, clock)}
     return {name: statistics.median(own) for name, own in times.items()}

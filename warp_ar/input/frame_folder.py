@@ -7,8 +7,8 @@ carries is applied. A folder whose frames alternate between exposures says so in
 
 from __future__ import annotations
 
-import json
 import math
+import os
 import pathlib
 import re
 from collections.abc import Generator, Sequence
@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.errors import SourceError, reason
+from warp_ar.errors import SourceError
+from warp_ar.files import parse_json, read_text
 from warp_ar.input.source import (
     DEFAULT_FPS,
     Frame,
@@ -30,6 +31,7 @@ from warp_ar.input.source import (
     names_in,
     nearest_name,
 )
+from warp_ar.pictures import read_picture
 
 Image = npt.NDArray[np.uint8]
 
@@ -91,22 +93,9 @@ class FrameFolder(RecordedSource):
 
 def _read_image(path: pathlib.Path) -> Image:
     """8-bit RGB of an image file, as the module's docstring says."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"frame {path} cannot be read: {reason(error)}") from error
-    if not data:
-        raise SourceError(f"frame {path} is empty (0 bytes); an image is needed")
-    # libpng would refuse a file without its last chunk too, but writes to stderr when it does.
-    if data.startswith(b"\x89PNG") and b"IEND\xaeB`\x82" not in data:
-        raise SourceError(f"frame {path} is cut off after {len(data)} bytes; copy the whole file")
-    try:
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
-    except cv2.error as error:
-        raise SourceError(f"frame {path} cannot be decoded: {reason(error)}") from error
-    if picture is None:
-        raise SourceError(f"frame {path} cannot be decoded: damaged, cut off, or no image")
-    return rgb8(picture, f"frame {path}")
+    label = f"frame {path}"
+    picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
+    return rgb8(picture, label)
 
 
 def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
@@ -126,12 +115,9 @@ def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
 def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:
     """Exposures in seconds by file name or in turn, from the folder's sidecar; empty where there is none."""
     path = folder / SIDECAR
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{path} cannot be read: {reason(error)}") from error
+    table = parse_json(read_text(path, SourceError, expected="JSON"), str(path), SourceError)
     if not isinstance(table, dict | list) or not table:
         raise SourceError(
             f'{path} must hold an object such as {{"0000.png": 0.008}}, seconds by file name, or a list such as '

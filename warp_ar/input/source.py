@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SourceError, UsageError, reason
+from warp_ar.files import kind_of
 
 Image = npt.NDArray[np.uint8]
 
@@ -183,11 +184,13 @@ def distinct(exposures: Iterable[float]) -> tuple[float, ...]:
 def existing_path(path: pathlib.Path) -> pathlib.Path:
     """``path`` if it exists, else an error that names the nearest object that does."""
     try:
-        if path.exists():
-            return path
+        if (kind := kind_of(path)) != "nothing":
+            if kind in ("file", "folder"):
+                return path
+            raise SourceError(f"{path} is {kind}; frames are read from folders, files and capture devices")
         # The first part that is missing is the one that was mistyped.
         missing = path
-        while not missing.parent.exists():
+        while kind_of(missing.parent) == "nothing":
             missing = missing.parent
     except OSError as error:
         raise SourceError(f"{path} cannot be read: {reason(error)}") from error

@@ -9,9 +9,11 @@ Frames may alternate between exposures, of which only one is shown: the others t
 
 from __future__ import annotations
 
+import os
 import pathlib
 from collections.abc import Sequence
 
+from warp_ar.errors import SourceError
 from warp_ar.input.capture_device import CaptureDevice
 from warp_ar.input.frame_folder import IMAGE_SUFFIXES, FrameFolder
 from warp_ar.input.live_source import QueueSource
@@ -29,6 +31,10 @@ __all__ = [
     "VideoFile",
     "open_source",
 ]
+
+
+MOST_INDEX = 1023
+"""Largest index of a capture device."""
 
 
 def open_source(
@@ -52,8 +58,10 @@ def open_source(
     check_fps(fps)
     check_exposures(exposures)
     text = str(spec)
-    if isinstance(spec, int) or (text.isdecimal() and not pathlib.Path(text).exists()):
-        return CaptureDevice(int(spec) if isinstance(spec, int) else int(text), fps=fps, exposures=exposures)
+    if isinstance(spec, int) or (text.isdecimal() and not os.path.lexists(text)):
+        if len(text) > 4 or not 0 <= (index := int(text)) <= MOST_INDEX:
+            raise SourceError(f"there is no capture device {text[:40]}; they are numbered from 0 to {MOST_INDEX}")
+        return CaptureDevice(index, fps=fps, exposures=exposures)
     if text.startswith("synthetic:"):
         return Synthetic(text.removeprefix("synthetic:"), fps=fps or DEFAULT_FPS, loop=loop)
     if "://" in text:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 
 from warp_ar.errors import SourceError, reason
+from warp_ar.files import limits, too_much
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
 Image = npt.NDArray[np.uint8]
@@ -22,6 +23,13 @@ Image = npt.NDArray[np.uint8]
 HD_HEIGHT = 720
 """Rows from which a video that names no colour matrix is BT.709; below, BT.601: what players do, and encoders
 expect."""
+
+# Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
+_FORMATS = (
+    "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
+    "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
+)
+_OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
 # Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
 _TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
@@ -75,21 +83,31 @@ class VideoFile(RecordedSource):
 
     def _open(self) -> Any:
         try:
-            container = av.open(str(self._path))
-        except (av.FFmpegError, OSError) as error:
+            container = av.open(str(self._path), options=_OPTIONS)
+        except (av.FFmpegError, OSError, ValueError) as error:
             raise SourceError(
                 f"{self._path} cannot be read as a video ({reason(error)}): damaged, cut off, or no video file"
             ) from error
-        # FFmpeg draws any text file as a picture.
-        if not container.streams.video or container.format.name == "tty":
-            kinds = (
-                "text"
-                if container.format.name == "tty"
-                else ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
-            )
+        try:
+            self._check_stream(container)
+        except BaseException:
             container.close()
-            raise SourceError(f"{self._path} has no video stream, only {kinds}; choose a file with pictures")
+            raise
         return container
+
+    def _check_stream(self, container: Any) -> None:
+        if not container.streams.video:
+            kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
+            raise SourceError(f"{self._path} has no video stream, only {kinds}; choose a file with pictures")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise SourceError(f"{self._path} has a video stream of no known codec; choose another encoding")
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if width * height > limits().picture_pixels:
+            label = f"{self._path} is {width}x{height}: a frame of it"
+            raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
+        # The size may change on the way.
+        stream.codec_context.options = {"max_pixels": str(limits().picture_pixels)}
 
     def _decode(self) -> Generator[Frame, None, None]:
         with self._open() as container:
@@ -124,7 +142,7 @@ class VideoFile(RecordedSource):
                     break
                 packets += packet.size > 0
                 pictures = packet.decode()
-            except (av.FFmpegError, OSError) as error:
+            except (av.FFmpegError, OSError, ValueError) as error:
                 damage = reason(error)
             for picture in pictures:
                 yield to_rgb(picture), picture.time

@@ -9,10 +9,12 @@ from typing import Any, Protocol, runtime_checkable
 
 import warp as wp
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import TRACK, Result
+from warp_ar.errors import printable
 from warp_ar.scene import Pose
 from warp_ar.stages import STAGES
 
@@ -129,7 +131,8 @@ def left_out(plan: Plan) -> list[tuple[str, str]]:
 def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     """Print the table of stages: what runs, with ``log`` its median times too, and what is left out and why."""
     request = plan.request
-    table = Table(title=f"{request.scene.name}, quality {request.quality.name}, {request.size[0]}x{request.size[1]}")
+    name = escape(printable(request.scene.name))
+    table = Table(title=f"{name}, quality {request.quality.name}, {request.size[0]}x{request.size[1]}")
     table.add_column("stage")
     table.add_column("method")
     table.add_column("state")

@@ -10,6 +10,7 @@ import collections
 import contextlib
 import pathlib
 import tempfile
+import threading
 from abc import ABC, abstractmethod
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
@@ -19,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SinkError, reason
+from warp_ar.files import kind_of
 
 Image = npt.NDArray[np.uint8]
 
@@ -31,6 +33,12 @@ class Sink(ABC):
 
     description: str
     """One line for people, with a note where the frames are changed."""
+
+    written: int = 0
+    """Frames that are stored; of a sink that failed, those that are whole."""
+
+    replaced: str = ""
+    """What is lost by its first frame, in words; empty where that is nothing."""
 
     @abstractmethod
     def write(self, image: Image) -> None:
@@ -71,6 +79,7 @@ class ThreadedSink(Sink):
         self._closed = False
         self._shape: tuple[int, ...] | None = None
         self._count = 0
+        self._counting = threading.Lock()
 
     def _check(self, image: npt.NDArray[Any]) -> None:
         """Raise SinkError if the array is of a kind that cannot be written."""
@@ -92,8 +101,13 @@ class ThreadedSink(Sink):
         self._settle(FRAMES_WAITING - 1)
         if self._error is not None:
             raise self._error
-        self._pending.append(self._executor.submit(self._store, self._count, image.copy()))
+        self._pending.append(self._executor.submit(self._keep, self._count, image.copy()))
         self._count += 1
+
+    def _keep(self, index: int, image: npt.NDArray[Any]) -> None:
+        self._store(index, image)
+        with self._counting:
+            self.written += 1
 
     def _settle(self, waiting: int) -> None:
         """Wait until at most ``waiting`` frames are left, and raise what went wrong first."""
@@ -121,7 +135,7 @@ class ThreadedSink(Sink):
 
 
 class NullSink(Sink):
-    """Takes frames and forgets them; ``count`` tells how many."""
+    """Takes frames and forgets them; ``count`` tells how many there were."""
 
     description = "nowhere"
 
@@ -143,6 +157,7 @@ class TeeSink(Sink):
     def __init__(self, *sinks: Sink) -> None:
         self._sinks = sinks
         self.description = " and ".join(sink.description for sink in sinks) or NullSink.description
+        self.replaced = "; ".join(sink.replaced for sink in sinks if sink.replaced)
 
     def write(self, image: Image) -> None:
         """Give the frame to every sink, in order."""
@@ -164,9 +179,9 @@ def check_image(image: npt.NDArray[Any]) -> None:
 
 def make_folder(path: pathlib.Path) -> None:
     """Make the folder and its parents, and find out whether files can be made in it."""
-    if path.exists() and not path.is_dir():
-        raise SinkError(f"{path} is a file, not a folder to write to")
     try:
+        if (kind := kind_of(path)) not in ("folder", "nothing"):
+            raise SinkError(f"{path} is {'a file' if kind == 'file' else kind}, not a folder to write to")
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass

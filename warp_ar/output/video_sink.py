@@ -18,9 +18,12 @@ import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.output.places import PROGRAM, check_replaceable
 from warp_ar.output.sink import ThreadedSink, make_folder
+from warp_ar.output.whole_fragments import WholeFragments
 
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
+_FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
+VIDEO_SUFFIXES = tuple(_FORMATS)
 """What `VideoSink` writes."""
 
 CRF = 18
@@ -34,39 +37,35 @@ class VideoSink(ThreadedSink):
     """H.264 in MP4, MOV or Matroska: yuv420p, BT.709, limited range, tagged as such.
 
     Chroma at half resolution needs even sizes: an odd one is padded by repeating the last row or column, and the
-    description says so. A file that exists is replaced when the first frame comes; if none comes, it is left as it was.
+    description says so. A file that exists is replaced when the first frames are on the disk; if none come, or none
+    fits there, it is left as it was.
 
     Args:
         path: The file.
         fps: Frames per second.
         size: (width, height) of the frames in pixels, if known.
+        overwrite: Whether a file that this program did not write may be replaced.
 
     Raises:
-        SinkError: The file cannot be written or has another ending.
+        SinkError: The file cannot be written, may not be replaced, or has another ending.
         UsageError: ``fps`` is not a positive number.
     """
 
-    def __init__(self, path: str | pathlib.Path, *, fps: float, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, path: str | pathlib.Path, *, fps: float, size: tuple[int, int] | None = None, overwrite: bool = False
+    ) -> None:
         self._path = pathlib.Path(path)
         if not (math.isfinite(fps) and fps > 0):
             raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
         if self._path.suffix.lower() not in VIDEO_SUFFIXES:
             raise SinkError(f"{self._path} must end in {', '.join(VIDEO_SUFFIXES)} to be a video")
-        if self._path.is_dir():
-            raise SinkError(f"{self._path} is a folder; name a file, or a folder without {self._path.suffix}")
+        self.replaced = check_replaceable(self._path, overwrite=overwrite)
         make_folder(self._path.parent)
-        existed = self._path.exists()
-        try:
-            with self._path.open("ab"):
-                pass
-            if not existed:
-                self._path.unlink()
-        except OSError as error:
-            raise SinkError(f"{self._path} cannot be written: {reason(error)}") from error
         self._fps = fps
         self._rate = fractions.Fraction(fps).limit_denominator(1001)
         self._broken = False
         self._container: Any = None
+        self._file: WholeFragments | None = None
         self._stream: Any = None
         self._converter: Any = None
         self.description = f"{self._path} (H.264, {fps:g} fps)"
@@ -93,7 +92,10 @@ class VideoSink(ThreadedSink):
         flags = "hybrid_fragmented+frag_keyframe+empty_moov+default_base_moof"
         fragments = {"movflags": flags} if movie else {"cluster_time_limit": str(round(1000 * FRAGMENT_SECONDS))}
         group = max(1, round(FRAGMENT_SECONDS * self._fps))
-        self._container = av.open(str(self._path), "w", options={**fragments, "flush_packets": "1"})
+        self._file = WholeFragments(self._path, boxes=movie)
+        options = {**fragments, "flush_packets": "1"}
+        self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
+        self._container.metadata["comment"] = PROGRAM
         self._stream = self._container.add_stream(
             "libx264",
             rate=self._rate,
@@ -120,24 +122,43 @@ class VideoSink(ThreadedSink):
             self._converter.push(picture)
             picture = self._converter.pull()
             self._container.mux(self._stream.encode(picture))
+            self._check_file()
         except (av.FFmpegError, OSError) as error:
             self._broken = True
             raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
 
+    def _check_file(self) -> None:
+        if self._file is not None and self._file.error is not None:
+            raise self._file.error
+
     def _finish(self) -> None:
-        if self._container is None:
-            return
         container, self._container = self._container, None
         try:
             try:
-                if not self._broken:
+                if container is not None and not self._broken:
                     container.mux(self._stream.encode(None))
             finally:
-                container.close()
+                if container is not None:
+                    container.close()
+                if self._file is not None:
+                    self._file.close()
+            self._check_file()
         except (av.FFmpegError, OSError) as error:
             # After a frame that could not be written, the end cannot be either: once is enough.
             if self._error is None:
                 raise SinkError(f"{self._path} cannot be finished: {reason(error)}") from error
+        finally:
+            if self._broken or (self._file is not None and self._file.error is not None):
+                self.written = _count_frames(self._path)
+
+
+def _count_frames(path: pathlib.Path) -> int:
+    """Frames of a video that was not finished, of which the encoder held some back."""
+    try:
+        with av.open(str(path)) as container:
+            return sum(packet.size > 0 for packet in container.demux(video=0))
+    except (av.FFmpegError, OSError, ValueError):
+        return 0
 
 
 def _rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
-import re
 import struct
 import zipfile
 import zlib
@@ -16,7 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
+from warp_ar.files import is_file, read_bytes
+from warp_ar.pictures import read_picture
 from warp_ar.scene.geometry import Mesh, make_mesh, smooth_normals
+from warp_ar.scene.mesh_assets import Assets, check_counts, check_gltf
 
 FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
@@ -57,21 +60,15 @@ def load_texture(path: str | Path) -> ByteArray:
     """Read a picture as a base colour texture.
 
     Args:
-        path: Any 8-bit picture that OpenCV reads; deeper ones are reduced, alpha is dropped, grey becomes RGB.
+        path: PNG, JPEG, BMP, TIFF, WebP, GIF or PNM; deeper than 8 bits is reduced, alpha dropped, grey becomes RGB.
 
     Returns:
         (h, w, 3) RGB, sRGB-encoded, row 0 at the top.
 
     Raises:
-        SceneError: The file is missing or no picture.
+        SceneError: The file is missing, no picture, or too large.
     """
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot read the texture: {error.strerror}") from error
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
-    if image is None:
-        raise SceneError(f"{path}: not a picture that can be read; use PNG or JPEG")
+    image = read_picture(path, cv2.IMREAD_COLOR_RGB, SceneError, f"{path}: the texture")
     result: ByteArray = np.asarray(image, dtype=np.uint8)
     return result
 
@@ -97,20 +94,26 @@ def load_mesh(path: str | Path) -> Mesh:
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
+    if not is_file(path):
         raise SceneError(f"{path}: no such mesh file")
+    data = read_bytes(path, "mesh_bytes", SceneError)
+    assets = Assets(path, library_first=path.suffix.lower() == ".obj")
+    check_counts(path, data)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        check_gltf(path, data, assets)
     import trimesh  # here, since it takes half a second and most scenes need no file
 
     try:
-        scene = trimesh.load_scene(str(path), process=False)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=assets, process=False)
         parts = [part for node in scene.graph.nodes_geometry if (part := _read_part(path, scene, node)) is not None]
     except SceneError:
         raise
     except _LOADER_ERRORS as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
-    if path.suffix.lower() == ".obj" and any(part.image is None for part in parts):
-        _check_obj_texture(path)
+    # What else than a colour a glTF file may name, such as normals, is not read.
+    if path.suffix.lower() == ".obj" and assets.problem is not None:
+        raise assets.problem
     if not parts:
         raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
     return _join(path, parts)
@@ -169,17 +172,6 @@ def _read_part(path: Path, scene: Any, node: str) -> _Part | None:
     if uvs is None or getattr(image, "format", None) is None:
         image = None
     return _Part(vertices, faces, normals, uvs, image)
-
-
-def _check_obj_texture(path: Path) -> None:
-    """Say which texture of an OBJ file is missing: trimesh leaves it out without a word."""
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        library = next((line.split(maxsplit=1)[1].strip() for line in lines if re.match(r"mtllib\s+\S", line)), None)
-    if library is None or not (path.parent / library).is_file():
-        return
-    text = (path.parent / library).read_text(encoding="utf-8", errors="replace")
-    for name in re.findall(r"(?im)^[ \t]*map_Kd[ \t]+(\S.*?)[ \t]*$", text):
-        load_texture(path.parent / name)
 
 
 def _join(path: Path, parts: list[_Part]) -> Mesh:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import accumulate
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
@@ -48,7 +48,7 @@ class Accumulate(Stage):
             "environment_radiance": ArraySpec(shape, wp.vec3),
             "environment_confidence": ArraySpec(shape, wp.float32),
             "environment_clipped": ArraySpec(shape, wp.vec3),
-            "accumulate_change": ArraySpec(environment.change_shape(*shape), wp.vec2),
+            "accumulate_change": ArraySpec(accumulate.change_shape(*shape), wp.vec2),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -57,7 +57,7 @@ class Accumulate(Stage):
         radiance, confidence, clipped = (arrays[name] for name in self.wiring.reads[:3])
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_change(
+            accumulate.measure_change(
                 radiance,
                 confidence,
                 arrays["environment_radiance"],
@@ -66,8 +66,8 @@ class Accumulate(Stage):
                 rows=rows,
             )
 
-        def accumulate(rows: Rows | None) -> None:
-            environment.accumulate_environment(
+        def follow(rows: Rows | None) -> None:
+            accumulate.accumulate_environment(
                 radiance,
                 confidence,
                 clipped,
@@ -79,4 +79,4 @@ class Accumulate(Stage):
                 rows=rows,
             )
 
-        return [Pass(measure), Pass(accumulate, rows=height)]
+        return [Pass(measure), Pass(follow, rows=height)]

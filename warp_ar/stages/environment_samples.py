@@ -82,7 +82,7 @@ class EnvironmentSamples(Stage):
 
             def place(rows: Rows | None) -> None:
                 for one in found:
-                    environment_samples.place_lamps(arrays["lamps"], one)
+                    environment_samples.place_emitters(arrays["lamps"], one)
 
             passes.append(Pass(place))
         return passes

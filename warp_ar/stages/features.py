@@ -82,8 +82,8 @@ class Features:
     @property
     def near_names(self) -> tuple[str, ...]:
         """Resources of what surrounds the objects, those that their materials show."""
-        diffuse = () if self.distant.diffuse == "none" else ("object_irradiance",)
-        return (*diffuse, "object_mirrored") if self.distant.specular else diffuse
+        diffuse = () if self.distant.diffuse == "none" else ("near_irradiance",)
+        return (*diffuse, "near_reflected") if self.distant.specular else diffuse
 
 
 def find_features(request: Request) -> Features:
@@ -144,5 +144,5 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLi
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
         specular=environment and any(map(reflects_glossily, materials)),
         probes=environment,
-        lamps=emitters,
+        emitters=emitters,
     )

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import change, fill
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 
@@ -42,7 +42,7 @@ class Fill(Stage):
         shape = (height, 2 * height)
         return {
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
-            "fill_levels": ArraySpec((environment.fill_level_offsets(*shape)[-1],), wp.vec4),
+            "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
             "fill_difference": ArraySpec((height,), wp.float32),
         }
@@ -58,18 +58,18 @@ class Fill(Stage):
             most = 1.0 / max(min(min(probe.reflectance) for probe in self.request.scene.probes), 1e-3)
 
         def seed(rows: Rows | None) -> None:
-            environment.seed_fill(
+            fill.seed_fill(
                 arrays["environment_radiance"], arrays["environment_confidence"], arrays["fill_levels"], rows=rows
             )
 
         def push_pull(rows: Rows | None) -> None:
-            environment.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
+            fill.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
 
         def finish(rows: Rows | None) -> None:
-            environment.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
+            fill.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_difference(
+            change.measure_difference(
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import key_lights
 from warp_ar.kernels.structs import KeyLight
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -38,17 +38,17 @@ class KeyLights(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The lights and the sums on the way to them."""
         return {
-            "key_lights": ArraySpec((environment.KEY_LIGHT_COUNT,), KeyLight),
+            "key_lights": ArraySpec((key_lights.KEY_LIGHT_COUNT,), KeyLight),
             "key_lights_sums": ArraySpec((self.request.quality.environment_height,), wp.vec4),
-            "key_lights_cells": ArraySpec((environment.CELL_SUMS,), wp.vec4),
+            "key_lights_sectors": ArraySpec((key_lights.SECTOR_SUMS,), wp.vec4),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One short series of launches."""
 
         def find(rows: Rows | None) -> None:
-            environment.find_key_lights(
-                arrays["environment"], arrays["key_lights_sums"], arrays["key_lights_cells"], arrays["key_lights"]
+            key_lights.find_key_lights(
+                arrays["environment"], arrays["key_lights_sums"], arrays["key_lights_sectors"], arrays["key_lights"]
             )
 
         return [Pass(find)]

@@ -15,6 +15,7 @@ from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.picture import make_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
@@ -27,7 +28,9 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     """What the mirrored part of a request's scene calls for."""
     layers = features.layers
     # What a ball shows of an object is too small for what surrounds it at close range.
-    shading = dataclasses.replace(shade_config(features), near=False, edge_samples=1) if "virtual" in layers else None
+    shading = None
+    if "virtual" in layers:
+        shading = dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
     lit = "physical_added" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(features.request.scene),
@@ -40,7 +43,7 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
 
 def mirrored_relighting(features: Features) -> RelightConfig:
     """How the desk that a ball shows responds: cells of the frame say nothing about it."""
-    return dataclasses.replace(relight_config(features), share=False, bounced=False)
+    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
 class MirrorBall(Stage):
@@ -103,25 +106,22 @@ class MirrorBall(Stage):
         relighting = mirrored_relighting(self.features)
         irradiance = self.features.irradiance
         lit = config.relight is not None
-        desk = make_receiver(
+        receiver = make_receiver(
             relighting,
-            arrays["frame"],
-            arrays["decode"],
-            None,
-            arrays["probes"],
-            arrays["key_lights"] if "key_lights" in reads else None,
-            arrays[irradiance] if lit and irradiance in reads else None,
-            arrays["lamps"] if "lamps" in reads else None,
+            make_picture(arrays),
+            probes=arrays["probes"],
+            key_lights=arrays["key_lights"] if "key_lights" in reads else None,
+            irradiance=arrays[irradiance] if lit and irradiance in reads else None,
+            emitters=arrays["lamps"] if "lamps" in reads else None,
         )
         shading = config.shade
         distant = DistantLight() if shading is None else make_distant_light(self.features, arrays, self.name)
         inputs = (
             arrays["params"],
-            arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if "lights" in reads else None,
             distant,
-            desk,
+            receiver,
             arrays["shadow_ratio"] if config.ratio else None,
         )
 

@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import change
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
+from warp_ar.light.config import CONFIG
+from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -28,7 +30,7 @@ LATENCY = 0.1
 """Seconds, by the frames' clock, after which an estimate takes effect, unless the request is to wait for it: it is
 solved for beside them. They are fixed, so that the same frames give the same pictures; where it is not solved for in
 time, the frame waits."""
-MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
+MOST_LAMPS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
 @dataclasses.dataclass
@@ -97,11 +99,11 @@ class Recover(Stage):
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         cells = kernels.cell_shape(*shape)
-        self._surfaces = recovery.find_surfaces(self.request.scene, card_only=self.method == "white_card")
+        self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
-            **{name: ArraySpec((recovery.PEAKS,), Emitter) for name in self.wiring.writes if name == "lamps"},
+            **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_lacking": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
@@ -201,7 +203,7 @@ class Recover(Stage):
             )
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_difference(
+            change.measure_difference(
                 arrays["environment"], arrays["recover_published"], arrays["recover_difference"], rows=rows
             )
 
@@ -294,7 +296,7 @@ class Recover(Stage):
         now.estimate = solution.estimate
         values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
         if "lamps" in self.wiring.writes:
-            records = np.zeros(recovery.PEAKS, np.dtype(Emitter.numpy_dtype()))
+            records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
             for record, lamp in zip(records, solution.estimate.lamps, strict=False):
                 record["origin"], record["direction"] = lamp.origin, lamp.direction
                 record["distance"], record["power"] = lamp.distance, lamp.power

@@ -39,8 +39,12 @@ class Unwrap(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The exact one where the quality names none."""
+        """The exact one where the quality names none; exact too for frames of several exposures, which the paper's
+        texture does not know.
+        """
         method = super().method_for(features)
+        if method == "sphere_map" and features.merged:
+            return "bilinear"
         return method if method in cls.methods else "area"
 
     @classmethod

@@ -11,6 +11,7 @@ from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import make_visible
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -32,7 +33,7 @@ class Visibility(Stage):
         """Left out of scenes without virtual objects."""
         if not features.request.scene.objects:
             return LeftOut(NO_OBJECT)
-        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hit_depth", "hits"))
+        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
@@ -47,9 +48,9 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        outputs = [arrays[name] for name in ("hit_object", "hit_depth", "hits")]
+        visible = make_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
-            trace_pixels(config, *inputs, *outputs, rows=rows)
+            trace_pixels(config, *inputs, visible, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]

@@ -1,4 +1,4 @@
-"""The time/accuracy dial: what a budget buys on this device, and how far off that is.
+"""The page's budget: what a time per frame buys on this device, and how far off that is.
 
 Errors come from the cost table, costs from measurements on this device, both as for ``--quality auto``; they are
 measured here one method at a time between other work, so that frames and edits go on meanwhile.
@@ -6,11 +6,14 @@ measured here one method at a time between other work, so that frames and edits 
 
 from __future__ import annotations
 
+import collections
 import dataclasses
-from collections.abc import Callable, Generator
+import statistics
+import time
+from collections.abc import Generator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -23,12 +26,18 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import WarpArError
 from warp_ar.scene import Pose
 from warp_ar.stages.quality import PRESETS, Quality
+from warp_ar.viewer.controls import Notify
+
+_COST_FRAMES: Final = 30
+"""Frames whose median tells what a preset costs."""
+_SETTLED: Final = 10
+"""Frames of a new pipeline that do not count."""
 
 
-class Dial:
+class BudgetSetting:
     """Holds the budget and what it buys. The thread that lights frames calls its methods, unless they say otherwise."""
 
-    def __init__(self, notify: Callable[[dict[str, Any]], None], folder: Path | None = None) -> None:
+    def __init__(self, notify: Notify, folder: Path | None = None) -> None:
         """Start switched off.
 
         Args:
@@ -47,6 +56,8 @@ class Dial:
         self._failed: str | None = None
         self._settings: tuple[Setting, ...] = ()
         self._stopped = False
+        self._preset_ms: dict[str, collections.deque[float]] = {}
+        self._since_restart = 0
 
     @property
     def budget(self) -> float | None:
@@ -60,7 +71,7 @@ class Dial:
 
     @property
     def measuring(self) -> bool:
-        """Whether costs are being measured: frames do well to leave environment for that."""
+        """Whether costs are being measured: frames do well to leave time for that."""
         return self._progress is not None
 
     def switch(self, budget: float | None) -> None:
@@ -77,7 +88,7 @@ class Dial:
         return dataclasses.replace(BASE, name=AUTO)
 
     def look(self, pipeline: Pipeline, image: npt.NDArray[np.uint8], pose: Pose | None, helper: Executor) -> None:
-        """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as the dial is on.
+        """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as there is a budget.
 
         Args:
             pipeline: What lights the frames, with the scene as it is edited.
@@ -118,7 +129,7 @@ class Dial:
         finally:
             self._progress = progress
         self._notify(self.record())
-        if progress is not None:
+        if progress is not None and not self._stopped:
             helper.submit(self._step, helper, steps, key)
 
     def _adopt(self, costs: Costs | None) -> None:
@@ -130,7 +141,7 @@ class Dial:
         self._controller, self._offer = controller, self._list(controller, costs)
 
     def choose(self, milliseconds: float | None, now: float) -> Quality | None:
-        """What to run under the budget, or None while that is not known or the dial is off.
+        """What to run under the budget, or None while that is not known or there is no budget.
 
         Args:
             milliseconds: What the last frame took; None if it says nothing about the present choice.
@@ -145,8 +156,36 @@ class Dial:
             controller.observe(milliseconds, now)
         return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
 
+    def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
+        """Note what a frame took; what to run from now on, as ``choose`` has it.
+
+        Args:
+            preset: Name of the quality that it was lit by.
+            milliseconds: What it took; None if it says nothing about that quality.
+        """
+        self._since_restart += 1
+        counts = milliseconds is not None and not self.measuring
+        if counts and milliseconds is not None and self._since_restart > _SETTLED:
+            self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
+        return self.choose(milliseconds if counts else None, time.monotonic())
+
+    def costs(self) -> dict[str, float]:
+        """Median milliseconds per frame of every preset that has run on this scene. From any thread."""
+        return {name: round(statistics.median(ms), 2) for name, ms in list(self._preset_ms.items()) if ms}
+
+    def forget_costs(self, preset: str | None = None) -> None:
+        """What a preset took says nothing of it any more; None means all: another scene is shown. From any thread."""
+        for name in [preset] if preset is not None else list(self._preset_ms):
+            self._preset_ms.pop(name, None)
+
+    @staticmethod
+    def rules(quality: Quality) -> bool:
+        """Whether a quality is a budget's choice."""
+        return quality.name == AUTO
+
     def restart(self) -> None:
         """Forget the frames so far: another pipeline lights those to come."""
+        self._since_restart = 0
         if self._controller is not None:
             self._controller.restart()
 
@@ -164,28 +203,26 @@ class Dial:
 
     def record(self) -> dict[str, Any]:
         """All that can be bought, as a message for the page. From any thread."""
-        return {"type": "dial", "measuring": self._progress, "known": self._controller is not None, **self._offer}
+        return {"type": "budget", "measuring": self._progress, "known": self._controller is not None, **self._offer}
 
     def _list(self, controller: Controller, costs: Costs) -> dict[str, Any]:
         names = [setting.name for setting in self._settings]
-        ladders = {setting.name: list(setting.methods) for setting in self._settings}
+        methods = {setting.name: list(setting.methods) for setting in self._settings}
         return {
             "base": costs.base,
-            "ladders": ladders,
+            "settings": methods,
             "choices": [
                 {
                     "ms": round(choice.milliseconds, 3),
                     "error": round(choice.error, 5),
-                    "methods": [ladders[name].index(dict(choice.settings)[name]) for name in names],
+                    "methods": [methods[name].index(dict(choice.settings)[name]) for name in names],
                 }
                 for choice in controller.choices
             ],
-            "presets": {
-                name: method_cost for name in PRESETS if (method_cost := self._price(PRESETS[name], costs)) is not None
-            },
+            "presets": {name: cost for name in PRESETS if (cost := self._cost_of(PRESETS[name], costs)) is not None},
         }
 
-    def _price(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
+    def _cost_of(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
         """What a preset should cost and err; None where it has methods that are not measured."""
         methods = {setting.name: chosen(quality, setting) for setting in self._settings}
         if any(method not in costs.methods[setting] for setting, method in methods.items()):
