@@ -39,8 +39,9 @@ class Unwrap(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The exact one where the quality names none; exact too for frames of several exposures, which the paper's
-        texture does not know.
+        """The exact one where the quality names none.
+
+        Exact too for frames of several exposures: the sphere map is a texture of one.
         """
         method = super().method_for(features)
         if method == "sphere_map" and features.merged:
