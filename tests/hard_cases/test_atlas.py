@@ -96,6 +96,6 @@ def test_the_table_adds_reports_up(tmp_path: pathlib.Path) -> None:
     assert found["CUDA"][1, "unwrap", "bilinear"] == [False, True]
     assert found["CPU"][1, "unwrap", "bilinear"] == [True, True]
     made = table.make_table(found, "")
-    assert "| 1 | unwrap | bilinear area | 1/2 (2 tests) | FAILED: bilinear |" in made
+    assert "| 1 | unwrap | sphere_map bilinear area | 1/3 (2 tests) | FAILED: bilinear |" in made
     assert "| 15 | track | default |  | on the host |" in made
     assert table.make_table({"CPU": {}, "CUDA": {}}, made).splitlines()[2] == made.splitlines()[2], "kept"
