@@ -76,6 +76,7 @@ class Session:
             chosen = _where(spec)
         own = self.scene.source if source is None else None
         fps, exposures = (own.fps, own.exposures or ()) if own is not None else (None, ())
+        shown = own.shown if own is not None else None
         self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
         self.decode_ms = 0.0
         """Milliseconds that the source took for its last frame."""
@@ -93,6 +94,7 @@ class Session:
                     size=self.source.size,
                     outputs=outputs,
                     exposures=self.source.exposures,
+                    shown=shown,
                 )
             else:
                 self.pipeline = Pipeline(
@@ -102,6 +104,7 @@ class Session:
                     size=self.source.size,
                     outputs=outputs,
                     exposures=self.source.exposures,
+                    shown=shown,
                     waits=not self.source.live,
                 )
         except BaseException:

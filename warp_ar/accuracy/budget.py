@@ -375,6 +375,7 @@ class AutoPipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         costs: Costs | None = None,
         folder: Path | None = None,
@@ -389,6 +390,7 @@ class AutoPipeline:
             size: Width and height of the frames; None means the scene's.
             outputs: What results shall hold.
             exposures: As for ``Pipeline``.
+            shown: As for ``Pipeline``.
             bands: Bands of rows per CPU pass; None means one per core.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
@@ -406,6 +408,7 @@ class AutoPipeline:
             "size": size,
             "outputs": outputs,
             "exposures": tuple(exposures),
+            "shown": shown,
             "bands": bands,
         }
         self._given, self._folder, self._clock = scene, folder or cache_folder(), clock

@@ -23,7 +23,7 @@ from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image, Picture, Slot, Transfers
 from warp_ar.errors import UsageError
-from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.structs import Probe
@@ -174,6 +174,7 @@ class Pipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         profile: bool = False,
         waits: bool = False,
@@ -186,8 +187,9 @@ class Pipeline:
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
-            exposures: Exposure times in seconds between which the frames alternate. Frames of the longest are lit and
-                shown; the others tell what clips in it.
+            exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
+                the others tell what clips in it, and what is too dark.
+            shown: Which: seconds; None means the longest.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
             waits: Whether a frame waits for the light that is estimated from it. A camera's frames should not: that
@@ -202,9 +204,8 @@ class Pipeline:
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
         self.quality = resolve_quality(quality)
-        self._longest = max(exposures, default=1.0)
-        ratios = bracket_ratios(exposures)
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, waits))
+        self.bracket = plan_bracket(exposures, shown)
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, self.bracket.ratios, waits))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -371,7 +372,7 @@ class Pipeline:
         """
         host_image = self._accept(image)
         now, exposure = self._note_time(time_seconds, exposure_time)
-        if exposure > 0:
+        if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
         if host_image is None:
             self._finish()
@@ -428,19 +429,19 @@ class Pipeline:
         host_image = self._accept(image)
         self._finish()
         now, exposure = self._note_time(time_seconds, exposure_time)
-        if exposure > 0:
+        if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
         frame, state = self._look(image, host_image, now, pose)
         if host_image is not None and not frame.lost and self._transfers is not None:
             frame = dataclasses.replace(frame, slot=self._transfers.upload(host_image))
         return Result(frame.pose, state, _done(self._render(frame)))
 
-    def _note_time(self, time_seconds: float | None, exposure_time: float | None) -> tuple[float, int]:
+    def _note_time(self, time_seconds: float | None, exposure_time: float | None) -> tuple[float, int | None]:
         """When a frame was taken, and which of the exposures it has."""
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:
             self._start_time = self._last_time = self._lit_time = now
-        return now, find_exposure(exposure_time, self._longest, self.plan.request.exposures)
+        return now, find_exposure(exposure_time, self.bracket)
 
     def _look(
         self, image: Any, host_image: Image | None, now: float, pose: Pose | None
@@ -485,24 +486,25 @@ class Pipeline:
         self,
         image: Any,
         host_image: npt.NDArray[np.uint8] | None,
-        exposure: int,
+        exposure: int | None,
         now: float,
         pose: Pose | None,
     ) -> Result:
-        """Let a frame of another exposure tell of the light; the picture stays."""
+        """Let a frame of another exposure tell of the light, unless that was left out; the picture stays."""
         self._finish()
         timings: dict[str, StageTiming] = {}
         state: TrackState | None = None
         bright: Any = image
         if self._shown is None or (self._tracker is not None and pose is None):
             picture = image.numpy() if host_image is None else host_image
-            bright = brightened(picture, self._decode, self.plan.request.exposures[exposure])
+            ratio = 1.0 if exposure is None else self.bracket.ratios[exposure]
+            bright = brightened(picture, self._decode, ratio)
         if self._tracker is not None and pose is None:
             start = time.perf_counter()
             track = self._tracker.track(bright, now)
             timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
             pose, state = track.pose, track.state
-        if self._short is not None and pose is not None:
+        if self._short is not None and pose is not None and exposure is not None:
             start = time.perf_counter()
             with exclusive(self.device):
                 self._short.take(image, exposure, pose, self._block.host("params"), now)

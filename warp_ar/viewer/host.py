@@ -25,7 +25,7 @@ from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
 from warp_ar.input.card import write_card
-from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.input.sources import Frame, QueueSource, Source, open_source
 from warp_ar.input.tracking import TrackState
 from warp_ar.output.report import left_out, stage_names
@@ -165,7 +165,7 @@ class _Slot:
     def _fits(self, pipeline: Pipeline, target: _Target) -> bool:
         request = pipeline.plan.request
         same = (request.quality, pipeline.size, request.outputs) == (target.quality, target.size, target.outputs)
-        same = same and request.exposures == bracket_ratios(target.exposures)
+        same = same and request.exposures == plan_bracket(target.exposures).ratios
         return same and pipeline.update(target.scene)
 
     def follow(self, target: _Target, *, wait: bool = False) -> Pipeline | None:
