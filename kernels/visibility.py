@@ -32,7 +32,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
@@ -67,6 +67,14 @@ class Hit:
     geometric_normal: wp.vec3  # of the surface that rays meet
     uv: wp.vec2
     error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
+
+
+@wp.struct
+class VisibleObjects:
+    """The virtual objects that pixels show."""
+
+    objects: wp.array2d[wp.int32]  # index of the object; -1 where there is none
+    hits: wp.array2d[Hit]  # defined only where there is an object
 
 
 @wp.func
@@ -191,6 +199,16 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
     if shape.tree != wp.uint64(0):
         return walk_any(shape.tree, entry, direction, t_max - start)
     return wp.mesh_query_ray_anyhit(shape.mesh, entry, direction, t_max - start)
+
+
+@wp.func
+def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    """Whether a mirror ball lies in the way."""
+    for index in range(probes.shape[0]):
+        probe = probes[index]
+        if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
+            return True
+    return False
 
 
 @wp.func
@@ -466,6 +484,29 @@ def make_primary(config: TraceConfig) -> wp.Function:
     return closest_visible
 
 
+@functools.cache
+def make_visible_proxy(config: TraceConfig, probes: bool) -> wp.Function:
+    """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
+
+    A face that is seen from behind, or a mirror ball before it, is not what the camera sees of it.
+    """
+    closest_proxy = make_trace(config).closest_proxy
+
+    @wp.func(module="unique")
+    def visible_proxy(params: FrameParams, ray: wp.vec2, scene: RayScene, balls: wp.array[Probe]) -> Hit:
+        direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params.camera_position, direction, FAR)
+        if hit.shape >= 0:
+            if wp.dot(hit.geometric_normal, direction) >= 0.0:
+                hit.shape = -1
+            if wp.static(probes):
+                if meets_probe(balls, params.camera_position, direction, hit.t):
+                    hit.shape = -1
+        return hit
+
+    return visible_proxy
+
+
 def check_edge_samples(count: int) -> None:
     """Raise an error unless ``make_sample_direction`` can place so many samples.
 
@@ -512,24 +553,19 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         # Out:
-        hit_object_out: wp.array2d[wp.int32],
-        hit_depth_out: wp.array2d[wp.float32],
-        hits_out: wp.array2d[Hit],
+        visible_out: VisibleObjects,
     ):
         i, j = wp.tid()
         i += row_start
         found = wp.int32(-1)
-        depth = wp.float32(wp.inf)
         if inside_rect(i, j, params[0].object_rect):
             ray = rays[i, j]
             direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
             hit = closest_visible(scene, params[0].camera_position, direction)
             if hit.shape >= 0:
                 found = hit.shape
-                depth = hit.t
-                hits_out[i, j] = hit
-        hit_object_out[i, j] = found
-        hit_depth_out[i, j] = depth
+                visible_out.hits[i, j] = hit
+        visible_out.objects[i, j] = found
 
     return trace_pixels_kernel
 
@@ -539,9 +575,7 @@ def trace_pixels(
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
-    hit_object_out: wp.array2d[wp.int32],
-    hit_depth_out: wp.array2d[wp.float32],
-    hits_out: wp.array2d[Hit],
+    visible_out: VisibleObjects,
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -552,16 +586,14 @@ def trace_pixels(
         params: Frame values: camera and object_rect.
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
         scene: What rays meet.
-        hit_object_out: (H, W) index of the visible object; -1 where there is none, and outside the rectangle.
-        hit_depth_out: (H, W) depth along the camera's z axis in metres, infinity where there is none.
-        hits_out: (H, W) the hits; defined only where there is an object.
+        visible_out: (H, W) the objects and hits.
         rows: Band of rows; None means all.
     """
     launch_rows(
         make_trace_pixels_kernel(config),
         rays.shape,
         [params, rays, scene],
-        [hit_object_out, hit_depth_out, hits_out],
+        [visible_out],
         rows=rows,
         device=rays.device,
     )

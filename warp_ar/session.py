@@ -105,7 +105,7 @@ class Session:
                     outputs=outputs,
                     exposures=self.source.exposures,
                     shown=shown,
-                    waits=not self.source.live,
+                    synchronous=not self.source.live,
                 )
         except BaseException:
             self.source.close()

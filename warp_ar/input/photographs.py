@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SourceError
-from warp_ar.input.sources import read_image
+from warp_ar.input.frame_folder import read_image
 from warp_ar.scene.exif import PhotoInfo, exposure_in_name, read_exif
 
 Image = NDArray[np.uint8]

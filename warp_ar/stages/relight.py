@@ -6,20 +6,20 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
-from warp_ar.kernels.environment_shadow import count_parts
-from warp_ar.scene.ray_scene import proxies_face, trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import shares_environment
-from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.environment_samples import SAMPLES
-from warp_ar.stages.recover import knows_emitters
-from warp_ar.stages.shade import casts_soft, sees_near
-from warp_ar.stages.visibility import GrowingRows
+from warp_ar.kernels.launch import count_partials
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.request import Request
+from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
+from warp_ar.stages.shared.environment_sets import SAMPLES
+from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.relighting import relight_config, relight_reads
+from warp_ar.stages.shared.rows import GrowingRows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Grain:
     """How finely cells of the desk are estimated."""
 
     samples: int
-    """Of the environment, for its share."""
-    share: int
-    """Pixels per cell of the environment's share, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
+    """Of the environment, for ambient visibility."""
+    ambient: int
+    """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
     bounced: int
     """The same, of bounced light."""
     patch: int
@@ -37,55 +37,69 @@ class Grain:
 
 
 GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
-"""Methods that know the environment's own shadows on the desk and one bounce of virtual light; else they are
-``reflectance``."""
+"""By method of ``features.LOCAL``: else these are ``reflectance``."""
 STRIDE_ROWS = 480
 
 
 class Relight(Stage):
     """Adds what virtual lights send to the proxies, shadowed, to the desk in the frame."""
 
-    name = "relight"
-    methods = (*relight.METHODS, *GRAINS)
-    summary = "virtual light and its shadows on the physical desk"
+    name: ClassVar[str] = "relight"
+    methods: ClassVar[Mapping[str, str]] = {
+        "flat": "on a grey desk",
+        "paper": "blended by the frame's brightness (the paper)",
+        "directional": "the same, as far as the environment's light has a direction",
+        "relief": "the paper's blend, relief told from paint",
+        "reflectance": "on the reflectance that frame and environment light give",
+        "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
+        "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
+    }
+    summary: ClassVar[str] = "virtual light and its shadows on the physical desk"
+    subject: ClassVar[str] = "virtual light on the real desk"
+    settings: ClassVar[tuple[str, ...]] = (
+        "edge_samples",
+        "light_shadow",
+    )
+    unseen_method: ClassVar[str | None] = "paper"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32 over an integer table; sums over samples and patches",
+        bound=5e-5,
+        cause="a dozen roundings, sums over a thousand terms; shadow edges fall to either side",
+        measured=3e-07,
+        rows=(5, 6, 9, 10, 13, 14, 17),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Reads what its method needs to know of the environment and the desk."""
-        if not request.scene.lights:
-            return LeftOut("the scene has no virtual light")
-        if not request.scene.proxies:
-            return LeftOut("the scene has no proxy for virtual light to fall on")
-        method = relight_method(request)
-        reads = ["pose", "lights", "objects"]
-        if method != "flat":
-            reads += ["frame", "key_lights"]
-        if method in ("relief", "reflectance", *GRAINS):
-            reads.append("summed_area")
-        if method in ("reflectance", *GRAINS):
-            reads.append(irradiance_name(request))
-            reads += ["lamps"] * knows_emitters(request)
-        if shares_environment(request):
-            reads.append("environment_samples")
-        return Wiring(tuple(reads), ("physical_added",))
+    def method_for(cls, features: Features) -> str:
+        """``flat`` where no ball tells anything of the environment."""
+        return features.relight_method
 
-    def gives_way(self) -> tuple[str, ...]:
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Reads what its method needs to know of the environment and the desk."""
+        if not features.request.scene.lights:
+            return LeftOut("the scene has no virtual light")
+        if not features.lit:
+            return LeftOut("the scene has no proxy for virtual light to fall on")
+        return Wiring(relight_reads(features), ("physical_added",))
+
+    def runs_after(self) -> tuple[str, ...]:
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
-        return () if sees_near(self.request) else ("environment_shadow",)
+        return () if self.features.near_field else ("environment_shadow",)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
         specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
-            specs["relight_seen"] = ArraySpec((height, width), wp.int32)
+            specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
-        if shares_environment(self.request):
-            cells = _cells(self.request, _grain(self.request).share)
-            specs["relight_share"] = ArraySpec(cells, wp.vec3)
-            specs["relight_share_surface"] = ArraySpec(cells, wp.int32, -1)
-        if bounces_virtual(self.request):
-            grain = _grain(self.request)
+        if self.features.ambient_visibility:
+            cells = _cells(self.request, _grain(self.features).ambient)
+            specs["relight_ambient_visibility"] = ArraySpec(cells, wp.vec3)
+            specs["relight_ambient_surface"] = ArraySpec(cells, wp.int32, -1)
+        if self.features.bounced:
+            grain = _grain(self.features)
             cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
             specs["relight_bounced"] = ArraySpec(cells, wp.vec3)
             specs["relight_bounced_surface"] = ArraySpec(cells, wp.int32, -1)
@@ -96,46 +110,49 @@ class Relight(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
-        reads, irradiance = self.wiring.reads, irradiance_name(self.request)
-        config = relight_config(self.request)
+        config = relight_config(self.features)
         relight.make_relight_kernel(config)
-        cells = make_cells(self.request, arrays)
-        distant = arrays[irradiance] if irradiance in reads else None
-        known = (
-            arrays["frame"],
-            arrays["decode"],
-            arrays["summed_area"] if "summed_area" in reads else None,
-            arrays["ray_scene"],
-            arrays["probes"],
-            arrays["light_array"],
-            arrays["key_lights"] if "key_lights" in reads else None,
-            distant,
-        )
-        lamps = arrays["lamps"] if "lamps" in reads else None
-        camera = arrays["params"], arrays["rays"]
-        added, seen = arrays["physical_added"], arrays["relight_seen"] if config.edge_samples > 1 else None
+        receiver = self._receiver(config, arrays)
+        inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
+        added = arrays["physical_added"]
+        visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
         def launch(rows: Rows | None) -> None:
-            relight.relight(config, *camera, *known, added, seen, lamps=lamps, cells=cells, rows=rows)
+            relight.relight(config, *inputs, added, visibility, rows=rows)
 
-        height = self.request.size[1]
-        light_rows = arrays["light_rows"]
-        last = [Pass(launch, rows=height, extent=GrowingRows(light_rows))]
-        frame, decode, table, scene, probes, lights, key_lights, _ = known
-        desk = relight.make_receiver(config, frame, decode, table, probes, key_lights, distant, lamps, cells)
+        height, light_rows = self.request.size[1], arrays["light_rows"]
+        passes = [*self._cell_passes(config, inputs, arrays, device)]
+        passes.append(Pass(launch, rows=height, extent=GrowingRows(light_rows)))
         if config.edge_samples > 1:
             lists = make_edge_lists(arrays, device, self.name)
 
             def smooth(rows: Rows | None) -> None:
-                relight.smooth_edges(config, *camera, scene, lights, desk, seen, added, edge_lists=lists, rows=rows)
+                relight.smooth_edges(config, *inputs, visibility, added, edge_lists=lists, rows=rows)
 
             relight.make_smooth_edges_kernel(config, left=lists is not None)
             if lists is not None:
                 relight.make_sample_edges_kernel(config)
-            last.append(Pass(smooth, rows=height, extent=light_rows))
-        if not (config.share or config.bounced):
-            return last
+            passes.append(Pass(smooth, rows=height, extent=light_rows))
+        return passes
 
+    def _receiver(self, config: relight.RelightConfig, arrays: Arrays) -> relight.Receiver:
+        """What kernels read of the receiver."""
+        names = {
+            "table": "summed_area",
+            "key_lights": "key_lights",
+            "irradiance": self.features.irradiance,
+            "emitters": "lamps",
+        }
+        known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
+        cells = make_cells(self.features, arrays)
+        return relight.make_receiver(config, make_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+
+    def _cell_passes(
+        self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any
+    ) -> list[Pass]:
+        """Ambient visibility and bounced light of cells, where the method knows them."""
+        params, scene, _, receiver = inputs
+        cells, light_rows = receiver.cells, arrays["light_rows"]
         place = receiver_cells.CellConfig(config)
         passes: list[Pass] = []
 
@@ -150,51 +167,49 @@ class Relight(Stage):
 
             return extent
 
-        grain = _grain(self.request)
-        if config.share:
-            share, surface, size = arrays["relight_share"], arrays["relight_share_surface"], cells.share_stride
-            parts = 1 if device.is_cpu else count_parts(*share.shape, receiver_cells.SHARE_PARTS)
+        if config.ambient_visibility:
+            shape = cells.ambient_visibility.shape
+            partials = 1 if device.is_cpu else count_partials(*shape, receiver_cells.MAX_PARTIALS)
             sums = None
-            if parts > 1:
-                sums = wp.empty(receiver_cells.share_sums_shape(parts, *share.shape), dtype=wp.vec3, device=device)
+            if partials > 1:
+                sums = wp.empty(receiver_cells.partial_sums_shape(partials, *shape), dtype=wp.vec3, device=device)
+            samples, count = arrays["environment_samples"], _grain(self.features).samples
 
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
-                own = arrays["environment_samples"], grain.samples, size, share, surface
-                more = {"bounced": bounced, "sums_out": sums, "rows": rows}
-                receiver_cells.share_environment(place, *camera, scene, lights, desk, *own, **more)
+                receiver_cells.estimate_ambient_visibility(
+                    place, *inputs, samples, count, cells, bounced=bounced, sums_out=sums, rows=rows
+                )
 
-            receiver_cells.make_share_environment_kernel(place)
-            passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))
+            receiver_cells.make_ambient_visibility_kernel(place)
+            ambient_rows = rows_of(int(cells.ambient_stride), shape[0], 2)
+            passes.append(Pass(estimate, rows=shape[0], extent=ambient_rows))
         if config.bounced:
-            patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
-            bounced, lit = arrays["relight_bounced"], arrays["relight_bounced_surface"]
-            step, wide = cells.bounced_stride, _stride(self.request, grain.patch)
+            patches, listed, lit_count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
+            wide = _stride(self.request, _grain(self.features).patch)
 
             def send(rows: Rows | None) -> None:
-                receiver_cells.send_light(place, *camera, scene, lights, desk, wide, patches, rows=rows)
+                receiver_cells.send_light(place, *inputs, wide, patches, rows=rows)
 
             def arrange(rows: Rows | None) -> None:
-                receiver_cells.list_patches(patches, listed, count, rows=rows)
+                receiver_cells.list_patches(patches, listed, lit_count, rows=rows)
 
             def gather(rows: Rows | None) -> None:
-                receiver_cells.gather_light(
-                    place, *camera, scene, desk, listed, count, wide, step, bounced, lit, rows=rows
-                )
+                receiver_cells.gather_light(place, params, scene, receiver, listed, lit_count, wide, cells, rows=rows)
 
             receiver_cells.make_send_light_kernel(place)
             receiver_cells.make_gather_light_kernel(place)
-            lit_patches = rows_of(wide, len(patches), 0)
+            lit_patches, height = rows_of(wide, len(patches), 0), len(cells.bounced)
             passes.append(Pass(send, rows=len(patches), extent=lit_patches))
             passes.append(Pass(arrange, rows=len(patches), extent=lit_patches))
-            passes.append(Pass(gather, rows=len(bounced), extent=rows_of(step, len(bounced), 2)))
-            if config.share:
+            passes.append(Pass(gather, rows=height, extent=rows_of(int(cells.bounced_stride), height, 2)))
+            if config.ambient_visibility:
                 again = functools.partial(estimate, bounced=True)
-                passes.append(Pass(again, rows=len(share), extent=rows_of(size, len(share), 2)))
-        return passes + last
+                passes.append(Pass(again, rows=shape[0], extent=ambient_rows))
+        return passes
 
 
-def _grain(request: Request) -> Grain:
-    return GRAINS[relight_method(request)]
+def _grain(features: Features) -> Grain:
+    return GRAINS[features.relight_method]
 
 
 def _stride(request: Request, pixels: int) -> int:
@@ -208,45 +223,15 @@ def _cells(request: Request, pixels: int) -> tuple[int, int]:
     return -(-height // stride), -(-width // stride)
 
 
-def make_cells(request: Request, arrays: Arrays) -> relight.ReceiverCells:
+def make_cells(features: Features, arrays: Arrays) -> relight.ReceiverCells:
     """The cells of a request as kernels read them."""
     cells = relight.ReceiverCells()
-    if relight_method(request) in GRAINS:
-        grain = _grain(request)
-        cells.share_stride, cells.bounced_stride = _stride(request, grain.share), _stride(request, grain.bounced)
-    if shares_environment(request):
-        cells.share, cells.share_surface = arrays["relight_share"], arrays["relight_share_surface"]
-    if bounces_virtual(request):
+    if features.relight_method in GRAINS:
+        grain, request = _grain(features), features.request
+        cells.ambient_stride, cells.bounced_stride = _stride(request, grain.ambient), _stride(request, grain.bounced)
+    if features.ambient_visibility:
+        cells.ambient_visibility = arrays["relight_ambient_visibility"]
+        cells.ambient_surface = arrays["relight_ambient_surface"]
+    if features.bounced:
         cells.bounced, cells.bounced_surface = arrays["relight_bounced"], arrays["relight_bounced_surface"]
     return cells
-
-
-def bounces_virtual(request: Request) -> bool:
-    """Whether lit proxies light each other: where the quality asks for it, and one proxy faces another."""
-    return relight_method(request) in GRAINS and proxies_face(request.scene)
-
-
-def relight_config(request: Request) -> relight.RelightConfig:
-    """What the relighting of a request's desk calls for."""
-    method = relight_method(request)
-    return relight.RelightConfig(
-        "reflectance" if method in GRAINS else method,
-        trace_config(request.scene),
-        "sh" if irradiance_name(request) == "irradiance_sh" else "map",
-        bool(request.scene.probes),
-        casts_soft(request),
-        method in ("reflectance", *GRAINS) and knows_emitters(request),
-        shares_environment(request),
-        bounces_virtual(request),
-        request.quality.edge_samples,
-    )
-
-
-def relight_method(request: Request) -> str:
-    """The quality's method, or ``flat`` where no ball tells anything of the environment."""
-    return request.quality.method(Relight.name) if request.scene.probes else relight.METHODS[0]
-
-
-def irradiance_name(request: Request) -> str:
-    """Resource that holds the environment's irradiance at this quality."""
-    return "irradiance_sh" if request.quality.method("diffuse") == "sh2" else "irradiance_map"

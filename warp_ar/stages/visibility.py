@@ -2,47 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-
-
-class GrowingRows:
-    """Rows of this frame and of the one before: what moved away must be cleared from where it was."""
-
-    def __init__(self, current: Callable[[], Rows]) -> None:
-        self._current = current
-        self._previous: Rows = (0, 0)
-
-    def __call__(self) -> Rows:
-        """Rows to run over; asked once per frame."""
-        rows, previous = self._current(), self._previous
-        self._previous = rows
-        if previous[0] >= previous[1]:
-            return rows
-        if rows[0] >= rows[1]:
-            return previous
-        return min(rows[0], previous[0]), max(rows[1], previous[1])
+from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.rows import GrowingRows
 
 
 class Visibility(Stage):
     """Traces primary rays, only where virtual objects can be on screen."""
 
-    name = "visibility"
-    methods = ("default",)
-    summary = "trace which virtual object each pixel sees, hidden by proxies in front"
+    name: ClassVar[str] = "visibility"
+    summary: ClassVar[str] = "trace which virtual object each pixel sees, hidden by proxies in front"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; error bound carried with every hit",
+        bound=3e-5,
+        cause="twenty roundings at a grazing angle of 3 degrees",
+        measured=4.6e-07,
+        rows=(5, 13, 14, 17),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Left out of scenes without virtual objects."""
-        if not request.scene.objects:
-            return LeftOut("the scene has no virtual object")
-        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hit_depth", "hits"))
+        if not features.request.scene.objects:
+            return LeftOut(NO_OBJECT)
+        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
@@ -57,9 +48,9 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        outputs = [arrays[name] for name in ("hit_object", "hit_depth", "hits")]
+        visible = make_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
-            trace_pixels(config, *inputs, *outputs, rows=rows)
+            trace_pixels(config, *inputs, visible, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]
