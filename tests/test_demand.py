@@ -206,8 +206,8 @@ PATHS: dict[str, tuple[Frame, ...]] = {
     "half for long": (*[(*SHOWN, 0, SHORT)] * 3, *[("near", False, "on", 1, SHORT)] * 14, *[(*SHOWN, 1, SHORT)] * 2),
     "long": (*[(*SHOWN, 0, SHORT)] * 2, *[(*BARE, 1, LONG)] * 9, *[(*SHOWN, 1, SHORT)] * 6),
 }
-"""What is left out of some frames comes back: every reason; light that moves on meanwhile, read by nothing or by half of
-what reads it, a little and for long."""
+"""What is left out of some frames comes back: every reason; light that moves on meanwhile, read by nothing or by half
+of what reads it, a little and for long."""
 
 
 def number_estimates(monkeypatch: pytest.MonkeyPatch) -> None:

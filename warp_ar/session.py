@@ -77,6 +77,7 @@ class Session:
             chosen = _where(spec)
         own = self.scene.source if source is None else None
         fps, exposures = (own.fps, own.exposures or ()) if own is not None else (None, ())
+        shown = own.shown if own is not None else None
         self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
         self.decode_ms = 0.0
         """Milliseconds that the source took for its last frame."""
@@ -95,6 +96,7 @@ class Session:
                     size=self.source.size,
                     outputs=outputs,
                     exposures=self.source.exposures,
+                    shown=shown,
                 )
             else:
                 # The pipeline before a change is kept: results that were handed out may still be read.
@@ -102,7 +104,7 @@ class Session:
                     device=device, keep=1, profile=False, synchronous=not self.source.live
                 )
                 self._target = Target(
-                    self.scene, resolve_quality(quality), self.source.size, outputs, self.source.exposures
+                    self.scene, resolve_quality(quality), self.source.size, outputs, self.source.exposures, shown
                 )
                 self.pipeline = self._switcher.open(self._target)
         except BaseException:

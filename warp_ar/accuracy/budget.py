@@ -370,6 +370,7 @@ class AutoPipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         costs: Costs | None = None,
         folder: Path | None = None,
@@ -384,6 +385,7 @@ class AutoPipeline:
             size: Width and height of the frames; None means the scene's.
             outputs: What results shall hold.
             exposures: As for ``Pipeline``.
+            shown: As for ``Pipeline``.
             bands: Bands of rows per CPU pass; None means one per core.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
@@ -401,7 +403,7 @@ class AutoPipeline:
         self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
         self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
         self._switcher = PipelineSwitcher(device=device, bands=bands, keep=_KEPT_PIPELINES - 1)
-        self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures))
+        self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures), shown)
         self.pipeline = self._switcher.open(self._target)
         """The one that lights the next frame."""
         self._costs = costs
