@@ -399,7 +399,12 @@ def test_any_exposure_can_be_the_shown_one(clip, device, shown):
     found = []
     for choice in (0, shown):
         with Pipeline(
-            make_scene(), device=device, quality="low", outputs=("environment", "image"), exposures=times, shown=times[choice]
+            make_scene(),
+            device=device,
+            quality="low",
+            outputs=("environment", "image"),
+            exposures=times,
+            shown=times[choice],
         ) as pipe:
             for index, (image, pose, seconds) in enumerate(clip * 2):
                 result = pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)

@@ -88,7 +88,9 @@ class ShortFrames:
             Whether one has come in that was not there before: what was accumulated until then had clipped without it,
             and is no mean to start from.
         """
-        told = tuple(index == self._reference or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken))
+        told = tuple(
+            index == self._reference or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken)
+        )
         if told == self._told:
             return False
         self._told = told

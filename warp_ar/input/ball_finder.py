@@ -20,7 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_rim import MOST_COST, RimEvidence, descend, gather_evidence, gather_steps, gradients, radial_compression
+from warp_ar.input.ball_rim import (
+    MOST_COST,
+    RimEvidence,
+    descend,
+    gather_evidence,
+    gather_steps,
+    gradients,
+    radial_compression,
+)
 from warp_ar.scene import Camera
 
 Array = NDArray[np.float64]
@@ -276,9 +284,20 @@ def propose_circles(image: Image, most: int = 8) -> list[tuple[float, float, flo
     gray = cv2.medianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), 3)
     side = min(gray.shape)
     found: list[tuple[float, float, float]] = []
-    for way, edge, votes in ((cv2.HOUGH_GRADIENT_ALT, 120, 0.6), (cv2.HOUGH_GRADIENT_ALT, 60, 0.3), (cv2.HOUGH_GRADIENT, 80, 30)):
+    for way, edge, votes in (
+        (cv2.HOUGH_GRADIENT_ALT, 120, 0.6),
+        (cv2.HOUGH_GRADIENT_ALT, 60, 0.3),
+        (cv2.HOUGH_GRADIENT, 80, 30),
+    ):
         circles = cv2.HoughCircles(
-            gray, way, 1.5, max(side / 20, 4), param1=edge, param2=votes, minRadius=max(side // 40, 5), maxRadius=side * 6 // 10
+            gray,
+            way,
+            1.5,
+            max(side / 20, 4),
+            param1=edge,
+            param2=votes,
+            minRadius=max(side // 40, 5),
+            maxRadius=side * 6 // 10,
         )
         if circles is not None:
             for x, y, r, *_ in circles.reshape(-1, circles.shape[-1])[:most]:
@@ -305,8 +324,12 @@ def find_ball(
     height, width = image.shape[:2]
     camera = camera or far_camera(width, height)
     if rough is not None and (len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0):
-        raise UsageError(f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels")
-    starts = [sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))]
+        raise UsageError(
+            f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
+        )
+    starts = [
+        sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))
+    ]
     starts = [start for start in starts if start[2] > 1.0]
     # Of what a Hough transform proposes, those that look most like a ball; a mirrored edge may be one inside it.
     starts.sort(key=lambda start: -_strength(image, camera, start))

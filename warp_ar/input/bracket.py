@@ -116,7 +116,10 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
         for _ in range(8):
             grow = math.exp(move[2])
-            at = (grow * x + (n - 1) / 2 + move[0]).astype(np.float32), (grow * y + (n - 1) / 2 + move[1]).astype(np.float32)
+            at = (
+                (grow * x + (n - 1) / 2 + move[0]).astype(np.float32),
+                (grow * y + (n - 1) / 2 + move[1]).astype(np.float32),
+            )
             seen = cv2.remap(b, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             ok = well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
             if ok.sum() < LEAST_PIXELS:
@@ -355,7 +358,9 @@ def thin_exposures(exposures: Sequence[float]) -> tuple[tuple[int, ...], tuple[s
     for k in order[1:]:
         ratio = exposures[kept[-1]] / exposures[k]
         if ratio < WAVERING:
-            notes.append(f"exposure {_number(exposures[k])} is left out: {ratio:.2f} times from {_number(exposures[kept[-1]])}")
+            notes.append(
+                f"exposure {_number(exposures[k])} is left out: {ratio:.2f} times from {_number(exposures[kept[-1]])}"
+            )
         else:
             kept.append(k)
     return tuple(kept), tuple(notes)
