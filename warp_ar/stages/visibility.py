@@ -11,7 +11,7 @@ from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -48,7 +48,7 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        visible = make_visible(arrays)
+        visible = find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
             trace_pixels(config, *inputs, visible, rows=rows)
