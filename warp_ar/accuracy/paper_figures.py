@@ -229,7 +229,7 @@ def figure_3(context: Context) -> PaperFigure:
     degrees = (np.arange(NORMALS[1]) + 0.5) / NORMALS[1] * 360.0 - 180.0
     middle = NORMALS[0] // 2
     series = [
-        ("paper: a 4x8 map", degrees, found["paper"][1][middle] @ _LUMINANCE),
+        ("paper: a coarse level", degrees, found["paper"][1][middle] @ _LUMINANCE),
         ("the same light through the cosine lobe", degrees, lobe[middle] @ _LUMINANCE),
         ("ours, with clipped light put back", degrees, found["high"][1][middle] @ _LUMINANCE),
     ]
@@ -238,8 +238,8 @@ def figure_3(context: Context) -> PaperFigure:
     head = ("quality", "mean radiance", "largest radiance", "irradiance upward", "diffuse map, off its cosine lobe")
     text = (
         "Left: the acquired environment map; right: the filtered map for diffuse lighting (sections 3.1 and 3.2). The "
-        "paper's environment is clipped as the camera clips, and its diffuse map is a mean over an eighth of all "
-        "directions."
+        "paper's environment is clipped as the camera clips, and its diffuse map is a coarse level of the ball's "
+        "picture, with the background that surrounds it."
     )
     picture = sheet(list(columns.values()), None, box)
     return PaperFigure(3, "Environment maps", text, tuple(columns), picture, head, tuple(rows), (plot,))
@@ -437,7 +437,10 @@ class Reading:
 
 
 _BLEND = "what the multiplicative factor is taken from"
+_EXACT = {"unwrap": "bilinear", "irradiance": "top_mip", "prefilter": "box_mip"}
 READINGS: tuple[Reading, ...] = (
+    Reading("3.1", "the environment map", "OpenGL's sphere map, boxes over its texture (taken)", {}),
+    Reading("3.1", "the environment map", "exact places on the ball, means over solid angles", _EXACT),
     Reading("4.2", _BLEND, "video values, light added in linear light (taken)", {}),
     Reading("4.2", _BLEND, "linear luminance", {"relight": "paper_linear"}),
     Reading("4.2", _BLEND, "video values, everything else in video values too", {}, video=True),
@@ -450,7 +453,7 @@ READINGS: tuple[Reading, ...] = (
     Reading("4.3", "the factor", "as taken, at most 2 s", {"expose": "box"}),
 )
 """What ``docs/paper.md`` compares."""
-READING_SCENES = ("desk", "wire_coincident", "wire_opposing", "darken")
+READING_SCENES = ("desk", "torus", "wire_coincident", "wire_opposing", "darken")
 """Scenes on which it does."""
 
 
@@ -463,7 +466,7 @@ def compare_readings(
         case = context.case(scene)
         known: dict[tuple[Any, ...], float] = {}
         for reading, errors in found:
-            if (reading.section == "4.3") != case.darker:
+            if not _matters(reading, case):
                 continue
             key = (*sorted(reading.methods.items()), reading.video)
             if key not in known:
@@ -471,6 +474,13 @@ def compare_readings(
                 advance(f"{scene}: {reading.answer}")
             errors[scene] = known[key]
     return found
+
+
+def _matters(reading: Reading, case: Case) -> bool:
+    """Whether a case can tell a reading from others."""
+    if reading.section == "4.3":
+        return case.darker
+    return bool(case.scene.objects if reading.section == "3.1" else case.scene.lights) and not case.darker
 
 
 def _reading_error(context: Context, case: Case, reading: Reading) -> float:
