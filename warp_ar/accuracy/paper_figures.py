@@ -191,8 +191,10 @@ def _setting(name: str) -> Setting:
 def _maps(context: Context, case: Case, quality: Quality) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Environment and irradiance at the end of a case's frames."""
     maps = []
-    for name in ("recover", "irradiance"):
-        outcome = run(case, quality, context.device, _setting(name), between=light_only(quality), timed=1)
+    # A filter that reads the environment's map keeps it in the plan.
+    whole = turn(quality, {"irradiance": "clusters"})
+    for name, shown in (("recover", whole), ("irradiance", quality)):
+        outcome = run(case, shown, context.device, _setting(name), between=light_only(shown), timed=1)
         assert outcome.output is not None
         maps.append(outcome.output)
     return maps[0], maps[1]
