@@ -131,7 +131,11 @@ def url(scene_file: Path, cache: Path, options: list[str]) -> Iterator[str]:
     command = [sys.executable, "-c", LIVE, str(scene_file), "--device", "cpu", "--quality", "low"]
     command += ["--port", "0", "--no-browser", *options]
     # Costs of its own, but the kernels that are compiled already.
-    environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "WARP_CACHE_PATH": str(wp.config.kernel_cache_dir)}
+    environment = {
+        **os.environ,
+        "XDG_CACHE_HOME": str(cache),
+        "WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent),
+    }
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:
