@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import dataclasses
 import faulthandler
+import gc
 import itertools
 import json
 import os
@@ -227,6 +228,9 @@ def serve_page(options: argparse.Namespace) -> int:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
         from warp_ar.viewer.host import Host
 
+        # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+        gc.collect()
+        gc.freeze()
         return Host(
             scene,
             source=options.source,
