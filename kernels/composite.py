@@ -45,6 +45,10 @@ class CompositeConfig:
     mirrored: bool = False
     """What mirror balls show of what is virtual, a change of the frame."""
 
+    def general(self) -> CompositeConfig:
+        """For any scene: layers that it lacks may then be empty."""
+        return CompositeConfig(True, True, True, True)
+
 
 @wp.struct
 class Layers:
@@ -79,16 +83,16 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
         at = LayersAt()
         at.ratio = wp.vec3(1.0, 1.0, 1.0)
         if wp.static(config.virtual):
-            if inside_rect(row, col, params[0].object_rect):
+            if layers.objects.shape[0] > 0 and inside_rect(row, col, params[0].object_rect):
                 at.objects = layers.objects[row, col]
         if wp.static(config.added):
-            if inside_rect(row, col, params[0].light_rect):
+            if layers.added.shape[0] > 0 and inside_rect(row, col, params[0].light_rect):
                 at.added = layers.added[row, col]
         if wp.static(config.ratio):
-            if inside_rect(row, col, params[0].shadow_rect):
+            if layers.ratio.shape[0] > 0 and inside_rect(row, col, params[0].shadow_rect):
                 at.ratio = layers.ratio[row, col]
         if wp.static(config.mirrored):
-            if inside_rect(row, col, params[0].ball_rect):
+            if layers.mirrored.shape[0] > 0 and inside_rect(row, col, params[0].ball_rect):
                 at.mirrored = layers.mirrored[row, col]
         return at
 

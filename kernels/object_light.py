@@ -226,10 +226,10 @@ def make_mirror_pixel(config: ObjectLightConfig) -> wp.Function:
                         FAR,
                     )
                     if shown[3] <= 0.0:
-                        distant = distant_mirrored(
+                        far = distant_mirrored(
                             distant, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
                         )
-                        shown = wp.vec4(distant[0], distant[1], distant[2], 1.0)
+                        shown = wp.vec4(far[0], far[1], far[2], 1.0)
                     total += shown
         return total / wp.max(total[3], 1.0)
 
@@ -377,9 +377,9 @@ def make_object_light_kernel(config: ObjectLightConfig) -> wp.Kernel:
                                 turned = outward
                                 if wp.static(config.distant.lamps):
                                     turned = correct_parallax(distant.lamps, hit.point, outward)
-                                distant = sample_levels(distant.levels, turned, level, distant.level_height)
-                                missed = (1.0 - near[3]) * distant
-                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(distant))
+                                far = sample_levels(distant.levels, turned, level, distant.level_height)
+                                missed = (1.0 - near[3]) * far
+                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(far))
                 mirrored = mirrored / wp.max(leaving, 1.0)
                 passed = passed / wp.max(leaving, 1.0)
             mirrored_out[i, j] = mirrored

@@ -23,7 +23,7 @@ from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.probe import project
 from warp_ar.kernels.relight import meets_probe
-from warp_ar.kernels.structs import MIRROR, PHONG, Emitter, FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Emitter, FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -52,6 +52,16 @@ class DistantLightConfig:
     """Whether there are mirror balls, which hide the receiver."""
     lamps: bool = False
     """Whether lamps of the environment are known by their places."""
+
+    def general(self, form: DiffuseForm) -> DistantLightConfig:
+        """For any scene with as many mirror balls: forms that it does not call for may then be empty.
+
+        Args:
+            form: Where irradiance comes from in scenes that call for it.
+        """
+        models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
+        diffuse: DiffuseForm = form if self.probes else "none"
+        return DistantLightConfig(self.trace.general(), models, True, diffuse, self.probes, self.probes, self.lamps)
 
 
 @wp.struct
@@ -90,6 +100,18 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
     top = (1.0 - fx) * layer[i, j] + fx * layer[i, j + 1]
     bottom = (1.0 - fx) * layer[i + 1, j] + fx * layer[i + 1, j + 1]
     return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
+def knows_irradiance(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the environment's irradiance: a kernel of several scenes has it compiled in."""
+    return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
+
+
+@wp.func
+def knows_levels(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the prefiltered environment."""
+    return distant.levels.shape[0] > 0
 
 
 @functools.cache
@@ -144,9 +166,10 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
         )
         radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
         if wp.static(config.specular):
-            outward = reflect(wo, normal)
-            mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
-            radiance += wp.cw_mul(surface.reflectance, mirrored)
+            if knows_levels(distant):
+                outward = reflect(wo, normal)
+                mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
+                radiance += wp.cw_mul(surface.reflectance, mirrored)
         return radiance
 
     return shade_unoccluded
@@ -159,12 +182,14 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
     @wp.func(module="unique")
     def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
         irradiance = wp.vec3(0.0)
-        if wp.static(config.diffuse == "sh"):
-            irradiance = sh_irradiance(distant.irradiance_sh, normal)
-        if wp.static(config.diffuse == "map"):
-            irradiance = sample_latlong(distant.irradiance_map, normal)
-        if wp.static(config.lamps and config.diffuse != "none"):
-            irradiance = add_nearness(irradiance, distant.lamps, point, normal)
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant):
+                if wp.static(config.diffuse == "sh"):
+                    irradiance = sh_irradiance(distant.irradiance_sh, normal)
+                if wp.static(config.diffuse == "map"):
+                    irradiance = sample_latlong(distant.irradiance_map, normal)
+                if wp.static(config.lamps):
+                    irradiance = add_nearness(irradiance, distant.lamps, point, normal)
         return irradiance
 
     return distant_irradiance

@@ -136,6 +136,10 @@ class RelightConfig:
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
 
+    def general(self, *, soft: bool) -> RelightConfig:
+        """For any scene in which as much is known of the receiver."""
+        return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
+
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method: {self.method!r} is none of {', '.join(RUNGS)}")

@@ -24,8 +24,15 @@ import warp as wp
 from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig, make_distant_irradiance, make_mirrored
-from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
+from warp_ar.kernels.reflect import (
+    DiffuseForm,
+    DistantLight,
+    DistantLightConfig,
+    knows_levels,
+    make_distant_irradiance,
+    make_mirrored,
+)
+from warp_ar.kernels.shadow import ALL_LIGHTS, make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import Hit, check_edge_samples, inside_rect, make_primary, make_sample_direction
 
@@ -56,6 +63,10 @@ class ShadeConfig:
     """Whether lights with a radius cast soft shadows."""
     near: bool = False
     """Whether ``object_light`` says what surrounds the objects at close range."""
+
+    def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
+        """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
+        return dataclasses.replace(self, distant=self.distant.general(form), lights=ALL_LIGHTS, soft=soft)
 
     def __post_init__(self) -> None:
         check_edge_samples(self.edge_samples)
@@ -115,7 +126,8 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                     irradiance = near.irradiance
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
-            if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
+            glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+            if glossiness > 0.0 and knows_levels(distant):
                 outward = reflect(wo, normal)
                 mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
                 if wp.static(config.near):
@@ -225,9 +237,11 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             near.known = pixel[0] >= 0
             if near.known:
                 if wp.static(config.distant.diffuse != "none"):
-                    near.irradiance = near_irradiance[pixel[0], pixel[1]]
+                    if near_irradiance.shape[0] > 0:
+                        near.irradiance = near_irradiance[pixel[0], pixel[1]]
                 if wp.static(config.distant.specular):
-                    near.mirrored = near_mirrored[pixel[0], pixel[1]]
+                    if near_mirrored.shape[0] > 0:
+                        near.mirrored = near_mirrored[pixel[0], pixel[1]]
         radiance = shade_hit(scene, lights, distant, hit, direction, near, tile_turn(i, j))
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 

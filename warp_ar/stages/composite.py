@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import composite
 from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.variants import composite_variant
 
 
 class Composite(Stage):
@@ -38,12 +39,13 @@ class Composite(Stage):
         """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
         config = composite_config(layer_names(self.request))
         width, height = self.request.size
-        composite.make_composite_kernel(config, by_warps(device, width))
+        variant = composite_variant(config, device)
+        composite.make_composite_kernel(variant, by_warps(device, width))
         image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
 
         def launch(rows: Rows | None) -> None:
             composite.composite(
-                config,
+                variant,
                 arrays["params"],
                 frame,
                 arrays["decode"],

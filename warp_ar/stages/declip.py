@@ -12,6 +12,7 @@ from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import exposes
 from warp_ar.stages.recover import recovers
+from warp_ar.stages.variants import trace_variant
 
 
 class Declip(Stage):
@@ -41,7 +42,9 @@ class Declip(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Twice up and down the pyramid: for pixels that clip in some channels, then for those that clip in all."""
         ball = asks_ball(self.request)
-        config = declip.DeclipConfig(ball, trace_config(self.request.scene).proxies if ball else ())
+        config = declip.DeclipConfig(
+            ball, trace_variant(trace_config(self.request.scene), device).proxies if ball else ()
+        )
         declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
         marked, active = arrays["declip_marked"], arrays["declip_active"]

@@ -15,6 +15,7 @@ from warp_ar.stages.composite import shadows_environment
 from warp_ar.stages.environment_samples import REFERENCE_SIZE, sample_names
 from warp_ar.stages.recover import knows_emitters
 from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
+from warp_ar.stages.variants import distant_variant
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -108,7 +109,7 @@ class EnvironmentShadow(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
         method = METHODS[self.method]
-        forms = distant_light_config(self.request)
+        forms = distant_variant(distant_light_config(self.request), self.request, device)
         near = knows_emitters(self.request)
         cells = arrays["environment_shadow_ratio"].shape
         parts = 1 if device.is_cpu else environment_shadow.count_parts(*cells)
@@ -123,7 +124,7 @@ class EnvironmentShadow(Stage):
                 sums = wp.empty(environment_shadow.sums_shape(parts, *cells), dtype=wp.vec3, device=device)
         environment_shadow.make_filter_ratio_kernel(method.side)
         environment_shadow.make_spread_ratio_kernel(forms)
-        distant = make_distant_light(forms, self.request, arrays, self.name)
+        distant = make_distant_light(distant_light_config(self.request), self.request, arrays, self.name)
         distant.environment = arrays["environment"]
         ratio, bounced, surface, filtered = (
             arrays[f"environment_shadow_{name}"] for name in ("ratio", "bounced", "surface", "filtered")

@@ -12,6 +12,7 @@ from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import composite_config, exposes, layer_names, layers_of
 from warp_ar.stages.declip import declips
+from warp_ar.stages.variants import composite_variant
 
 
 class Expose(Stage):
@@ -55,7 +56,7 @@ class Expose(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        composed = composite_config(layer_names(self.request))
+        composed = composite_variant(composite_config(layer_names(self.request)), device)
         config = exposure.ExposureConfig(
             "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
         )

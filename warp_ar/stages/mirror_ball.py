@@ -17,6 +17,7 @@ from warp_ar.stages.composite import layer_names, mirrors_virtual
 from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
 from warp_ar.stages.relight import Relight, irradiance_name, relight_config
 from warp_ar.stages.shade import shade_config
+from warp_ar.stages.variants import mirror_variant
 from warp_ar.stages.visibility import GrowingRows
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
@@ -85,7 +86,8 @@ class MirrorBall(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows in which a ball can be."""
         config = mirror_config(self.request)
-        mirror_ball.make_mirror_ball_kernel(config)
+        variant = mirror_variant(config, self.request, device)
+        mirror_ball.make_mirror_ball_kernel(variant)
         reads = self.wiring.reads
         relighting = mirrored_relighting(self.request)
         irradiance = irradiance_name(self.request)
@@ -115,6 +117,6 @@ class MirrorBall(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(config, *inputs, arrays["mirrored"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirrored"], rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -15,6 +16,7 @@ from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows,
 from warp_ar.stages.composite import layer_names
 from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
 from warp_ar.stages.shade import near_names, sees_near
+from warp_ar.stages.variants import distant_variant
 
 SIDE = 4
 """Pixels along a tile."""
@@ -77,8 +79,10 @@ class ObjectLight(Stage):
         forms = distant_light_config(self.request)
         widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
         sharp = [width < object_light.SHARP_ALPHA for width in widths]
+        # The forms themselves stay the scene's: they are what the kernel writes.
+        variant = distant_variant(forms, self.request, device)
         config = object_light.ObjectLightConfig(
-            forms,
+            dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
             COUNT,
             0 if all(sharp) else LOBE_COUNT,
             MIRROR_SAMPLES if any(sharp) else 0,

@@ -19,6 +19,7 @@ from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.host_copies import HostCopies
 from warp_ar.stages.unwrap import NO_PROBE
+from warp_ar.stages.variants import trace_variant
 
 EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
@@ -107,8 +108,8 @@ class Recover(Stage):
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         scene = self.request.scene
         height = self.request.quality.environment_height
-        proxies = trace_config(scene).proxies
         self._arrays, self._device = arrays, device
+        proxies = self._proxies = trace_variant(trace_config(scene), device).proxies
         arrays["recover_points"].assign(self._surfaces.points)
         ball = scene.probes[0]
         solver = recovery.Recovery(
@@ -219,8 +220,7 @@ class Recover(Stage):
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
             if self.method == "shading":
                 # Now, not in the worker later: kernels are translated by one thread at a time.
-                proxies = trace_config(self.request.scene).proxies
-                wp.load_module(kernels.make_kernels(proxies)[2].module, device=self._device)
+                wp.load_module(kernels.make_kernels(self._proxies)[2].module, device=self._device)
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.pending = self._worker.submit(self._solve, now.solver)
@@ -261,7 +261,7 @@ class Recover(Stage):
             arrays["probes"],
             arrays["ray_scene"],
             target,
-            proxies=trace_config(self.request.scene).proxies,
+            proxies=self._proxies,
             stream=self._stream,
         )
         received = self._lamps["recover_lamp_transfer"]

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.environment_shadow import count_parts
+from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.ray_scene import proxies_face, trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import shares_environment
@@ -19,6 +20,7 @@ from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.environment_samples import SAMPLES
 from warp_ar.stages.recover import knows_emitters
 from warp_ar.stages.shade import casts_soft, sees_near
+from warp_ar.stages.variants import relight_variant
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -97,7 +99,7 @@ class Relight(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
         reads, irradiance = self.wiring.reads, irradiance_name(self.request)
-        config = relight_config(self.request)
+        config = relight_variant(relight_config(self.request), self.request, device)
         relight.make_relight_kernel(config)
         cells = make_cells(self.request, arrays)
         distant = arrays[irradiance] if irradiance in reads else None
@@ -136,7 +138,7 @@ class Relight(Stage):
         if not (config.share or config.bounced):
             return last
 
-        place = receiver_cells.CellConfig(config)
+        place = receiver_cells.CellConfig(_keep_planes(config, self.request))
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
@@ -191,6 +193,14 @@ class Relight(Stage):
                 again = functools.partial(estimate, bounced=True)
                 passes.append(Pass(again, rows=len(share), extent=rows_of(size, len(share), 2)))
         return passes + last
+
+
+def _keep_planes(config: relight.RelightConfig, request: Request) -> relight.RelightConfig:
+    """Where all proxies are planes, cells know that: most of their rays are then left out."""
+    proxies = trace_config(request.scene).proxies
+    if not set(proxies) <= {int(PLANE)}:
+        return config
+    return dataclasses.replace(config, trace=dataclasses.replace(config.trace, proxies=proxies))
 
 
 def _grain(request: Request) -> Grain:

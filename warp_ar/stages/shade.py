@@ -13,6 +13,7 @@ from warp_ar.scene.ray_scene import has_sized_lights, light_kind
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
+from warp_ar.stages.variants import shade_variant
 from warp_ar.stages.visibility import GrowingRows
 
 
@@ -77,6 +78,7 @@ class Shade(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
         config = shade_config(self.request)
+        variant = shade_variant(config, self.request, device)
         lists = make_edge_lists(arrays, device, self.name)
         inputs = (
             arrays["params"],
@@ -90,7 +92,7 @@ class Shade(Stage):
 
         def launch(rows: Rows | None) -> None:
             shade(
-                config,
+                variant,
                 *inputs,
                 arrays["virtual"],
                 near_irradiance=arrays.get("object_irradiance"),

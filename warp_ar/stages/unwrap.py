@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import probe
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.variants import shares_kernels
 
 NO_PROBE = "the scene has no mirror ball"
 
@@ -45,6 +46,7 @@ class Unwrap(Stage):
         """Corners first, then texels between them."""
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
         config = probe.ProjectConfig(tuple(kinds))
+        config = config.general() if shares_kernels(device) else config
         method = self.request.quality.method(self.name)
         method = method if method != "default" else "area"
         height = self.request.quality.environment_height

@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
+from warp_ar.stages.variants import trace_variant
 
 
 class GrowingRows:
@@ -55,7 +56,7 @@ class Visibility(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
-        config = trace_config(self.request.scene)
+        config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
         outputs = [arrays[name] for name in ("hit_object", "hit_depth", "hits")]
 

@@ -1,0 +1,70 @@
+"""Which variant of a kernel a stage compiles: what its scene calls for, or one that every scene shares.
+
+A kernel that holds nothing but what its scene needs is faster, and is compiled anew for each combination of shapes,
+materials and lights. On CPU the general one is as fast within noise, for it asks a shape for its kind where it walks
+memory anyway; there only what a whole stage does without is left out. On CUDA code that is never reached still takes
+registers from what is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from warp_ar.kernels.composite import CompositeConfig
+from warp_ar.kernels.mirror_ball import MirrorBallConfig
+from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.relight import RelightConfig
+from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.stages.base import Request
+
+
+def shares_kernels(device: Any) -> bool:
+    """Whether kernels on ``device`` are those of any scene."""
+    return bool(device.is_cpu)
+
+
+def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
+    """Kinds of shape to compile in."""
+    return config.general() if shares_kernels(device) else config
+
+
+def distant_variant(config: DistantLightConfig, request: Request, device: Any) -> DistantLightConfig:
+    """Shapes, materials and forms of light to compile in."""
+    return config.general(_form(request)) if shares_kernels(device) else config
+
+
+def shade_variant(config: ShadeConfig, request: Request, device: Any) -> ShadeConfig:
+    """As ``distant_variant``, and kinds of virtual light."""
+    return config.general(_form(request), soft=_asks_soft(request)) if shares_kernels(device) else config
+
+
+def relight_variant(config: RelightConfig, request: Request, device: Any) -> RelightConfig:
+    """Shapes and shadows to compile in."""
+    return config.general(soft=_asks_soft(request)) if shares_kernels(device) else config
+
+
+def mirror_variant(config: MirrorBallConfig, request: Request, device: Any) -> MirrorBallConfig:
+    """What a ball can show; whether there are objects, virtual light and shadows stays the scene's."""
+    if not shares_kernels(device):
+        return config
+    return dataclasses.replace(
+        config,
+        trace=trace_variant(config.trace, device),
+        shade=None if config.shade is None else shade_variant(config.shade, request, device),
+        relight=None if config.relight is None else relight_variant(config.relight, request, device),
+    )
+
+
+def composite_variant(config: CompositeConfig, device: Any) -> CompositeConfig:
+    """Layers to compile in."""
+    return config.general() if shares_kernels(device) else config
+
+
+def _form(request: Request) -> DiffuseForm:
+    return "sh" if request.quality.method("diffuse") == "sh2" else "map"
+
+
+def _asks_soft(request: Request) -> bool:
+    return request.quality.method("light_shadow") == "soft"
