@@ -56,7 +56,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle, wrap_texel
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, wait_for_block
 from warp_ar.kernels.structs import FrameParams, KeyLight
 
 wp.set_module_options({"enable_backward": False})
@@ -1293,9 +1293,9 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, cells_out: wp.arr
         raise ValueError(f"key_lights_out has {len(key_lights_out)} places; expected 1 to {MAX_KEY_LIGHTS}")
     device = environment.device
     lanes, parts = (1, 1) if device.is_cpu else (32, 4)
-    wp.launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
+    launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
     cells = CELL_ROWS * CELL_COLUMNS
-    wp.launch(sum_cells_kernel, (cells, lanes), [lanes, parts, environment, sums_out], [cells_out], device=device)
+    launch(sum_cells_kernel, (cells, lanes), [lanes, parts, environment, sums_out], [cells_out], device=device)
     blocks = KEY_BLOCKS if device.is_cuda and device.arch >= CLUSTERS_FROM else 1
     launch_tiles(
         find_key_lights_kernel,

@@ -57,7 +57,7 @@ import warp as wp
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
@@ -1356,28 +1356,28 @@ def shade_environment(
         cells = steps.hits.shape
         device = rays.device
         steps.listed.zero_()
-        wp.launch(
+        launch(
             make_find_hits_kernel(config),
             cells,
             [*seen, scene, distant, directions, samples, stride],
             [ratio_out, bounced_out, surface_out, steps],
             device=device,
         )
-        wp.launch(
+        launch(
             make_sum_light_kernel(config),
             cells,
             [*seen, *light, flux, samples, stride, surface_out],
             [steps],
             device=device,
         )
-        wp.launch(
+        launch(
             make_ask_kernel(config),
             threads,
             [*seen, *light, samples, stride, cells[2], threads],
             [steps],
             device=device,
         )
-        wp.launch(
+        launch(
             make_join_steps_kernel(config),
             cells[1:],
             [params, steps],
@@ -1396,7 +1396,7 @@ def shade_environment(
         device=rays.device,
     )
     if config.parts > 1:
-        wp.launch(join_parts_kernel, cells, [surface_out, sums_out], [ratio_out, bounced_out], device=rays.device)
+        launch(join_parts_kernel, cells, [surface_out, sums_out], [ratio_out, bounced_out], device=rays.device)
 
 
 def count_parts(rows: int, columns: int, most: int = MAX_PARTS) -> int:

@@ -34,7 +34,7 @@ import warp as wp
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.relight import (
     DEFAULT_REFLECTANCE,
     Receiver,
@@ -477,7 +477,7 @@ def share_environment(
         device=rays.device,
     )
     if parts > 1:
-        wp.launch(join_shares_kernel, share_out.shape, [sums_out], [share_out, surface_out], device=rays.device)
+        launch(join_shares_kernel, share_out.shape, [sums_out], [share_out, surface_out], device=rays.device)
 
 
 def share_sums_shape(parts: int, rows: int, columns: int) -> tuple[int, int, int]:

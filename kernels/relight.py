@@ -71,7 +71,7 @@ from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edg
 from warp_ar.kernels.emitters import add_nearness
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean
@@ -806,10 +806,10 @@ def smooth_edges(
         return
     listed = [edge_lists.count, edge_lists.edges]
     edge_lists.count.zero_()
-    wp.launch(list_edges_kernel, rays.shape, [params, seen], listed, device=device)
+    launch(list_edges_kernel, rays.shape, [params, seen], listed, device=device)
     kernel, given = make_smooth_edges_kernel(config, left=True), [*inputs, seen, *listed]
     launch_rows(kernel, rays.shape, given, [physical_added_out], rows=None, device=device)
     sampling = [EDGE_THREADS, *inputs, *listed]
-    wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [edge_lists.samples], device=device)
+    launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [edge_lists.samples], device=device)
     averaging = [EDGE_THREADS, config.edge_samples, *listed, edge_lists.samples]
-    wp.launch(average_lit_edges_kernel, EDGE_THREADS, averaging, [physical_added_out], device=device)
+    launch(average_lit_edges_kernel, EDGE_THREADS, averaging, [physical_added_out], device=device)

@@ -22,7 +22,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.reflect import (
     DiffuseForm,
@@ -450,6 +450,6 @@ def shade(
         launch_rows(kernel, rays.shape, [*inputs, *near], outputs, rows=rows, device=device)
     listed = [count, edges]
     sampling = [EDGE_THREADS, *inputs, *near, *listed]
-    wp.launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)
+    launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)
     averaging = [EDGE_THREADS, config.edge_samples, *listed, samples]
-    wp.launch(average_edges_kernel, EDGE_THREADS, averaging, [virtual_out], device=device)
+    launch(average_edges_kernel, EDGE_THREADS, averaging, [virtual_out], device=device)

@@ -35,7 +35,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 
 wp.set_module_options({"enable_backward": False})
 
@@ -502,7 +502,7 @@ def sum_along_columns(table_out: wp.array, *, columns: Rows | None = None) -> No
     start, stop = columns if columns is not None else (0, table_out.shape[1])
     block = CPU_COLUMN_BLOCK if table_out.device.is_cpu else 1
     if stop > start:
-        wp.launch(
+        launch(
             sum_along_columns_kernel,
             dim=-(-(stop - start) // block),
             inputs=[start, stop, block],
@@ -569,7 +569,7 @@ def sum_area_by_strips(
         raise ValueError("sum_area_by_strips: frame and table_out must be contiguous; copy what is a view")
     config = strip_config(*frame.shape, frame.device)
     strips = sums_out.shape[0]
-    wp.launch(
+    launch(
         make_sum_strips_kernel(config),
         strips * config.threads,
         [frame, _group_size(strips)],

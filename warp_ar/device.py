@@ -27,12 +27,19 @@ def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
     return _CUDA if device.is_cuda else contextlib.nullcontext()
 
 
-def translating(device: Any) -> contextlib.AbstractContextManager[Any]:
-    """Held by who declares kernels or launches them for the first time.
+@contextlib.contextmanager
+def translating(device: Any) -> Iterator[None]:
+    """Held by who declares kernels or launches them for the first time; to be entered before ``exclusive``.
 
     Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
     """
-    return _CUDA if device.is_cuda else _TRANSLATION
+    with _TRANSLATION, exclusive(device):
+        yield
+
+
+def compiling() -> contextlib.AbstractContextManager[Any]:
+    """Held by who has kernels compiled, in threads of its own: nobody else translates, frames go on."""
+    return _TRANSLATION
 
 
 class _Captures:

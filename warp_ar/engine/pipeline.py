@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import exclusive, resolve_device
+from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import make_plan
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image, Picture, Slot, Transfers
@@ -216,7 +217,7 @@ class Pipeline:
         self._short: ShortFrames | None = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
-        with exclusive(self.device), wp.ScopedDevice(self.device):
+        with translating(self.device), wp.ScopedDevice(self.device):
             self._add_inputs()
             self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
             if self.plan.needs("short_frames"):
@@ -313,9 +314,14 @@ class Pipeline:
         self.scene, self.plan = scene, plan
         return True
 
-    def warm_up(self) -> None:
-        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline."""
-        self._scheduler.warm_up()
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be: kernels are
+                compiled once for a kind of scene and kept. On the caller's thread.
+        """
+        self._scheduler.warm_up(progress)
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""

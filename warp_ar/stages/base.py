@@ -152,6 +152,10 @@ class Stage(abc.ABC):
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
 
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Kernels that its steps on the host launch: they are compiled with the others."""
+        return ()
+
     def gives_way(self) -> tuple[str, ...]:
         """Names of stages that are slower beside this one than before it: on CUDA it waits for them.
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import bracket as kernels
+from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.recover import recovers
 from warp_ar.stages.unwrap import NO_PROBE
@@ -56,7 +57,7 @@ class Bracket(Stage):
 
         def store(rows: Rows | None) -> None:
             for target, source in own:
-                wp.copy(target, source)
+                copy(target, source)
 
         def spread(rows: Rows | None) -> None:
             kernels.spread_clipping(

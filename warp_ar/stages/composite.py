@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import composite
 from warp_ar.kernels.codes import by_warps
+from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.variants import composite_variant
 
@@ -59,7 +60,7 @@ class Composite(Stage):
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
         extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
-        return [Pass(lambda rows: wp.copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
+        return [Pass(lambda rows: copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
 
 
 def layer_names(request: Request) -> tuple[str, ...]:

@@ -203,6 +203,10 @@ class Recover(Stage):
         ]
         return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
 
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Of the solver: irradiance from lamps, at whatever places it tries."""
+        return (kernels.make_kernels(self._proxies)[2],) if self.method == "shading" else ()
+
     def begin(self) -> None:
         """Decide whether an estimate is begun in this frame, and whether one takes effect."""
         now, seconds = self._progress, self._arrays["seconds"]()
@@ -218,9 +222,6 @@ class Recover(Stage):
         """Begin to solve, and wait for it where it takes effect at once."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
-            if self.method == "shading":
-                # Now, not in the worker later: kernels are translated by one thread at a time.
-                wp.load_module(kernels.make_kernels(self._proxies)[2].module, device=self._device)
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.pending = self._worker.submit(self._solve, now.solver)
