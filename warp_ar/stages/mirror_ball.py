@@ -11,13 +11,14 @@ import warp as wp
 from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
+from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
 from warp_ar.stages.composite import layer_names, mirrors_virtual
 from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
 from warp_ar.stages.relight import Relight, irradiance_name, relight_config
 from warp_ar.stages.shade import shade_config
-from warp_ar.stages.variants import mirror_variant
+from warp_ar.stages.variants import relight_variant, shade_variant, shares_kernels, trace_variant
 from warp_ar.stages.visibility import GrowingRows
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
@@ -27,8 +28,7 @@ SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
 def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
     """What the mirrored part of a request's scene calls for."""
     layers = layer_names(request)
-    # What a ball shows of an object is too small for what surrounds it at close range.
-    shading = dataclasses.replace(shade_config(request), near=False, edge_samples=1) if "virtual" in layers else None
+    shading = mirrored_shading(request) if "virtual" in layers else None
     lit = "physical_added" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(request.scene),
@@ -37,6 +37,24 @@ def mirror_config(request: Request) -> mirror_ball.MirrorBallConfig:
         mirrored_relighting(request) if lit else None,
         "shadow_ratio" in layers,
     )
+
+
+def mirror_variant(request: Request, device: Any) -> mirror_ball.MirrorBallConfig:
+    """What is compiled: where any scene shares it, a scene without objects or lights finds none when it looks."""
+    if not shares_kernels(device):
+        return mirror_config(request)
+    return mirror_ball.MirrorBallConfig(
+        trace_variant(trace_config(request.scene), device),
+        SAMPLES[request.quality.method("mirror_ball")],
+        shade_variant(mirrored_shading(request), request, device),
+        relight_variant(mirrored_relighting(request), request, device),
+        ratio=True,
+    )
+
+
+def mirrored_shading(request: Request) -> ShadeConfig:
+    """How objects look: what a ball shows of one is too small for what surrounds it at close range."""
+    return dataclasses.replace(shade_config(request), near=False, edge_samples=1)
 
 
 def mirrored_relighting(request: Request) -> RelightConfig:
@@ -86,7 +104,7 @@ class MirrorBall(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows in which a ball can be."""
         config = mirror_config(self.request)
-        variant = mirror_variant(config, self.request, device)
+        variant = mirror_variant(self.request, device)
         mirror_ball.make_mirror_ball_kernel(variant)
         reads = self.wiring.reads
         relighting = mirrored_relighting(self.request)

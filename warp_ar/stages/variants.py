@@ -8,11 +8,9 @@ registers from what is.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from warp_ar.kernels.composite import CompositeConfig
-from warp_ar.kernels.mirror_ball import MirrorBallConfig
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.kernels.relight import RelightConfig
 from warp_ar.kernels.shade import ShadeConfig
@@ -43,18 +41,6 @@ def shade_variant(config: ShadeConfig, request: Request, device: Any) -> ShadeCo
 def relight_variant(config: RelightConfig, request: Request, device: Any) -> RelightConfig:
     """Shapes and shadows to compile in."""
     return config.general(soft=_asks_soft(request)) if shares_kernels(device) else config
-
-
-def mirror_variant(config: MirrorBallConfig, request: Request, device: Any) -> MirrorBallConfig:
-    """What a ball can show; whether there are objects, virtual light and shadows stays the scene's."""
-    if not shares_kernels(device):
-        return config
-    return dataclasses.replace(
-        config,
-        trace=trace_variant(config.trace, device),
-        shade=None if config.shade is None else shade_variant(config.shade, request, device),
-        relight=None if config.relight is None else relight_variant(config.relight, request, device),
-    )
 
 
 def composite_variant(config: CompositeConfig, device: Any) -> CompositeConfig:
