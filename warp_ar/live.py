@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, Parser
@@ -262,6 +262,29 @@ def _ball_report(scene: str | Path, session: Session) -> dict[str, Any]:
     return {"balls": found} if found else {}
 
 
+def _compile(session: Session, *, shown: bool) -> None:
+    """Have the kernels ready, with a bar where some must be compiled."""
+    bar = Progress(
+        TextColumn("compiling kernels, once for this kind of scene"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        disable=not shown,
+    )
+    task: TaskID | None = None
+
+    def tell(done: int, total: int) -> None:
+        nonlocal task
+        if task is None:
+            bar.start()
+            task = bar.add_task("compile", total=total)
+        bar.update(task, completed=done)
+
+    try:
+        session.warm_up(tell)
+    finally:
+        bar.stop()
+
+
 def _has_display() -> bool:
     """Whether a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -305,6 +328,7 @@ def run(options: argparse.Namespace) -> int:
             )
         )
         balls = _ball_report(options.scene, session)
+        _compile(session, shown=not options.headless)
         source = session.source
         sink = NullSink() if output is None else open_sink(output, fps=source.fps, size=session.pipeline.size)
         log = RunLog(session.pipeline)

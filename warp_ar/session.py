@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
@@ -120,6 +121,14 @@ class Session:
         """Let the source and the pipeline's threads go."""
         self.source.close()
         self.pipeline.close()
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Compile and load what the frames need; left out, the first frame does it.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be.
+        """
+        self.pipeline.warm_up(progress)
 
     def _frames(self) -> Iterator[Frame]:
         """The source's frames; notes what they are waited for."""

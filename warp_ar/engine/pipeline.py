@@ -473,6 +473,7 @@ class Pipeline:
         timings = frame.timings
         start = time.perf_counter()
         if not frame.lost:
+            self._scheduler.prepare()
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._has_light = False

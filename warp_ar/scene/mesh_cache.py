@@ -1,0 +1,48 @@
+"""Meshes as they were read from their files, kept for the next run: reading takes half a second of imports alone.
+
+Only files that hold all of their mesh are kept, under a hash of their bytes and of the code that reads them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from warp_ar.cache_folder import cache_folder
+from warp_ar.scene import geometry
+
+WHOLE = (".ply", ".stl", ".off", ".glb")
+"""Formats without files beside them."""
+MOST_BYTES = 256 << 20
+"""Of a file that is kept."""
+
+
+def load_kept_mesh(path: Path) -> geometry.Mesh:
+    """As ``geometry.load_mesh``, from what an earlier run kept if the file is the same.
+
+    Raises:
+        SceneError: As ``geometry.load_mesh``.
+    """
+    try:
+        if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
+            return geometry.load_mesh(path)
+        key = hashlib.sha256(Path(geometry.__file__).read_bytes() + path.read_bytes()).hexdigest()[:32]
+    except OSError:
+        return geometry.load_mesh(path)  # which says what is wrong
+    kept = cache_folder() / "meshes" / f"{key}{path.suffix.lower()}.npz"
+    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile), np.load(kept) as values:
+        return geometry.Mesh(**{name: values[name] for name in values.files})
+    mesh = geometry.load_mesh(path)
+    values = {field.name: getattr(mesh, field.name) for field in dataclasses.fields(mesh)}
+    part = kept.with_suffix(f".{os.getpid()}.npz")
+    with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(part, **{name: value for name, value in values.items() if value is not None})
+        part.replace(kept)
+    return mesh
