@@ -1,10 +1,11 @@
 """What every method costs: the times of the cost table, on ``desk`` at its own size, all else on ``medium``.
 
 ``python -m bench costs --device cpu > bench/results/cpu_costs.jsonl``, then ``python -m bench.write_cost_tables`` puts
-these lines and the errors of ``warp_ar/accuracy/cost_table.json`` into ``docs/costs.md`` and the README.
+these lines and the errors of ``warp_ar/accuracy/cost_table.json`` into ``docs/accuracy.md`` and the README.
 
-Rows: ``method KNOB RUNG``, the stages that a setting turns, at each of its methods; ``preset SCENE NAME``, whole frames
-of the presets in turn. On CUDA a frame is the sum of its stages, each alone: stages that run side by side take less.
+Rows: ``method SETTING METHOD``, the stages that a setting turns, at each of its methods; ``preset SCENE NAME``, whole
+frames of the presets in turn. On CUDA a frame is the sum of its stages, each alone: stages that run side by side take
+less.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from typing import Any
 import warp as wp
 
 from bench.common import report
+from warp_ar.accuracy.cases import Case, open_scene, sized_light
 from warp_ar.accuracy.cost_table import Setting, chosen, light_only, relevant_settings, turn
 from warp_ar.accuracy.costs import BASE, NOW_AND_THEN, WORK
+from warp_ar.accuracy.runs import run, run_in_turn
+from warp_ar.accuracy.sweep import count_work
 from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
-from warp_ar.tradeoff import Case, count_work, open_scene, run, run_in_turn, sized_lamp
 
 FRAMES = 12
 TIMED = 6
@@ -34,7 +37,7 @@ def main(device: str) -> None:
     more = {"clock": "processor" if by_work else "wall", "load": round(os.getloadavg()[0], 1)}
     desk = open_scene("desk", FRAMES)
     darken = open_scene("darken", FRAMES)
-    lamp = sized_lamp(desk)
+    lamp = sized_light(desk)
     for setting in settings_of(lamp):
         method_cost(lamp if setting.name == "light_shadow" else desk, setting, device, clock, more)
     method_cost(

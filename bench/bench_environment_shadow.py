@@ -34,7 +34,7 @@ def main(device: str) -> None:
             passes = {
                 stage.name: [step.launch for step in steps]
                 for stage, steps in pipe._scheduler._stages
-                if stage.name in ("environment_samples", "environment_shadow", "object_light")
+                if stage.name in ("environment_samples", "environment_shadow", "near_field")
             }
 
             def run_all(launches):

@@ -34,7 +34,7 @@ from warp_ar.kernels.structs import FrameParams, RayScene
 from warp_ar.kernels.visibility import intersect_mesh
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
-from warp_ar.scene.geometry import torus_mesh
+from warp_ar.scene.shapes import torus_mesh
 from warp_ar.stages.quality import PRESETS, Quality
 
 CLIP_FRAMES = 48
@@ -131,7 +131,7 @@ def floors(pipeline: Pipeline, bandwidth: float) -> dict[str, float]:
     """Least milliseconds of each stage: its bytes over the copy bandwidth, or its rays over the rate of bare rays."""
     width, height = pipeline.size
     pixels, arrays = width * height, pipeline.arrays
-    params = pipeline._block.host("params")[0]
+    params = pipeline.inputs.block.host("params")[0]
     objects, lit = _area(params["object_rect"]), _area(params["light_rect"])
     texels = 2 * pipeline.quality.environment_height**2
     moved = {
@@ -139,8 +139,8 @@ def floors(pipeline: Pipeline, bandwidth: float) -> dict[str, float]:
         "accumulate": 84 * texels,
         "fill": 28 * texels,
         "key_lights": 12 * texels,
-        "diffuse": 12 * texels,
-        "specular": 28 * texels,
+        "irradiance": 12 * texels,
+        "prefilter": 28 * texels,
         "visibility": 72 * objects,
         "summed_area": 7 * pixels,
         "relight": 39 * lit,

@@ -18,14 +18,14 @@ import cv2
 import numpy as np
 import warp as wp
 
-from bench.bench_probe import empty_scene
+from bench.bench_unwrap import empty_scene
 from bench.common import measure, paired_ratio, report
-from warp_ar.kernels import probe, summed_area
+from warp_ar.kernels import summed_area, unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.kernels.wide_bvh import walk_closest
-from warp_ar.scene.geometry import torus_mesh
 from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.shapes import torus_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}
 RAYS = (480, 640)
@@ -259,7 +259,7 @@ def bench_unwrap(device: str) -> None:
     ball["radius"], ball["reflectance"] = 1.0, 1.0
     x, y = np.meshgrid(*2 * [np.arange(size) - (size - 1) / 2])
     with wp.ScopedDevice(device):
-        scene, config = empty_scene(0), probe.ProjectConfig(())
+        scene, config = empty_scene(0), unwrap.ProjectConfig(())
         params, ball = wp.array(params, dtype=FrameParams), wp.array(ball, dtype=Probe)
         rays = wp.array(np.stack([x, y], -1) / focal, dtype=wp.vec2)
         table, frame = wp.array(decode_table("linear"), dtype=wp.vec3), wp.array(smooth, dtype=wp.vec3ub)
@@ -270,8 +270,8 @@ def bench_unwrap(device: str) -> None:
             confidence = wp.zeros(shape, dtype=wp.float32)
 
             def ours(corners=corners, radiance=radiance, confidence=confidence, clipped=clipped) -> None:
-                probe.project_corners(params, ball, rays, scene, corners, config=config)
-                probe.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method="bilinear")
+                unwrap.project_corners(params, ball, rays, scene, corners, config=config)
+                unwrap.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method="bilinear")
 
             def theirs(height=height) -> Any:
                 return envmap.EnvironmentMap(smooth / np.float32(255), "sphere").convertTo("latlong", height).data

@@ -3,7 +3,7 @@
     python -m bench precision [--device D]
 
 takes under two minutes, prints one JSON line per case, writes them to ``bench/results/<device>_precision.jsonl``, and
-the table made of all such files into ``docs/hard-cases.md``; ``python -m bench.bench_precision`` only writes the table.
+the table made of all such files into ``docs/numerics.md``; ``python -m bench.bench_precision`` only writes the table.
 Times on CPU are CPU time of one thread, on CUDA those of events around graph replays; contenders run in turn.
 
 Rows: ``sums`` of a frame, ``summed-area tables``, ``accumulations`` (a mean over 1,000 frames), ``ray offsets``,
@@ -38,7 +38,7 @@ MOST_RAYS = 1 << 21
 LEVEL_HEIGHT = 128
 EPSILON = wp.constant(wp.float32(1.0e-4))
 RESULTS = Path(__file__).resolve().parent / "results"
-TABLE = Path(__file__).resolve().parents[1] / "docs" / "hard-cases.md"
+TABLE = Path(__file__).resolve().parents[1] / "docs" / "numerics.md"
 BEGIN, END = "<!-- precision -->", "<!-- /precision -->"
 
 Forms = dict[str, Callable[[], object]]

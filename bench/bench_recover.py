@@ -14,6 +14,7 @@ from bench.common import measure, report
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.light import recovery
+from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene import load_scene
 from warp_ar.scene.ray_scene import HostScene, trace_config
 
@@ -31,7 +32,7 @@ class Setup:
         scene = load_scene("desk")
         self.scene = HostScene(dataclasses.replace(scene, objects=()), self.device).ray_scene
         self.proxies = trace_config(scene).proxies
-        surfaces = recovery.find_surfaces(scene)
+        surfaces = find_surfaces(scene)
         count, shape = len(surfaces.points), (self.height, 2 * self.height)
         probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
         probe = scene.probes[0]

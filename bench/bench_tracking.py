@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 
 from bench.common import measure, report
-from warp_ar.input.tracking import MarkerDetector, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, Marker, Pose
 
 SINGLE = Marker()

@@ -8,8 +8,8 @@ import warp as wp
 from bench.common import measure, report
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
-from warp_ar.scene.geometry import torus_mesh
 from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.shapes import torus_mesh
 
 H, W = 480, 640
 FOCAL = 600.0

@@ -112,3 +112,9 @@ def report(case: str, milliseconds: list[float], device: Any, **more: Any) -> No
         "commit": commit(),
     }
     print(json.dumps(record), flush=True)
+
+
+def report_map(stage: str, height: int, milliseconds: list[float], texel_bytes: int, device: str) -> None:
+    """Print one JSON line for a stage on a map of so many rows, with its share of the copy bandwidth."""
+    rate = texel_bytes * 2 * height**2 / (float(np.median(milliseconds)) * 1e-3) / copy_bandwidth(device)
+    report(f"{stage}_{height}", milliseconds, device, of_copy_bandwidth=round(rate, 4))

@@ -12,6 +12,17 @@ import warp as wp
 
 from warp_ar.kernels.pyramid import reduce_latlong
 
+HEIGHTS = (32, 64, 128, 256)
+"""Rows of maps that stages of the environment are measured on."""
+
+
+def random_map(height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance with a few bright texels, (rows, 2 rows, 3), and which texels are known: all but 15 %."""
+    shape = (height, 2 * height)
+    rng = np.random.default_rng(0)
+    radiance = np.float32(rng.uniform(0, 1, (*shape, 3)) ** 4)
+    return radiance, np.float32(rng.random(shape) > 0.15)
+
 
 def made_up_environment(height: int) -> np.ndarray:
     """Dim walls, a window, a lamp of four degrees and a sun of half a degree, 512 rows or more, (rows, 2 rows, 3)."""

@@ -1,6 +1,6 @@
-"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/costs.md`` and the README.
+"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/accuracy.md`` and the README.
 
-It reads ``bench/results/*_prices.jsonl``, which ``python -m bench costs`` prints, and the errors of
+It reads ``bench/results/*_costs.jsonl``, which ``python -m bench costs`` prints, and the errors of
 ``warp_ar/accuracy/cost_table.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
 replaces what stands between ``<!-- costs:NAME -->`` and ``<!-- /costs:NAME -->``. It prints for every preset what
 the rule of ``quality.BUDGETS`` would choose.
@@ -117,7 +117,7 @@ def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tup
             for method, line in own.items()
             if method != "brute_force"
         ]
-    frame = next(line["base_ms"] for line in lines if line.get("setting") == "diffuse")
+    frame = next(line["base_ms"] for line in lines if line.get("setting") == "irradiance")
     return (
         pareto_front(method_costs),
         frame,
@@ -157,12 +157,12 @@ def replace(path: Path, name: str, text: str) -> None:
 
 
 def main() -> None:
-    cpu, cuda = read("cpu_costs.jsonl"), read("h*_prices.jsonl")
-    listed = json.loads((ROOT / "warp_ar" / "cost_table.json").read_text(encoding="utf-8"))
+    cpu, cuda = read("cpu_costs.jsonl"), read("h*_costs.jsonl")
+    listed = json.loads((ROOT / "warp_ar" / "accuracy" / "cost_table.json").read_text(encoding="utf-8"))
     presets = json.loads((ROOT / "bench" / "results" / "presets.json").read_text(encoding="utf-8"))
     if not cpu:
         sys.exit("write_cost_tables: no bench/results/cpu_costs.jsonl; make it with python -m bench costs --device cpu")
-    page = ROOT / "docs" / "costs.md"
+    page = ROOT / "docs" / "accuracy.md"
     scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
     replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
     replace(page, "methods", method_table(cpu, cuda, listed))

@@ -29,7 +29,7 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.environment import is_finite, light_confidence
+from warp_ar.kernels.guards import is_finite, light_confidence
 from warp_ar.kernels.latlong import PI
 from warp_ar.kernels.launch import Rows, launch_rows
 

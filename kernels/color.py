@@ -27,6 +27,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.errors import SceneError
+from warp_ar.files import is_file, read_text
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,11 +40,40 @@ _KEY_SCALE = wp.constant(wp.float32(ENCODE_KEYS - 1))
 _NEXT = wp.constant(ENCODE_KEYS)
 _THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
+CLIPPING_CODE = wp.constant(254)  # video codecs and JPEG bring a clipped 255 back as 254 now and then
+# Chroma at half the resolution (4:2:0) lowers the clipped blue of a small lamp to 239 to 252 (measured in H.264). Where
+# another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
+BESIDE_CLIPPING_CODE = wp.constant(248)
+
+
+@wp.func
+def luminance(radiance: wp.vec3) -> wp.float32:
+    """Rec. 709 luminance of linear RGB."""
+    return 0.2126 * radiance[0] + 0.7152 * radiance[1] + 0.0722 * radiance[2]
+
+
+@wp.func
+def brightness(radiance: wp.vec3) -> wp.float32:
+    """Mean of the channels: where change of any colour counts alike."""
+    return (radiance[0] + radiance[1] + radiance[2]) / 3.0
+
 
 @wp.func
 def decode(table: wp.array[wp.vec3], code: wp.vec3ub) -> wp.vec3:
     """Linear value of an 8-bit colour; ``table`` comes from ``decode_table``."""
     return wp.vec3(table[wp.int32(code[0])][0], table[wp.int32(code[1])][1], table[wp.int32(code[2])][2])
+
+
+@wp.func
+def is_clipped(code: wp.vec3ub) -> wp.vec3:
+    """1 in the channels that are at clipping."""
+    largest = wp.max(wp.max(wp.int32(code[0]), wp.int32(code[1])), wp.int32(code[2]))
+    from_code = wp.where(largest >= CLIPPING_CODE, BESIDE_CLIPPING_CODE, CLIPPING_CODE)
+    return wp.vec3(
+        wp.where(wp.int32(code[0]) >= from_code, 1.0, 0.0),
+        wp.where(wp.int32(code[1]) >= from_code, 1.0, 0.0),
+        wp.where(wp.int32(code[2]) >= from_code, 1.0, 0.0),
+    )
 
 
 @wp.func
@@ -142,17 +172,14 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
     if name in ("srgb", "linear") or name.startswith("gamma:"):
         return np.repeat(_formula(name, np.arange(256) / 255.0)[:, None], 3, axis=1)
     path = pathlib.Path(transfer)
-    if not path.is_file():
+    if not is_file(path):
         raise SceneError(
             f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
         )
+    text = read_text(path, SceneError, expected="256 lines of three linear values")
     try:
         values = np.array(
-            [
-                [float(word) for word in line.replace(",", " ").split()]
-                for line in path.read_text().splitlines()
-                if line.strip()
-            ]
+            [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
         )
     except ValueError as error:
         raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None

@@ -28,8 +28,9 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.color import brightness
+from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.launch import Rows, launch, launch_rows
-from warp_ar.kernels.pyramid import safe_radiance
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
 from warp_ar.kernels.structs import Emitter
 
@@ -116,12 +117,6 @@ def row_weight(row: wp.int32, height: wp.int32, width: wp.int32) -> wp.float32:
     top = row_edge(row, height)
     bottom = row_edge(row + 1, height)
     return direction_weight(0.5 * (top + bottom)) * (top - bottom) * 2.0 * PI / wp.float32(width)
-
-
-@wp.func
-def brightness(radiance: wp.vec3) -> wp.float32:
-    """One number for a colour: its mean, so that no hue goes unsampled."""
-    return (radiance[0] + radiance[1] + radiance[2]) / 3.0
 
 
 # Sums that run along rows are one chain of additions, whoever does them. On CUDA a warp's lanes load what comes next

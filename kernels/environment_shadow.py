@@ -71,7 +71,6 @@ from warp_ar.kernels.reflect import (
     make_mirrored,
     make_shade_unoccluded,
 )
-from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, sample_cosine_hemisphere, uniform_from_bits
 from warp_ar.kernels.structs import BOX, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.visibility import (
@@ -82,6 +81,7 @@ from warp_ar.kernels.visibility import (
     inside_rect,
     intersect_sphere,
     make_trace,
+    meets_probe,
     offset_origin,
     surface_key,
 )

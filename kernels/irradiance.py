@@ -64,8 +64,8 @@ import math
 import numpy as np
 import warp as wp
 
+from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
-from warp_ar.kernels.pyramid import safe_radiance
 
 wp.set_module_options({"enable_backward": False})
 

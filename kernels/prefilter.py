@@ -63,9 +63,10 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
+from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.latlong import latlong_from_direction, texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
-from warp_ar.kernels.pyramid import level_count, safe_radiance, sample_packed, sample_packed_smooth
+from warp_ar.kernels.pyramid import level_count, sample_packed, sample_packed_smooth
 from warp_ar.kernels.sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
 
 wp.set_module_options({"enable_backward": False})
@@ -103,7 +104,7 @@ def lobe_offset(height: int, level: int) -> int:
 
 
 def lobe_texels(height: int) -> int:
-    """Texels of all levels together: the length of ``specular_levels``."""
+    """Texels of all levels together: the length of ``prefilter_levels``."""
     return lobe_offset(height, lobe_count(height))
 
 

@@ -31,6 +31,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.latlong import latlong_from_direction, wrap_texel
 from warp_ar.kernels.launch import Rows, is_last_block, launch, launch_rows, launch_tiles, wait_for_block
 
@@ -41,8 +42,6 @@ BLOCK = 512
 """Threads of a block that takes a band of rows."""
 BAND_LEVELS = 3
 """Levels that a block makes of its own band, of 2^3 rows."""
-MAX_RADIANCE = wp.constant(wp.float32(1.0e8))
-"""Radiance that an infinite or larger texel counts as, in camera values: sums over any map stay finite in float32."""
 
 
 def level_size(height: int, width: int, level: int) -> tuple[int, int]:
@@ -63,20 +62,6 @@ def level_offset(height: int, width: int, level: int) -> int:
 def packed_texels(height: int, width: int) -> int:
     """Texels of a whole pyramid."""
     return level_offset(height, width, level_count(height, width))
-
-
-@wp.func
-def safe_channel(value: wp.float32) -> wp.float32:
-    """NaN and negative values to 0, infinity and anything beyond ``MAX_RADIANCE`` to that."""
-    if value > 0.0:  # false for NaN
-        return wp.min(value, MAX_RADIANCE)
-    return 0.0
-
-
-@wp.func
-def safe_radiance(radiance: wp.vec3) -> wp.vec3:
-    """Radiance that a filter can take: NaN and negative to 0, infinity to ``MAX_RADIANCE``."""
-    return wp.vec3(safe_channel(radiance[0]), safe_channel(radiance[1]), safe_channel(radiance[2]))
 
 
 @wp.func

@@ -41,7 +41,6 @@ from warp_ar.kernels.relight import (
     RelightConfig,
     look_up_cells,
     make_lit_by,
-    meets_probe,
     middle_pixel,
 )
 from warp_ar.kernels.shadow import sample_light, tile_turn
@@ -53,6 +52,7 @@ from warp_ar.kernels.visibility import (
     inside_rect,
     intersect_sphere,
     make_trace,
+    meets_probe,
     offset_origin,
     surface_key,
 )

@@ -29,7 +29,8 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.latlong import (
     PI,
     direction_from_latlong,
@@ -39,8 +40,8 @@ from warp_ar.kernels.latlong import (
     texel_solid_angle,
 )
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.probe import is_clipped, project, reflecting_normal
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.unwrap import reflecting_normal
 from warp_ar.kernels.visibility import FAR, ROUNDING, TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})

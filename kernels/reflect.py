@@ -15,16 +15,15 @@ from typing import Literal
 
 import warp as wp
 
+from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.emitters import add_nearness, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
-from warp_ar.kernels.probe import project
-from warp_ar.kernels.relight import meets_probe
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Emitter, FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace
+from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace, meets_probe
 
 wp.set_module_options({"enable_backward": False})
 

@@ -66,7 +66,7 @@ from typing import Literal
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
+from warp_ar.kernels.color import decode, luminance
 from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
 from warp_ar.kernels.emitters import add_nearness
 from warp_ar.kernels.irradiance import sh_irradiance
@@ -81,9 +81,9 @@ from warp_ar.kernels.visibility import (
     TraceConfig,
     check_edge_samples,
     inside_rect,
-    intersect_sphere,
     make_sample_direction,
     make_trace,
+    meets_probe,
     surface_key,
 )
 
@@ -142,14 +142,8 @@ class RelightConfig:
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise ValueError(f"method: {self.method!r} is none of {', '.join(RUNGS)}")
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(METHODS)}")
         check_edge_samples(self.edge_samples)
-
-
-@wp.func
-def luminance(color: wp.vec3) -> wp.float32:
-    """Rec. 709 luminance of a linear colour."""
-    return 0.2126 * color[0] + 0.7152 * color[1] + 0.0722 * color[2]
 
 
 @wp.func
@@ -194,16 +188,6 @@ def surrounding_luminance(
     fraction = code - wp.float32(low)
     linear = (1.0 - fraction) * luminance(decode_table[low]) + fraction * luminance(decode_table[low + 1])
     return wp.max(linear, 1.0e-4)
-
-
-@wp.func
-def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-    """Whether a mirror ball lies in the way."""
-    for index in range(probes.shape[0]):
-        probe = probes[index]
-        if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
-            return True
-    return False
 
 
 @wp.struct

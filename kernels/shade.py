@@ -62,7 +62,7 @@ class ShadeConfig:
     soft: bool = False
     """Whether lights with a radius cast soft shadows."""
     near: bool = False
-    """Whether ``object_light`` says what surrounds the objects at close range."""
+    """Whether ``near_field`` says what surrounds the objects at close range."""
 
     def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
         """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
@@ -74,7 +74,7 @@ class ShadeConfig:
 
 @wp.struct
 class Nearby:
-    """What surrounds a point of an object at close range, of ``object_light``."""
+    """What surrounds a point of an object at close range, of ``near_field``."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
     irradiance: wp.vec3
@@ -431,7 +431,7 @@ def shade(
         hit_object: (H, W) as ``trace_pixels`` writes.
         hits: (H, W) likewise.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
-        near_irradiance: (H, W) as ``filter_object_light`` writes; needed if ``config.near``.
+        near_irradiance: (H, W) as ``filter_near_field`` writes; needed if ``config.near``.
         near_mirrored: (H, W) likewise.
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.

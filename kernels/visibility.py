@@ -32,7 +32,7 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, RayScene, Shape
+from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
@@ -193,6 +193,16 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
     if shape.tree != wp.uint64(0):
         return walk_any(shape.tree, entry, direction, t_max - start)
     return wp.mesh_query_ray_anyhit(shape.mesh, entry, direction, t_max - start)
+
+
+@wp.func
+def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    """Whether a mirror ball lies in the way."""
+    for index in range(probes.shape[0]):
+        probe = probes[index]
+        if intersect_sphere(probe.radius, origin - probe.center, direction, t_max) < t_max:
+            return True
+    return False
 
 
 @wp.func

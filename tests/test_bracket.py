@@ -14,7 +14,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import bracket as reference
 from tests.reference import latlong as latlong_reference
-from tests.reference import probe as probe_reference
+from tests.reference import unwrap as probe_reference
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
 from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure

@@ -24,18 +24,18 @@ COSTS = Costs(
     20.0,
     {
         "environment_height": {"32": -2.0, "64": 0.0, "128": 8.0, "256": 36.0},
-        "diffuse": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
-        "specular": {"box_mip": -2.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
+        "irradiance": {"top_mip": -2.0, "sh2": 0.0, "sh4": 3.0, "clusters": 8.0},
+        "prefilter": {"box_mip": -2.0, "energy_mip": 0.0, "fis32": 5.0, "fis128": 20.0},
         "environment_shadow": {"none": -8.0, "coarse": 0.0, "bounce": 30.0},
     },
-    {"environment_height": {"32": {"specular": 0.25}, "128": {"specular": 4.0}, "256": {"specular": 16.0}}},
+    {"environment_height": {"32": {"prefilter": 0.25}, "128": {"prefilter": 4.0}, "256": {"prefilter": 16.0}}},
 )
-BASE = {"environment_height": "64", "diffuse": "sh2", "specular": "energy_mip", "environment_shadow": "coarse"}
-CHEAPEST = {"environment_height": "32", "diffuse": "top_mip", "specular": "box_mip", "environment_shadow": "none"}
+BASE = {"environment_height": "64", "irradiance": "sh2", "prefilter": "energy_mip", "environment_shadow": "coarse"}
+CHEAPEST = {"environment_height": "32", "irradiance": "top_mip", "prefilter": "box_mip", "environment_shadow": "none"}
 ERRORS = {
     "environment_height": {"32": 0.03, "64": 0.01, "128": 0.007, "256": 0.0},
-    "diffuse": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
-    "specular": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
+    "irradiance": {"top_mip": 0.1, "sh2": 0.02, "sh4": 0.01, "clusters": 0.0},
+    "prefilter": {"box_mip": 0.04, "energy_mip": 0.01, "fis32": 0.005, "fis128": 0.0},
     "environment_shadow": {"none": 0.06, "coarse": 0.03, "bounce": 0.0},
 }
 UNSCALED = Costs(COSTS.base, COSTS.methods)
@@ -160,7 +160,7 @@ def test_a_tighter_budget_never_errs_less():
 def test_settings_that_multiply_are_priced_so():
     """The dearest methods of both add up to 56 ms and take 356."""
     adding, multiplying = (Controller(costs, ERRORS, 130.0) for costs in (UNSCALED, COSTS))
-    both = {"environment_height": "256", "specular": "fis128"}
+    both = {"environment_height": "256", "prefilter": "fis128"}
     assert both.items() <= adding.settings.items(), "as if costs added up, both would fit"
     assert not both.items() <= multiplying.settings.items()
     assert COSTS.base + COSTS.excess(multiplying.settings) <= AIM * 130.0
@@ -179,7 +179,7 @@ def test_what_nobody_knew_is_found_out_before_it_is_shown(budget):
 
 def test_the_first_choice_is_not_taken_for_being_cheaper_than_the_base():
     """A method that promises to cost 1 ms and costs 8 leaves less than the base takes, and more than the budget."""
-    promised = {**COSTS.methods, "diffuse": {**COSTS.methods["diffuse"], "clusters": 1.0}}
+    promised = {**COSTS.methods, "irradiance": {**COSTS.methods["irradiance"], "clusters": 1.0}}
     machine = Machine(13.0, known=Costs(COSTS.base, promised, COSTS.scales))
     machine.run(10.0)
     assert machine.rejected > 0, "it must have been tempted"
@@ -245,8 +245,8 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
         for setting in a:
             if a[setting] == b[setting]:
                 continue
-            ladder = machine.controller._ladders[setting]
-            assert abs(ladder.index(a[setting]) - ladder.index(b[setting])) == 1
+            methods = machine.controller._methods[setting]
+            assert abs(methods.index(a[setting]) - methods.index(b[setting])) == 1
             assert now - moved.get(setting, -1.0) >= SETTING_SECONDS - 1e-9
             moved[setting] = now
 
@@ -258,7 +258,7 @@ def test_ten_thousand_noisy_frames_bring_no_flicker(budget, seed):
     off = np.random.default_rng(100 + seed)
     # Those that multiply stay as they are: one alone that is off would give stages negative times.
     methods = dict(COSTS.methods)
-    for setting in ("diffuse", "environment_shadow"):
+    for setting in ("irradiance", "environment_shadow"):
         methods[setting] = {method: ms * float(off.uniform(0.8, 1.2)) for method, ms in COSTS.methods[setting].items()}
     machine = Machine(budget, seed, known=Costs(COSTS.base, methods, COSTS.scales))
     times = machine.run(10_000 / FPS, noise=0.2, slow=0.02)
@@ -295,10 +295,10 @@ def test_a_single_slow_frame_changes_nothing():
 
 
 def test_what_is_hardly_better_is_not_worth_a_change():
-    errors = {"diffuse": {"sh2": 1.0, "sh4": 1.0 - 0.5 * GAIN}}
-    costs = Costs(20.0, {"diffuse": {"sh2": 0.0, "sh4": 12.0}})
+    errors = {"irradiance": {"sh2": 1.0, "sh4": 1.0 - 0.5 * GAIN}}
+    costs = Costs(20.0, {"irradiance": {"sh2": 0.0, "sh4": 12.0}})
     controller = Controller(costs, errors, 30.0)
-    assert controller.settings == {"diffuse": "sh2"}
+    assert controller.settings == {"irradiance": "sh2"}
     assert not any(controller.observe(1.0, index / FPS) for index in range(600))
 
 
@@ -320,8 +320,8 @@ def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
     for shown in range(count or 100):
         # As in ``show_again``: stages rest where nothing changes, and their times with them.
         pipeline(image - (shown % 2) * (image // 8), time_seconds=shown / FPS)
-        if pipeline._building is not None:
-            pipeline._building.result()
+        if pipeline._switcher.busy:
+            pipeline._switcher._building.result()
         if not count and pipeline.status()["changes"]:
             return
 
@@ -368,7 +368,7 @@ def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monk
 
     def trial(pipeline, image, pose, costs, settings):
         tried.append(settings)
-        return 1e9 if settings["diffuse"] == "clusters" else costs.base
+        return 1e9 if settings["irradiance"] == "clusters" else costs.base
 
     monkeypatch.setattr(auto_quality, "time_alone", trial)
     costs = dataclasses.replace(even_costs(settings, base=20.0, step=0.1), work=20.0)
@@ -378,10 +378,10 @@ def test_what_takes_too_long_alone_is_never_shown(frames: Frames, tmp_path, monk
         assert pipeline.status()["changes"] == [], "one frame tells no load"
         light(pipeline, frames[0])
         status = pipeline.status()
-    assert tried[0]["diffuse"] == "clusters", "it must have been tempted"
+    assert tried[0]["irradiance"] == "clusters", "it must have been tempted"
     assert status["rejected"][0]["settings"] == tried[0]
     assert status["settings"] == status["changes"][0]["settings"] == tried[-1]
-    assert status["settings"]["diffuse"] != "clusters"
+    assert status["settings"]["irradiance"] != "clusters"
 
 
 def test_says_once_that_nothing_fits(frames: Frames, tmp_path, capsys) -> None:

@@ -17,7 +17,7 @@ from warp_ar.errors import UsageError
 from warp_ar.input import ball_outline, camera_calibration, card, response
 from warp_ar.input.tracking import Tracker
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_scene
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Probe, load_calibration, load_scene
 
 BOARD = Marker("DICT_5X5_100", board=CharucoBoard(7, 5, 0.035, 0.026))
 FOCAL = 0.003

@@ -33,15 +33,15 @@ def test_what_is_turned_is_set(setting):
 
 
 def test_turning_changes_nothing_else():
-    turned = turn(PRESETS["medium"], {"diffuse": "sh4", "edge_samples": "16"})
+    turned = turn(PRESETS["medium"], {"irradiance": "sh4", "edge_samples": "16"})
     for setting in SETTINGS:
-        if setting.name not in ("diffuse", "edge_samples"):
+        if setting.name not in ("irradiance", "edge_samples"):
             assert chosen(turned, setting) == chosen(PRESETS["medium"], setting)
 
 
 def test_bad_turns_are_refused():
-    with pytest.raises(UsageError, match="diffuse has no method 'sh9'; expected top_mip"):
-        turn(PRESETS["medium"], {"diffuse": "sh9"})
+    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected top_mip"):
+        turn(PRESETS["medium"], {"irradiance": "sh9"})
     with pytest.raises(UsageError, match="nothing called 'colour'"):
         turn(PRESETS["medium"], {"colour": "red"})
 
@@ -51,8 +51,8 @@ def test_scenes_have_the_settings_that_they_call_for():
         return {setting.name for setting in relevant_settings(load_scene(scene), (640, 480))}
 
     assert "expose" in names("darken")
-    assert names("darken").isdisjoint({"diffuse", "specular", "relight", "shade", "edge_samples"})
-    assert {"diffuse", "specular", "relight", "environment_shadow", "environment_height", "mirror_ball"} <= names(
+    assert names("darken").isdisjoint({"irradiance", "prefilter", "relight", "shade", "edge_samples"})
+    assert {"irradiance", "prefilter", "relight", "environment_shadow", "environment_height", "mirror_ball"} <= names(
         "desk"
     )
     assert "expose" not in names("desk")
@@ -150,7 +150,7 @@ def test_dominated_methods_are_dropped():
 def test_price_list_is_checked():
     with pytest.raises(UsageError, match="table 'errors'"):
         read_errors({})
-    with pytest.raises(UsageError, match=r"errors\.diffuse\.sh2 is -1"):
-        read_errors({"errors": {"diffuse": {"sh2": -1}}})
-    errors = read_errors({"errors": {"diffuse": {"top_mip": 0.5, "sh4": 0.1}}})
-    assert errors["diffuse"] == {"top_mip": 0.5, "sh2": 0.5, "sh4": 0.1, "clusters": 0.1, "brute_force": 0.1}
+    with pytest.raises(UsageError, match=r"errors\.irradiance\.sh2 is -1"):
+        read_errors({"errors": {"irradiance": {"sh2": -1}}})
+    errors = read_errors({"errors": {"irradiance": {"top_mip": 0.5, "sh4": 0.1}}})
+    assert errors["irradiance"] == {"top_mip": 0.5, "sh2": 0.5, "sh4": 0.1, "clusters": 0.1, "brute_force": 0.1}

@@ -14,13 +14,13 @@ from warp_ar.accuracy.costs import BASE, Costs, measure_costs, read_costs, show_
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.stages.quality import PRESETS
 
-SETTING = next(setting for setting in SETTINGS if setting.name == "diffuse")
-KEPT = Costs(12.5, {"diffuse": {"sh2": 0.0, "sh4": 1.25}}, {"diffuse": {"sh4": {"specular": 2.0}}}, 2.5, 20.0)
+SETTING = next(setting for setting in SETTINGS if setting.name == "irradiance")
+KEPT = Costs(12.5, {"irradiance": {"sh2": 0.0, "sh4": 1.25}}, {"irradiance": {"sh4": {"prefilter": 2.0}}}, 2.5, 20.0)
 
 
 def test_costs_are_kept(tmp_path):
     write_costs(tmp_path / "new", "a", KEPT)
-    write_costs(tmp_path / "new", "b", Costs(1.0, {"diffuse": {"sh2": 0.0}}))
+    write_costs(tmp_path / "new", "b", Costs(1.0, {"irradiance": {"sh2": 0.0}}))
     assert read_costs(tmp_path / "new", "a", [SETTING]) == KEPT
     assert read_costs(tmp_path / "new", "c", [SETTING]) is None
 
@@ -33,12 +33,12 @@ def test_costs_are_kept(tmp_path):
         "[]",
         '{"a": 3}',
         '{"a": {"base": 1}}',
-        '{"a": {"base": "x", "methods": {"diffuse": {"sh2": 0}}}}',
-        '{"a": {"base": 1, "methods": {"diffuse": {"sh9": 0}}}}',
-        '{"a": {"base": 1, "methods": {"diffuse": {}}}}',
-        '{"a": {"base": 1, "methods": {"specular": {"box_mip": 0}}}}',
-        '{"a": {"base": 1, "methods": {"diffuse": {"sh2": 0}}}}',
-        '{"a": {"base": 1, "methods": {"diffuse": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
+        '{"a": {"base": "x", "methods": {"irradiance": {"sh2": 0}}}}',
+        '{"a": {"base": 1, "methods": {"irradiance": {"sh9": 0}}}}',
+        '{"a": {"base": 1, "methods": {"irradiance": {}}}}',
+        '{"a": {"base": 1, "methods": {"prefilter": {"box_mip": 0}}}}',
+        '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}}}',
+        '{"a": {"base": 1, "methods": {"irradiance": {"sh2": 0}}, "scales": [], "track": 0, "work": 1}}',
     ],
 )
 def test_costs_that_are_not_ours_are_measured_anew(tmp_path, text):
@@ -70,7 +70,7 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
     scene = make_scene()
     with Pipeline(scene, device=device, quality="low") as pipeline:
         pose = pipeline(frames[0]).pose
-    names = ("diffuse", "expose", "unwrap", "environment_height")
+    names = ("irradiance", "expose", "unwrap", "environment_height")
     settings = [setting for setting in relevant_settings(scene, (320, 240)) if setting.name in names]
     costs = measure_costs(scene, frames[0], pose, device, (320, 240), settings)
     assert costs.base > costs.track > 0.0
@@ -81,7 +81,7 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
     # The map's rows multiply what is done for each texel, and say nothing of what is not.
     assert costs.scales.keys() == {"environment_height"}
     scales = costs.scales["environment_height"]
-    assert all(own.keys() <= {"diffuse", "unwrap"} for own in scales.values())
+    assert all(own.keys() <= {"irradiance", "unwrap"} for own in scales.values())
     assert all(scale == 1.0 for scale in scales["64"].values())
     # Sixteen times the texels of the base, a quarter: no machine is as noisy as that.
     assert scales["256"]["unwrap"] > scales["32"]["unwrap"]
@@ -90,12 +90,12 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
 def test_what_shared_settings_do_multiplies():
     costs = Costs(
         10.0,
-        {"height": {"64": 0.0, "128": 6.0}, "specular": {"mip": 0.0, "fis": 5.0}, "shade": {"one": 0.0, "two": 1.0}},
-        {"height": {"128": {"specular": 4.0}}},
+        {"height": {"64": 0.0, "128": 6.0}, "prefilter": {"mip": 0.0, "fis": 5.0}, "shade": {"one": 0.0, "two": 1.0}},
+        {"height": {"128": {"prefilter": 4.0}}},
     )
-    assert costs.excess({"height": "64", "specular": "fis", "shade": "two"}) == 6.0
-    assert costs.excess({"height": "128", "specular": "mip", "shade": "two"}) == 7.0
-    assert costs.excess({"height": "128", "specular": "fis", "shade": "two"}) == 27.0
+    assert costs.excess({"height": "64", "prefilter": "fis", "shade": "two"}) == 6.0
+    assert costs.excess({"height": "128", "prefilter": "mip", "shade": "two"}) == 7.0
+    assert costs.excess({"height": "128", "prefilter": "fis", "shade": "two"}) == 27.0
 
 
 def test_a_frame_that_is_shown_again_keeps_every_stage_at_work(frames: Frames, device: str) -> None:
@@ -118,7 +118,7 @@ def test_timed_alone_counts_all_but_what_recovery_does_beside(frames: Frames, mo
     costs = Costs(12.0, {"recover": {"white_card": 0.0, "shading": 7.0}}, track=2.0, work=20.0)
     for method, beside in (("white_card", 0.0), ("shading", 7.0)):
         with Pipeline(scene, device="cpu", quality=turn(BASE, {"recover": method})) as pipeline:
-            own = time_alone(pipeline, frames[0], None, costs, {"recover": method, "diffuse": "clusters"})
+            own = time_alone(pipeline, frames[0], None, costs, {"recover": method, "irradiance": "clusters"})
             others = len(pipeline.plan.stages) - 1
             assert pipeline.scheduler.clock is time.perf_counter, "its own clock is back"
         assert own == pytest.approx(2.0 + others * (12.0 - 2.0) / 20.0 + beside)

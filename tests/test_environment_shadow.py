@@ -26,8 +26,8 @@ from warp_ar.kernels.structs import (
 )
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import load_scene
-from warp_ar.stages.base import Request
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 COUNT, SIDE = 64, 4
 ORIGIN = (0.0, 0.0, 0.035)

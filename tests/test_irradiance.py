@@ -7,12 +7,15 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import irradiance as reference
 from tests.reference import latlong
-from warp_ar.kernels import irradiance, pyramid
+from warp_ar.engine.graph import make_plan
+from warp_ar.kernels import guards, irradiance, pyramid
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.scene import loads_scene
-from warp_ar.stages.base import Arrays, LeftOut, Request
-from warp_ar.stages.diffuse import Diffuse, diffuse_output
+from warp_ar.stages.base import Arrays
+from warp_ar.stages.features import find_features
+from warp_ar.stages.irradiance import Irradiance
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 # The best public renderer keeps a white furnace within this.
 FURNACE = 5e-4
@@ -28,7 +31,7 @@ SH2_ERROR = 0.1
 SH4_ERROR = 0.05
 
 SIZES = [(64, 128), (16, 32), (7, 13), (1, 9), (9, 1), (1, 1), (5, 10)]
-METHODS = Diffuse.methods
+METHODS = Irradiance.methods
 
 SCENE = """
 schema = 1
@@ -108,10 +111,10 @@ def clusters(radiance, blocks=None, size=(32, 64)):
 def run_method(radiance, method, normals, bands=1):
     """Irradiance on ``normals`` as the stage makes it."""
     environment = upload(radiance)
-    quality = PRESETS["medium"].with_methods(diffuse=method)
+    quality = PRESETS["medium"].with_methods(irradiance=method)
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
-    request = Request(loads_scene(SCENE), quality, (64, 48))
-    stage = Diffuse(request, Diffuse.wire(request))
+    features = find_features(Request(loads_scene(SCENE), quality, (64, 48)))
+    stage = Irradiance(features, Irradiance.wire(features))
     arrays = Arrays()
     arrays.add("environment", environment)
     for name, spec in stage.arrays().items():
@@ -123,7 +126,7 @@ def run_method(radiance, method, normals, bands=1):
         else:
             for band in range(bands):
                 step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
-    output = arrays[diffuse_output(quality)]
+    output = arrays[features.irradiance]
     return evaluate(evaluate_sh_kernel if output.ndim == 1 else evaluate_map_kernel, output, normals)
 
 
@@ -242,7 +245,7 @@ def test_projection_is_the_twin_s(device, size, order):
     np.testing.assert_allclose(
         ours, twin, atol=1e-3 * np.abs(twin).max() if min(size) < 4 else 1e-4 * np.abs(twin).max()
     )
-    check_error("diffuse", ours, twin)
+    check_error("irradiance", ours, twin)
 
 
 def test_order_4_map_is_the_twin_s(device):
@@ -260,7 +263,7 @@ def test_the_reference_is_the_twin_s(device, size):
     out = clusters(radiance, None, (6, 12)).numpy().reshape(-1, 3)
     twin = reference.irradiance(radiance, latlong.directions(6, 12).reshape(-1, 3))
     np.testing.assert_allclose(out, twin, atol=REFERENCE_SPREAD * twin.max())
-    check_error("diffuse", out, twin)
+    check_error("irradiance", out, twin)
 
 
 def test_the_reference_agrees_with_monte_carlo(device):
@@ -374,7 +377,7 @@ def test_bad_texels_are_contained(device, method):
     radiance[9, 9] = np.inf
     values = run_method(radiance, method, unit(100))
     assert np.isfinite(values).all()
-    assert values.max() <= float(pyramid.MAX_RADIANCE) * 4 * np.pi
+    assert values.max() <= float(guards.MAX_RADIANCE) * 4 * np.pi
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -408,10 +411,8 @@ def test_tables_reject_an_order_they_lack(device):
 
 def test_a_scene_without_diffuse_material_leaves_the_stage_out():
     mirror = SCENE.replace('model = "lambert"', 'model = "mirror"')
-    left_out = Diffuse.wire(Request(loads_scene(mirror), PRESETS["medium"], (64, 48)))
-    assert isinstance(left_out, LeftOut)
-    assert "no virtual object is diffuse" in left_out.reason
-    wiring = Diffuse.wire(Request(loads_scene(SCENE), PRESETS["medium"], (64, 48)))
-    assert wiring.writes == ("irradiance_map",)
-    wiring = Diffuse.wire(Request(loads_scene(SCENE), PRESETS["paper"], (64, 48)))
-    assert wiring.writes == ("irradiance_map",)
+    left_out = make_plan(Request(loads_scene(mirror), PRESETS["medium"], (64, 48))).left_out
+    assert "no virtual object is diffuse" in dict(left_out)["irradiance"]
+    for preset in ("medium", "paper"):
+        plan = make_plan(Request(loads_scene(SCENE), PRESETS[preset], (64, 48)))
+        assert dict(plan.stages)[Irradiance].writes == ("irradiance_map",)

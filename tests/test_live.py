@@ -99,7 +99,7 @@ def test_folder_report_and_environment(tmp_path: Path) -> None:
     assert data["warp"]
     assert [frame["index"] for frame in data["frames"]] == list(range(FRAMES))
     assert data["stages_run"][:2] == ["track", "unwrap"]
-    assert {"key_lights", "specular", "summed_area", "relight", "expose"} <= {
+    assert {"key_lights", "prefilter", "summed_area", "relight", "expose"} <= {
         entry["stage"] for entry in data["stages_left_out"]
     }
     with Synthetic("card") as card:

@@ -46,9 +46,10 @@ from warp_ar.kernels.structs import (
 )
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import load_scene
-from warp_ar.stages.base import Request
+from warp_ar.stages.features import find_features
 from warp_ar.stages.mirror_ball import SAMPLES, mirror_config
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 H, W, FOCAL = 48, 64, 150.0
 # Positions on what is mirrored carry 1e-7 of a metre, times the ball's curvature; lights are decimetres away.
@@ -676,7 +677,7 @@ def test_config_holds_what_the_scene_calls_for():
     size = desk.camera.width, desk.camera.height
 
     def config(scene, **methods):
-        return mirror_config(Request(scene, PRESETS["high"].with_methods(**methods), size))
+        return mirror_config(find_features(Request(scene, PRESETS["high"].with_methods(**methods), size)))
 
     whole = config(desk, mirror_ball="smooth")
     assert whole.samples == 4

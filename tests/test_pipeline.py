@@ -10,7 +10,8 @@ import numpy.typing as npt
 import pytest
 import warp as wp
 
-from warp_ar.engine.pipeline import Pipeline, Result, resample_light
+from warp_ar.engine.carried_light import resample_light
+from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import UsageError
 from warp_ar.input.sources import Synthetic
 from warp_ar.input.tracking import TrackState
@@ -222,7 +223,7 @@ def test_a_still_picture_runs_only_what_time_moves(frames: Frames) -> None:
         for index in range(60):  # the light settles, the tracker too
             result = pipeline(frames[0], time_seconds=index / 30)
         skipped = {name for name, timing in result.stages.items() if timing.skipped}
-    assert {"diffuse", "specular", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
+    assert {"irradiance", "prefilter", "visibility", "shade", "composite"} <= skipped, "nothing had changed"
     assert "accumulate" not in skipped, "accumulation follows the clock"
 
 
@@ -256,7 +257,7 @@ def test_only_what_the_scene_calls_for_is_planned() -> None:
     assert stages(objects=(), lights=(), exposure=off) == set()
     assert stages(objects=(), lights=()) == {"expose"}, "plain scaling asks for nothing else"
     assert {"relight", "summed_area", "expose"}.isdisjoint(stages(lights=(), exposure=off))
-    assert {"shade", "visibility", "diffuse", "specular"}.isdisjoint(stages(objects=(), exposure=off))
+    assert {"shade", "visibility", "irradiance", "prefilter"}.isdisjoint(stages(objects=(), exposure=off))
     assert surroundings.isdisjoint(stages(probes=())), "without a ball there is no environment light to capture"
 
 
@@ -446,7 +447,7 @@ def test_what_virtual_light_reaches_by_no_way_is_passed_over_to_the_bit(device, 
             monkeypatch.setattr(HostScene, "light_outline", lambda self, bounced=False: outline(self, bounced=True))
         with Pipeline(scene, device=device, quality=quality) as pipeline:
             pictures.append([pipeline(frame).image.copy() for frame in frames[:2]])
-            params = pipeline._block.host("params")
+            params = pipeline.inputs.block.host("params")
             looked.append((params["direct_rect"].tolist(), params["light_rect"].tolist()))
     assert looked[0][0] != looked[0][1] == looked[1][0] == looked[1][1]
     np.testing.assert_array_equal(pictures[0], pictures[1])

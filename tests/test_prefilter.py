@@ -8,12 +8,15 @@ from tests.error_model import check_error
 from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
-from warp_ar.kernels import prefilter, pyramid
+from warp_ar.engine.graph import make_plan
+from warp_ar.kernels import guards, prefilter, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.scene import loads_scene
-from warp_ar.stages.base import Arrays, LeftOut, Request
+from warp_ar.stages.base import Arrays
+from warp_ar.stages.features import find_features
+from warp_ar.stages.prefilter import Prefilter, scene_lobe
 from warp_ar.stages.quality import PRESETS
-from warp_ar.stages.specular import Specular, scene_lobe
+from warp_ar.stages.request import Request
 
 # The best public prefilter keeps a white furnace within this.
 FURNACE = 5e-4
@@ -28,7 +31,7 @@ ERRORS = {"box_mip": 2.0, "energy_mip": 0.6, "fis32": 0.35, "fis128": 0.2}
 # Split-sum table: 1024 Hammersley directions against quadrature.
 DFG = 4e-3
 
-METHODS = Specular.methods
+METHODS = Prefilter.methods
 LOBES = ("ggx", "phong")
 MATERIALS = {
     "ggx": 'model = "metallic_roughness"\nbase_color = [1.0, 0.8, 0.3]\nmetallic = 1.0\nroughness = 0.4',
@@ -92,11 +95,12 @@ def dfg_kernel(
 def run(radiance, method, lobe="ggx", bands=1):
     """Packed levels as the stage makes them."""
     environment = wp.array(np.ascontiguousarray(radiance, np.float32), dtype=wp.vec3)
-    quality = PRESETS["medium"].with_methods(specular=method)
+    quality = PRESETS["medium"].with_methods(prefilter=method)
     quality = type(quality)(**{**vars(quality), "environment_height": environment.shape[0]})
     request = Request(scene(lobe), quality, (64, 48))
     assert scene_lobe(request.scene) == ("ggx" if lobe == "mirror" else lobe)
-    stage = Specular(request, Specular.wire(request))
+    features = find_features(request)
+    stage = Prefilter(features, Prefilter.wire(features))
     arrays = Arrays()
     arrays.add("environment", environment)
     for name, spec in stage.arrays().items():
@@ -107,7 +111,7 @@ def run(radiance, method, lobe="ggx", bands=1):
         else:
             for band in range(bands):
                 step.launch((step.rows * band // bands, step.rows * (band + 1) // bands))
-    return arrays["specular_levels"]
+    return arrays["prefilter_levels"]
 
 
 def unpack(levels, height):
@@ -214,7 +218,7 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
         directions = latlong.directions(*level.shape[:2]).reshape(-1, 3)
         twin = reference.integrate_lobe(radiance, directions, prefilter.lobe_alpha(height, index), lobe)
         np.testing.assert_allclose(level.reshape(-1, 3), twin, rtol=1e-4, atol=ROUNDING)
-        check_error("specular", level.reshape(-1, 3), twin)
+        check_error("prefilter", level.reshape(-1, 3), twin)
 
 
 @pytest.mark.parametrize("lobe", LOBES)
@@ -325,7 +329,7 @@ def test_bad_texels_are_contained(device, method):
     values = run(radiance, method).numpy()
     assert np.isfinite(values).all()
     assert (values >= 0).all()
-    assert values.max() <= float(pyramid.MAX_RADIANCE) * 4
+    assert values.max() <= float(guards.MAX_RADIANCE) * 4
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -390,9 +394,9 @@ def test_a_white_metal_keeps_a_white_furnace_white(device):
 
 
 def test_a_scene_without_gloss_leaves_the_stage_out():
-    left_out = Specular.wire(Request(scene("lambert"), PRESETS["medium"], (64, 48)))
-    assert left_out == LeftOut("no virtual object has a glossy material")
-    assert isinstance(Specular.wire(Request(scene(), PRESETS["medium"], (64, 48))), LeftOut)
+    for scenery in (scene("lambert"), scene()):
+        left_out = make_plan(Request(scenery, PRESETS["medium"], (64, 48))).left_out
+        assert dict(left_out)["prefilter"] == "no virtual object has a glossy material"
 
 
 def test_the_lobe_is_that_of_the_scene():
@@ -401,5 +405,5 @@ def test_the_lobe_is_that_of_the_scene():
 
 
 def test_a_scene_of_mirrors_filters_nothing():
-    request = Request(scene("mirror"), PRESETS["medium"], (64, 48))
-    assert set(Specular(request, Specular.wire(request)).arrays()) == {"specular_levels"}
+    features = find_features(Request(scene("mirror"), PRESETS["medium"], (64, 48)))
+    assert set(Prefilter(features, Prefilter.wire(features)).arrays()) == {"prefilter_levels"}

@@ -17,16 +17,14 @@ from warp_ar.kernels import structs
 from warp_ar.scene import Pose
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import (
-    EMPTY,
     HostScene,
-    Outline,
     linear_texture,
     make_ray_mesh,
     reflects_diffusely,
     reflects_glossily,
-    screen_rects,
     trace_config,
 )
+from warp_ar.scene.screen_extents import EMPTY, Outline, screen_rects
 
 CAMERA = scenes.Camera(width=64, height=48, fx=60.0, fy=62.0, cx=30.5, cy=24.0)
 BENT = dataclasses.replace(CAMERA, distortion=(-0.25, 0.08, 0.003, -0.002, 0.0))

@@ -65,7 +65,7 @@ def taken(scene, quality, monkeypatch):
     owners = {
         name: wiring.writes
         for kind, wiring in pipeline.plan.stages
-        for name in kind(pipeline.plan.request, wiring).arrays()
+        for name in kind(pipeline.plan.features, wiring).arrays()
     }
     return pipeline.plan, names, owners
 
@@ -95,6 +95,6 @@ def test_stages_read_what_they_declare(scene, preset, monkeypatch):
 def test_an_undeclared_read_is_found(monkeypatch):
     relight = next(kind for kind in STAGES if kind.name == "relight")
     wire = relight.wire
-    monkeypatch.setattr(relight, "wire", lambda request: dataclasses.replace(wire(request), reads=("pose",)))
+    monkeypatch.setattr(relight, "wire", lambda features: dataclasses.replace(wire(features), reads=("pose",)))
     with pytest.raises(AssertionError, match=r"relight takes .*, declares pose"):
         test_stages_read_what_they_declare("desk", "medium", monkeypatch)

@@ -808,7 +808,7 @@ def test_nothing_of_an_earlier_frame_is_read(device, method, rect):
     with Rig(device, "relight", method) as rig:
         rig.frame(frames(SIZE[1], SIZE[0])["noise"])
         rig.set_params(light_rect=rect, direct_rect=rect)
-        rig.pipeline._rects["light"] = rect
+        rig.pipeline.inputs.rects["light"] = rect
         found = []
         for old in (-1, 0):
             for name in ("share", "bounced"):

@@ -21,7 +21,11 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.light import recovery
+from warp_ar.light import noise, recovery, regions
+from warp_ar.light import solver as light_solver
+from warp_ar.light import surfaces as light_surfaces
+from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.problem import mirroring_points
 from warp_ar.scene import Pose, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene, trace_config
@@ -354,9 +358,9 @@ def test_nonnegative_solution_is_the_reference_one():
         for _ in range(20):
             matrix, target = rng.normal(size=(2 * size, size)), rng.normal(size=2 * size)
             want = nnls(matrix, target)[0]
-            got = recovery.solve_nonnegative(matrix.T @ matrix, matrix.T @ target)
+            got = light_solver.solve_nonnegative(matrix.T @ matrix, matrix.T @ target)
             assert got == pytest.approx(want, abs=SOLVED * 1e2)
-            warm = recovery.solve_nonnegative(matrix.T @ matrix, matrix.T @ target, got)
+            warm = light_solver.solve_nonnegative(matrix.T @ matrix, matrix.T @ target, got)
             assert warm == pytest.approx(got, abs=SOLVED)
 
 
@@ -365,7 +369,7 @@ def test_regions_join_across_seam_and_poles():
     mask[5, 0] = mask[6, 31] = True  # across the seam, diagonally
     mask[0, 3] = mask[0, 20] = True  # both touch the pole
     mask[10, 10] = True
-    labels = recovery.connected_regions(mask)
+    labels = regions.connected_regions(mask)
     assert labels[5, 0] == labels[6, 31] >= 0
     assert labels[0, 3] == labels[0, 20] >= 0
     assert len(np.unique(labels[mask])) == 3
@@ -375,11 +379,11 @@ def test_regions_join_across_seam_and_poles():
 def test_wide_regions_are_split_into_compact_parts():
     d, area = reference.cell_directions(ROWS, COLUMNS)
     labels = np.where(d[:, 2] > 0.5, 0, np.where(d[:, 2] < -0.99, 1, -1))
-    parts, count = recovery.split_regions(labels, d, area)
+    parts, count = regions.split_regions(labels, d, area)
     sizes = np.bincount(parts[parts >= 0], area[parts >= 0])
     assert count == len(sizes) == parts.max() + 1
     assert (parts >= 0).tolist() == (labels >= 0).tolist()
-    assert sizes.max() < 3 * recovery.REGION
+    assert sizes.max() < 3 * CONFIG.priors.region
     assert len(np.unique(parts[labels == 1])) == 1
 
 
@@ -390,7 +394,7 @@ class DistantLight:
         self.device, self.scene = device, scene
         self.host = HostScene(dataclasses.replace(scene, objects=()), device)
         self.proxies = trace_config(scene).proxies
-        self.surfaces = recovery.find_surfaces(scene)
+        self.surfaces = light_surfaces.find_surfaces(scene)
         records = self.surfaces.points
         self.points = wp.array(records, dtype=kernels.SurfacePoint, device=device)
         self.seen = seen(device, len(records))
@@ -492,7 +496,7 @@ def test_a_lamp_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
     direction = lamp - center
     for _ in range(30):  # the direction in which the ball shows it
         direction /= np.linalg.norm(direction)
-        mirrors = recovery.mirroring_points(direction[None], center, 0.035, camera)[0]
+        mirrors = mirroring_points(direction[None], center, 0.035, camera)[0]
         direction = lamp - mirrors
     distance = np.linalg.norm(direction)
     direction /= distance
@@ -527,7 +531,7 @@ def scattered(kind, count, scatter, *, lamp=None, stains=0):
     light[:stains] *= 0.3
     exact = np.ones((count, 3), bool)
     surface = np.zeros(count, np.int64)
-    return recovery.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0]
+    return noise.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0]
 
 
 @pytest.mark.parametrize("lamp", [None, (-0.2, 0.1, 0.4)])
@@ -535,14 +539,14 @@ def scattered(kind, count, scatter, *, lamp=None, stains=0):
 def test_noise_is_how_far_points_scatter(scatter, lamp):
     # 40 points tell a deviation to about a seventh, robustly measured; a fifth of them in shadow change little.
     for stains in (0, 8):
-        assert scattered(recovery.Kind.FACE, 40, scatter, lamp=lamp, stains=stains) == pytest.approx(scatter, rel=0.4)
+        assert scattered(Kind.FACE, 40, scatter, lamp=lamp, stains=stains) == pytest.approx(scatter, rel=0.4)
 
 
 def test_noise_is_bounded_and_needs_points():
-    usual = recovery._NOISE[recovery.Kind.FACE]
-    assert scattered(recovery.Kind.FACE, 40, 0.0) == recovery.LEAST_NOISE
-    assert scattered(recovery.Kind.FACE, 40, 0.5) == usual
-    assert scattered(recovery.Kind.FACE, recovery.SCATTER_POINTS - 1, 0.001) == usual
+    usual = CONFIG.surfaces.noise[Kind.FACE]
+    assert scattered(Kind.FACE, 40, 0.0) == CONFIG.surfaces.least_noise
+    assert scattered(Kind.FACE, 40, 0.5) == usual
+    assert scattered(Kind.FACE, CONFIG.surfaces.scatter_points - 1, 0.001) == usual
 
 
 def test_a_card_that_clips_is_a_lower_bound(device, scene):
@@ -581,24 +585,24 @@ def test_errors_are_shared_by_what_is_near():
     """A point alone on a table has an error of its own; a hundred within a centimetre share one."""
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]])
     together = np.array([0.2, 0.3, 0.0]) + 1e-4 * np.arange(100)[:, None] * [1.0, 0.0, 0.0]
-    plane = np.full(103, int(recovery.Kind.PLANE))
-    overlap = recovery.texture_overlap(np.concatenate([apart, together]), np.zeros(103, int), plane)
-    shared = recovery.shared_errors(overlap, plane, np.ones(103, bool))
+    plane = np.full(103, int(Kind.PLANE))
+    overlap = light_surfaces.texture_overlap(np.concatenate([apart, together]), np.zeros(103, int), plane)
+    shared = noise.shared_errors(overlap, plane, np.ones(103, bool))
     assert shared[:3] == pytest.approx(2.0)
     assert (shared[3:] > 80.0).all()
-    half = recovery.shared_errors(overlap, plane, np.arange(103) % 2 == 0)
+    half = noise.shared_errors(overlap, plane, np.arange(103) % 2 == 0)
     assert len(half) == 52
     assert half[2:] == pytest.approx(0.5 * shared[4::2], rel=0.03)
 
 
 TWO_SOLVERS = """
 from threadpoolctl import threadpool_info, threadpool_limits
-from warp_ar.light import recovery
+from warp_ar.light import solver
 
 def threads():
     return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
 
-one = recovery._OneBlasThread()
+one = solver.OneBlasThread()
 with threadpool_limits(2, user_api="blas"):
     before = threads()
     one.__enter__()
@@ -649,7 +653,7 @@ def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
 
 def test_unknown_method_is_named(scene):
     with pytest.raises(ValueError, match=r"'guess'.*white_card or shading"):
-        recovery.Recovery(recovery.find_surfaces(scene), 0.85, (0, 0, 0), method="guess")
+        recovery.Recovery(light_surfaces.find_surfaces(scene), 0.85, (0, 0, 0), method="guess")
 
 
 # ---- the stage ----------------------------------------------------------------------------------------------------
@@ -710,14 +714,14 @@ def spied_estimates(monkeypatch, seconds=0.0):
     monkeypatch.setattr(recovery.Recovery, "update", update)
 
 
-def shown_estimates(scene, device, count, turns=1, waits=False):
+def shown_estimates(scene, device, count, turns=1, synchronous=False):
     """Number of the estimate that each of ``count`` frames, 30 a second, was lit by; pipelines take turns."""
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     rng = np.random.default_rng(6)
     shown = []
     with contextlib.ExitStack() as stack:
         quality = PRESETS["low"].with_methods(recover="white_card")
-        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "waits": waits}
+        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "synchronous": synchronous}
         pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
         for index in range(count):
             now, before = pipelines[index % turns], pipelines[(index - 1) % turns]
@@ -741,7 +745,7 @@ def test_estimates_take_effect_a_fixed_time_later(scene, device, monkeypatch, se
 def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monkeypatch):
     spied_estimates(monkeypatch, 0.05)
     expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
-    assert shown_estimates(scene, device, len(expected), waits=True) == expected
+    assert shown_estimates(scene, device, len(expected), synchronous=True) == expected
 
 
 def what_is_seen(surroundings=0.4, table=0.3):
@@ -758,20 +762,20 @@ def what_is_seen(surroundings=0.4, table=0.3):
 
 def settled_solver(scene):
     """A solver that has made as many estimates as it takes."""
-    solver = recovery.Recovery(recovery.find_surfaces(scene), 0.85, (-0.12, 0.03, 0.035))
-    solver._frames = recovery.SETTLED
+    solver = recovery.Recovery(light_surfaces.find_surfaces(scene), 0.85, (-0.12, 0.03, 0.035))
+    solver._frames = CONFIG.solver.settled
     return solver
 
 
 def test_what_still_holds_is_solved_for_now_and_then(scene):
     solver = settled_solver(scene)
     rested = [solver.rests(*what_is_seen()) for _ in range(12)]
-    assert rested == [False, *[True] * recovery.REST, False, *[True] * recovery.REST, False, True]
+    assert rested == [False, *[True] * CONFIG.solver.rest, False, *[True] * CONFIG.solver.rest, False, True]
 
 
 def test_a_new_solver_does_not_rest(scene):
     solver = settled_solver(scene)
-    solver._frames = recovery.SETTLED - 1
+    solver._frames = CONFIG.solver.settled - 1
     assert not any(solver.rests(*what_is_seen()) for _ in range(5))
 
 
@@ -840,12 +844,12 @@ def test_the_stage_lets_an_estimate_stand(scene, device, monkeypatch):
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     quality = PRESETS["low"].with_methods(recover="white_card")
     lit = []
-    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), waits=True) as pipeline:
+    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), synchronous=True) as pipeline:
         for index in range(100):
             result = pipeline(image, time_seconds=index / 30, pose=pose)
             lit.append(result.environment)
     asked = [0, 1, 2, *range(8, 100, 6)]
-    rests = [frame for frame in asked[recovery.SETTLED :] if frame not in solved]
+    rests = [frame for frame in asked[CONFIG.solver.settled :] if frame not in solved]
     assert solved == [frame for frame in asked if frame not in rests]
     assert len(rests) >= 4
     assert all((lit[frame] == lit[frame - 1]).all() for frame in rests)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from warp_ar import scene as sc
 from warp_ar.errors import SceneError, WarpArError
-from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_scene, loads_scene
+from warp_ar.scene import Camera, Scene, bundled_scenes, dumps_scene, load_calibration, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 
 CAMERA = """
@@ -387,7 +387,7 @@ def light(**changes: str) -> str:
 ERRORS = [
     # Not TOML, or not a scene.
     ("schema = ", r"not valid TOML"),
-    ("[[" * 5000, r"not valid TOML"),
+    ("[[" * 5000, r"levels of nesting"),
     ("schema = " + "1" * 5000, r"not valid TOML"),
     ("", r"schema is missing: expected schema = 1"),
     (CAMERA.replace("schema = 1", "schema = 2"), r"schema = 2: this program reads schema 1"),

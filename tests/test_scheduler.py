@@ -14,10 +14,12 @@ import warp as wp
 
 from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
-from warp_ar.engine.scheduler import Scheduler, _giving_way
+from warp_ar.engine.scheduler import Scheduler, _in_launch_order
 from warp_ar.kernels.launch import launch_rows
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
 
 SIZE = 37
 
@@ -29,14 +31,13 @@ def add_one_kernel(row_start: wp.int32, values: wp.array[wp.int32], values_out: 
 
 
 class AddOne(Stage):
-    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "adds one"
     source: ClassVar[str]
     target: ClassVar[str]
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
-        if cls.target in request.scene.unwanted:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        if cls.target in features.request.scene.unwanted:
             return LeftOut(f"the scene has no {cls.target}")
         return Wiring((cls.source,), (cls.target,))
 
@@ -66,6 +67,7 @@ def plan_of(
     monkeypatch: pytest.MonkeyPatch, stages: tuple[type[Stage], ...], outputs: tuple[str, ...], **scene: Any
 ) -> Plan:
     monkeypatch.setattr(graph, "STAGES", stages)
+    monkeypatch.setattr(graph, "find_features", lambda request: types.SimpleNamespace(request=request))
     values = types.SimpleNamespace(**{"unwanted": (), "still": False, **scene})
     return make_plan(Request(values, PRESETS["medium"], (4, 4), outputs))  # type: ignore[arg-type]
 
@@ -222,8 +224,8 @@ def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, dev
 
         def build(self, arrays: Arrays, device: Any) -> list[Pass]:
             (add,) = super().build(arrays, device)
-            again = Pass(add.launch, rows=SIZE, due=lambda: self.frame % 2 == 0)
-            return [add, Pass(lambda rows: calls.append("host"), on_host=True, due=again.due), again]
+            again = Pass(add.launch, rows=SIZE, enabled=lambda: self.frame % 2 == 0)
+            return [add, Pass(lambda rows: calls.append("host"), on_host=True, enabled=again.enabled), again]
 
         frame = -1
 
@@ -250,12 +252,11 @@ def test_a_stage_gives_way_as_far_as_its_readers_allow(monkeypatch: pytest.Monke
         stages = {}
         for target, source in (("a", "frame"), ("b", "frame"), ("c", "frame"), ("d", "a"), ("e", "frame")):
             way = {"a": a, "b": b}.get(target, ())
-            fields = {"name": target, "source": source, "target": target, "gives_way": lambda self, way=way: way}
+            fields = {"name": target, "source": source, "target": target, "runs_after": lambda self, way=way: way}
             stages[target] = type(target, (AddOne,), fields)
         plan = plan_of(monkeypatch, tuple(stages.values()), ("a", "b", "c", "d", "e"))
-        return [
-            stage.name for stage, _ in _giving_way([(kind(plan.request, wiring), []) for kind, wiring in plan.stages])
-        ]
+        steps = [(kind(plan.features, wiring), []) for kind, wiring in plan.stages]
+        return [stage.name for stage, _ in _in_launch_order(steps)]
 
     assert order() == ["a", "b", "c", "d", "e"]
     assert order(a=("b",)) == ["b", "a", "c", "d", "e"]

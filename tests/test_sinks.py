@@ -17,8 +17,8 @@ import pytest
 
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.input.sources import open_source
+from warp_ar.output.sink import FRAMES_WAITING
 from warp_ar.output.sinks import (
-    FRAMES_WAITING,
     EnvironmentSink,
     NullSink,
     Sink,

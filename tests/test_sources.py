@@ -19,17 +19,9 @@ import pytest
 from av.video.reformatter import ColorRange, Colorspace
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input import sources
-from warp_ar.input.sources import (
-    FRAMES_AHEAD,
-    CaptureDevice,
-    FrameFolder,
-    QueueSource,
-    Source,
-    Synthetic,
-    VideoFile,
-    open_source,
-)
+from warp_ar.input import live_source
+from warp_ar.input.source import FRAMES_AHEAD
+from warp_ar.input.sources import CaptureDevice, FrameFolder, QueueSource, Source, Synthetic, VideoFile, open_source
 
 # 4:2:0 at limited range keeps 219 of 255 levels, and the codec adds its own rounding.
 VIDEO_LEVELS = 3
@@ -411,7 +403,7 @@ def test_empty_and_foreign_files(tmp_path: pathlib.Path) -> None:
     (tmp_path / "text.mp4").write_text("This is not a video. " * 100)
     assert "cannot be read as a video" in error_of(tmp_path / "text.mp4")
     (tmp_path / "text.txt").write_text("This is not a video. " * 100)
-    assert "no video stream, only text" in error_of(tmp_path / "text.txt")
+    assert "cannot be read as a video" in error_of(tmp_path / "text.txt")
 
 
 def test_sound_alone_is_no_video(tmp_path: pathlib.Path) -> None:
@@ -700,7 +692,7 @@ class Exposed(FakeCapture):
 @pytest.mark.parametrize(("late", "backend"), [(0, "V4L2"), (2, "DSHOW"), (6, "V4L2")])
 def test_device_alternates_and_knows_what_it_shows(late: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """However late the camera follows, no picture is taken for one of another exposure."""
-    monkeypatch.setattr("warp_ar.input.sources.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
     capture = Exposed(late, backend=backend)
     with CaptureDevice(0, exposures=(1e-3, 8e-3), opener=lambda _: capture) as source:
         assert source.exposures == (8e-3, 1e-3)
@@ -717,7 +709,7 @@ def test_device_alternates_and_knows_what_it_shows(late: int, backend: str, monk
 
 def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lamp that is switched off while the exposure changes is not taken for an exposure forever."""
-    monkeypatch.setattr("warp_ar.input.sources.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
     capture = Exposed(1)
     with CaptureDevice(0, exposures=(8e-3, 2e-3), opener=lambda _: capture) as source:
         frames = iter(source)
@@ -730,7 +722,7 @@ def test_device_whose_light_changes_goes_on(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("stuck", [True, False])
 def test_device_whose_exposure_cannot_be_set(stuck: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("warp_ar.input.sources.BRACKET_SECONDS", 0.02)
+    monkeypatch.setattr("warp_ar.input.capture_device.BRACKET_SECONDS", 0.02)
     if stuck:  # it says yes, and nothing happens
         capture = Exposed(0)
         monkeypatch.setattr(capture, "set", lambda key, value: True)
@@ -744,7 +736,7 @@ def test_device_whose_exposure_cannot_be_set(stuck: bool, monkeypatch: pytest.Mo
 
 
 def test_a_slow_reader_gets_the_rare_exposure() -> None:
-    newest = sources._Newest()
+    newest = live_source._Newest()
     for stamp, exposure in ((0.0, 8.0), (1.0, 8.0), (2.0, 1.0), (3.0, 8.0), (4.0, 8.0)):
         newest.put(np.zeros((1, 1, 3), np.uint8), stamp, exposure)
     taken = [newest.take()[1:] for _ in range(2)]  # type: ignore[index]

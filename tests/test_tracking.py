@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.input.tracking import MarkerDetector, Tracker, TrackState, find_dictionary, make_board
+from warp_ar.input.markers import MarkerDetector, find_dictionary, make_board
+from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
 
 RENDERED_DEGREES, RENDERED_MM = 0.15, 0.4

@@ -12,8 +12,9 @@ from tests.error_model import check_error
 from tests.reference import visibility as reference
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, make_trace, offset_origin, trace_pixels
-from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals, sphere_mesh, torus_mesh
+from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals
 from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.shapes import sphere_mesh, torus_mesh
 
 EVERY = (structs.PLANE, structs.BOX, structs.MESH, structs.SPHERE)
 GENERAL = TraceConfig(EVERY, EVERY)

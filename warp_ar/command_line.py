@@ -1,16 +1,25 @@
-"""What all commands share: exit codes, and errors of usage in one line."""
+"""What all commands share: exit codes, errors in one line that a terminal cannot mistake, and how signals end them."""
 
 from __future__ import annotations
 
 import argparse
-from typing import NoReturn
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
 
-from warp_ar.errors import UsageError
+from warp_ar.errors import UsageError, WarpArError, printable
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+_LONGEST = 1000
+"""Characters of a message that are shown: a path may have thousands."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -19,3 +28,67 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise the message as an error of usage."""
         raise UsageError(f"{message}; see {self.prog} --help")
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end by SIGTERM or SIGHUP; it does so as after Ctrl-C."""
+
+
+def say(text: object) -> None:
+    """Print a line to stderr: on one line, and with nothing in it that a terminal would obey."""
+    shown = printable(text)
+    if len(shown) > _LONGEST:
+        shown = f"{shown[: _LONGEST * 2 // 3]}... ({len(shown)} characters) ...{shown[-_LONGEST // 4 :]}"
+    print(f"warp_ar: {shown}", file=sys.stderr)
+
+
+def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[type[WarpArError], ...] = ()) -> int:
+    """Run a command; what a user can cause is one line, and a signal ends it in order.
+
+    Args:
+        command: Returns the exit code.
+        failures: Errors that mean a failure while running, not wrong usage.
+
+    Returns:
+        The exit code.
+    """
+    try:
+        with ended_by_signals():
+            return command()
+    except failures as error:
+        say(error)
+        return EXIT_FAILED
+    except WarpArError as error:
+        say(error)
+        return EXIT_USAGE
+    except Terminated:
+        return EXIT_TERMINATED
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed."""
+
+    def handle(*_: Any) -> None:
+        raise Terminated
+
+    with handling(handle, "SIGTERM", "SIGHUP"):
+        yield
+
+
+@contextlib.contextmanager
+def handling(handler: Any, *names: str) -> Iterator[None]:
+    """Handle the signals of these names where there are such; elsewhere than in the main thread nothing is changed."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
+            # Who was started to outlive its terminal (nohup) goes on doing so.
+            if signal.getsignal(number) is not signal.SIG_IGN or number == signal.SIGINT:
+                before[number] = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)

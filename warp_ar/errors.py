@@ -1,5 +1,9 @@
 """Errors that a user can cause, each with a one-line message that says what is wrong and what would be right."""
 
+from __future__ import annotations
+
+import re
+
 
 class WarpArError(Exception):
     """Base of every error that this package raises on purpose; its message is one line, fit to print as it is."""
@@ -19,3 +23,18 @@ class SinkError(WarpArError, RuntimeError):
 
 class UsageError(WarpArError, ValueError):
     """An option or argument, on the command line or in a call, has a value that cannot be used."""
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong, on one line, without the path that the message around it names already."""
+    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return " ".join(str(text).split())
+
+
+# What a terminal takes for a command, and what turns the direction of text around; halves of a pair cannot be encoded.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufeff]")
+
+
+def printable(text: object) -> str:
+    r"""A text on one line that a terminal shows as it is: control characters become ``\x1b`` and the like."""
+    return _UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), str(text))

@@ -16,16 +16,16 @@ from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Parser
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import WarpArError
+from warp_ar.input.exposures import bracket_ratios
 from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Request
-from warp_ar.stages.numerics import NUMERICS
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.stages.request import Request
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.explain", description="Which stages a scene calls for, and why the others are left out."
     )
@@ -36,14 +36,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--quality", default=DEFAULT_PRESET, metavar="NAME", help=f"{', '.join(PRESETS)} (default: {DEFAULT_PRESET})"
     )
     parser.add_argument("--numerics", action="store_true", help="print every stage's precision and worst error instead")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
     try:
-        options: argparse.Namespace = parser.parse_args(arguments)
+        options = make_parser().parse_args(arguments)
         if options.numerics:
             print_numerics()
             return EXIT_DONE
         scene = load_scene(options.scene)
         size = (scene.camera.width, scene.camera.height)
-        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size)))
+        exposures = bracket_ratios((scene.source and scene.source.exposures) or ())
+        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
     except WarpArError as error:
         print(f"warp_ar: {error}", file=sys.stderr)
         return EXIT_USAGE
@@ -54,7 +60,7 @@ def print_numerics() -> None:
     """Print the error model: per stage its precision, expected and measured worst error, and rows of hard cases."""
     table = Table("stage", "precision", "expected worst error", "measured", "hard cases")
     for stage in STAGES:
-        numbers = NUMERICS[stage.name]
+        numbers = stage.numerics
         rows = " ".join(map(str, numbers.rows))
         table.add_row(stage.name, numbers.precision, numbers.expected, f"{numbers.measured:.1e}", rows)
     Console(width=None if sys.stdout.isatty() else 160).print(table)

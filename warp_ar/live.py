@@ -15,7 +15,7 @@ import signal
 import sys
 import time
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,22 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, Parser
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.command_line import (
+    EXIT_DONE,
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    Parser,
+    Terminated,
+    handling,
+    run_command,
+    say,
+)
+from warp_ar.errors import UsageError, WarpArError, printable, reason
+from warp_ar.files import write_whole
+from warp_ar.output.places import PROGRAM, check_places, check_replaceable, files_of
 from warp_ar.output.report import RunLog, print_plan
-from warp_ar.output.sinks import NullSink, open_sink, write_environment
+from warp_ar.output.sink import make_folder
+from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
 from warp_ar.session import Session
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
@@ -89,6 +101,11 @@ def make_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="no page, no progress bar, no table; writes only what other options name",
     )
+    add(
+        "--overwrite",
+        action="store_true",
+        help="replace files that this program did not write; those that it wrote are replaced anyway",
+    )
     add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
     add(
@@ -121,42 +138,40 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-@contextlib.contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C finish the frame in hand; a second one stops at once."""
-    requested = False
+class _Stop:
+    """Whether a signal has asked the run to end, and the exit code that this gives."""
 
-    def handle(*_: object) -> None:
-        nonlocal requested
-        if requested:
+    def __init__(self) -> None:
+        self.code: int | None = None
+
+    def handle(self, number: int, _: object) -> None:
+        """Note the first signal; a second one stops at once."""
+        if self.code is not None:
             raise KeyboardInterrupt
-        requested = True
-
-    previous = signal.signal(signal.SIGINT, handle)
-    try:
-        yield lambda: requested
-    finally:
-        signal.signal(signal.SIGINT, previous)
+        self.code = EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_TERMINATED
 
 
-def _prepare_file(path: Path) -> None:
-    """Fail now, not after an hour of frames, where a file cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    except OSError as error:
-        raise UsageError(
-            f"cannot write {path}: {error.strerror}; name a file in a folder that you may write to"
-        ) from error
+def _prepare_file(path: Path, *, overwrite: bool) -> str:
+    """Fail now, not after an hour of frames, where a file cannot be written; returns what it replaces, in words."""
+    replaced = check_replaceable(path, overwrite=overwrite)
+    make_folder(path.parent)
+    return replaced
 
 
-def _prepare_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(
-            f"cannot make the folder {path}: {error.strerror}; name a folder that you may write to"
-        ) from error
+def _check_places(options: argparse.Namespace, scene: Scene) -> None:
+    """See to it that nothing is written over what is read, or twice."""
+    source = options.source
+    if source is None:
+        source = None if scene.source is None else scene.source.path
+    reads: dict[str, list[Path]] = {"the scene": [] if scene.path is None else [scene.path]}
+    reads["what the scene names,"] = [path for path in files_of(scene) if path != scene.path]
+    if options.calibration is not None:
+        reads["--calibration"] = [Path(options.calibration)]
+    if source is not None:
+        reads["the source"] = [Path(source)]
+    names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
+    writes = {option: Path(path) for name, option in names.items() if (path := getattr(options, name)) is not None}
+    check_places(reads, writes)
 
 
 def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
@@ -172,13 +187,12 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     )
     if not live:
         raise RunError(message)
-    print(f"warp_ar: {message}", file=sys.stderr)
+    say(message)
 
 
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.viewer.host import Host
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -205,7 +219,10 @@ def serve_page(options: argparse.Namespace) -> int:
     )
     port = DEFAULT_PORT if options.port is None else options.port
 
-    def make_host(**callbacks: Any) -> Host:
+    def make_host(**callbacks: Any) -> Any:
+        # On the page's own thread, when it is served already: it loads Warp and all that uses it.
+        from warp_ar.viewer.host import Host
+
         return Host(
             scene,
             source=options.source,
@@ -217,7 +234,7 @@ def serve_page(options: argparse.Namespace) -> int:
         )
 
     def ready(address: Address) -> None:
-        print(f"warp_ar: {scene.name} is at {address.url} (Ctrl-C ends it)", flush=True)
+        print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
         if not options.no_browser and local and _has_display():
@@ -226,11 +243,19 @@ def serve_page(options: argparse.Namespace) -> int:
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     server = Server(make_host, Address(options.host, port, token, tls))
+    code = EXIT_DONE
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return EXIT_DONE
+    except KeyboardInterrupt as error:
+        code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
+    finally:
+        if not server.ended:
+            # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped: threads
+            # would be waited for at the end of Python. All files are closed and temporary folders gone by now.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    return code
 
 
 def _print_choice(pipeline: AutoPipeline) -> None:
@@ -249,27 +274,23 @@ def _print_choice(pipeline: AutoPipeline) -> None:
     )
 
 
-def _ball_report(scene: str | Path, session: Session) -> dict[str, Any]:
+def _ball_report(scene: Scene, session: Session) -> dict[str, Any]:
     """Say how far from where the scene has them the mirror balls were found."""
-    given = load_scene(scene).probes
+    given = scene.probes
     found = []
     for index, (fit, before, after) in enumerate(zip(session.ball_fits, given, session.scene.probes, strict=False)):
         offset = [round(1e3 * (b - a), 2) for a, b in zip(before.center, after.center, strict=True)]
         good = fit is not None and fit.is_good
         found.append({"offset_mm": offset, "deviation_mm": round(1e3 * fit.deviation, 2) if fit and good else None})
         what = f"moved by {offset} mm" if good else "left where the scene has it: too little of the desk shows in it"
-        print(f"warp_ar: mirror ball {index} {what}", file=sys.stderr)
+        say(f"mirror ball {index} {what}")
     return {"balls": found} if found else {}
 
 
 def _compile(session: Session, *, shown: bool) -> None:
     """Have the kernels ready, with a bar where some must be compiled."""
-    bar = Progress(
-        TextColumn("compiling kernels, once for this kind of scene"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        disable=not shown,
-    )
+    words = TextColumn("compiling kernels, once for this kind of scene")
+    bar = Progress(words, BarColumn(), MofNCompleteColumn(), disable=not shown)
     task: TaskID | None = None
 
     def tell(done: int, total: int) -> None:
@@ -304,93 +325,134 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
     if options.output is None and not options.headless:
         return serve_page(options)
-    output = options.output
-    outputs = ["image"]
+    return light_clip(options)
+
+
+def light_clip(options: argparse.Namespace) -> int:
+    """Light a source's frames without a page, and write what options name."""
+    scene = load_scene(options.scene)
+    _check_places(options, scene)
+    outputs, replaced = ["image"], []
+    lights: EnvironmentSink | None = None
     if options.save_environment is not None:
-        _prepare_folder(options.save_environment)
+        lights = EnvironmentSink(options.save_environment, overwrite=options.overwrite)
         outputs.append("environment")
     if options.report is not None:
-        _prepare_file(options.report)
+        replaced.append(_prepare_file(options.report, overwrite=options.overwrite))
         outputs.append("pose")
 
+    stop = _Stop()
     with contextlib.ExitStack() as stack:
-        session = stack.enter_context(
-            Session(
-                options.scene,
-                source=options.source,
-                calibration=options.calibration,
-                device=options.device,
-                quality=options.quality,
-                budget_ms=options.budget_ms,
-                outputs=tuple(outputs),
-                loop=options.loop,
-                refine_ball=options.refine_ball,
-            )
-        )
-        balls = _ball_report(options.scene, session)
+        if lights is not None:
+            stack.enter_context(lights)
+        session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
+        balls = _ball_report(scene, session)
         _compile(session, shown=not options.headless)
         source = session.source
-        sink = NullSink() if output is None else open_sink(output, fps=source.fps, size=session.pipeline.size)
+        sink: Sink = NullSink()
+        if options.output is not None:
+            size = session.pipeline.size
+            sink = open_sink(options.output, fps=source.fps, size=size, overwrite=options.overwrite)
+        for words in (*replaced, sink.replaced, "" if lights is None else lights.replaced):
+            if words:
+                say(words)
         log = RunLog(session.pipeline)
-        total = (
-            options.frames
-            if options.loop or source.length is None
-            else min(options.frames or source.length, source.length)
-        )
-        progress = Progress(
-            TextColumn(session.scene.name),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[fps]:.1f} fps"),
-            TimeRemainingColumn(),
-            disable=options.headless,
-        )
-        bar = progress.add_task("frames", total=total, fps=0.0)
         try:
-            with sink, _interruptible() as interrupted, progress:
-                for _, result in itertools.islice(session, options.frames):
-                    image, decode_ms = result.image, session.decode_ms
-                    start = time.perf_counter()
-                    sink.write(image)
-                    encode_ms = (time.perf_counter() - start) * 1e3
-                    if result.environment is not None:
-                        write_environment(options.save_environment / f"{log.count:04d}.exr", result.environment)
-                    log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
-                    progress.update(bar, advance=1, fps=log.fps)
-                    if log.count == MARKER_PATIENCE:
-                        _check_marker(log, session.scene, live=source.live)
-                    if interrupted():
-                        break
-                stopped = interrupted()
-            if log.count < MARKER_PATIENCE and not stopped:
+            with lights or NullSink(), sink, handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"):
+                _light_frames(options, session, log, sink, lights, stop)
+            if log.count < MARKER_PATIENCE and stop.code is None:
                 _check_marker(log, session.scene, live=source.live)
         except WarpArError as error:
-            raise RunError(f"{error} ({log.count} frames were written)") from error
-        finally:
-            if options.report is not None:
-                options.report.write_text(json.dumps({**log.report(), **balls}, indent=1))
+            problem = _write_report(options.report, log, balls)
+            also = f"; and {problem}" if problem else ""
+            raise RunError(f"{error} ({_count(log, sink, lights)}){also}") from error
+        except BaseException:
+            _write_report(options.report, log, balls)
+            raise
+        if problem := _write_report(options.report, log, balls):
+            raise RunError(f"{problem} ({_count(log, sink, lights)})")
     if not options.headless:
         print_plan(session.pipeline.plan, log)
         if isinstance(session.pipeline, AutoPipeline):
             _print_choice(session.pipeline)
         steps = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in log.steps().items())
         Console().print(f"side by side, in ms: {steps}", highlight=False)
-        Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {output}", highlight=False)
-    return EXIT_INTERRUPTED if stopped else EXIT_DONE
+        where = "nowhere" if options.output is None else printable(options.output)
+        Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {where}", highlight=False, markup=False)
+    return EXIT_DONE if stop.code is None else stop.code
+
+
+def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str, ...]) -> Session:
+    return Session(
+        scene,
+        source=options.source,
+        calibration=options.calibration,
+        device=options.device,
+        quality=options.quality,
+        budget_ms=options.budget_ms,
+        outputs=outputs,
+        loop=options.loop,
+        refine_ball=options.refine_ball,
+    )
+
+
+def _light_frames(
+    options: argparse.Namespace, session: Session, log: RunLog, sink: Sink, lights: EnvironmentSink | None, stop: _Stop
+) -> None:
+    """Let frames flow until they end, or until a signal asks to stop."""
+    source = session.source
+    total = (
+        options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
+    )
+    progress = Progress(
+        TextColumn(printable(session.scene.name), markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[fps]:.1f} fps"),
+        TimeRemainingColumn(),
+        disable=options.headless,
+    )
+    bar = progress.add_task("frames", total=total, fps=0.0)
+    with progress:
+        for _, result in itertools.islice(session, options.frames):
+            image, decode_ms = result.image, session.decode_ms
+            start = time.perf_counter()
+            sink.write(image)
+            encode_ms = (time.perf_counter() - start) * 1e3
+            if lights is not None and result.environment is not None:
+                lights.write(result.environment)
+            log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
+            progress.update(bar, advance=1, fps=log.fps)
+            if log.count == MARKER_PATIENCE:
+                _check_marker(log, session.scene, live=source.live)
+            if stop.code is not None:
+                return
+
+
+def _count(log: RunLog, sink: Sink, lights: EnvironmentSink | None) -> str:
+    """What there is of a run that failed."""
+    frames = f"{log.count} frames were lit" if isinstance(sink, NullSink) else f"{sink.written} frames were written"
+    return frames if lights is None else f"{frames}, and {lights.written} environments"
+
+
+def _write_report(path: Path | None, log: RunLog, balls: dict[str, Any]) -> str:
+    """Write the report if one is asked for; returns what went wrong, in words."""
+    if path is None:
+        return ""
+    text = json.dumps({"program": PROGRAM, **log.report(), **balls}, indent=1)
+    try:
+        write_whole(path, text.encode())
+    except OSError as error:
+        return f"--report {path} cannot be written: {reason(error)}"
+    return ""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage or scene, 130 interrupted."""
-    try:
-        return run(make_parser().parse_args(arguments))
-    except RunError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_FAILED
-    except WarpArError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+    """Run the command; returns its exit code.
+
+    0 done, 1 failed while running, 2 bad usage or scene, 130 interrupted, 143 terminated.
+    """
+    return run_command(lambda: run(make_parser().parse_args(arguments)), RunError)
 
 
 if __name__ == "__main__":

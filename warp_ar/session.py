@@ -103,7 +103,7 @@ class Session:
                     size=self.source.size,
                     outputs=outputs,
                     exposures=self.source.exposures,
-                    waits=not self.source.live,
+                    synchronous=not self.source.live,
                 )
         except BaseException:
             self.source.close()

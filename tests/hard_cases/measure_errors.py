@@ -1,4 +1,4 @@
-"""How far float32 kernels are from their float64 twins: the figures that ``warp_ar.stages.numerics`` prints.
+"""How far float32 kernels are from their float64 twins: the figures that stand in the stages' ``Numerics``.
 
 python -m tests.hard_cases.measure_errors
 
@@ -15,11 +15,11 @@ import pytest
 from tests.error_model import worst
 
 TWINS = (
-    "tests/test_probe.py::test_corners_match_twin",
-    "tests/test_probe.py::test_gather_matches_twin",
-    "tests/test_environment.py::test_accumulation_matches_twin",
-    "tests/test_environment.py::test_fill_matches_twin",
-    "tests/test_environment.py::test_irradiance_is_that_of_a_facing_surface",
+    "tests/test_unwrap.py::test_corners_match_twin",
+    "tests/test_unwrap.py::test_gather_matches_twin",
+    "tests/test_accumulate.py::test_accumulation_matches_twin",
+    "tests/test_fill.py::test_fill_matches_twin",
+    "tests/test_key_lights.py::test_irradiance_is_that_of_a_facing_surface",
     "tests/test_bracket.py::test_twin",
     "tests/test_recover.py::test_transfer_agrees_with_its_twin",
     "tests/test_irradiance.py::test_projection_is_the_twin_s",
@@ -30,14 +30,14 @@ TWINS = (
     "tests/test_relight.py::test_matches_twin",
     "tests/test_environment_shadow.py::test_cumulative_sums_match_their_twin",
     "tests/test_environment_shadow.py::test_reference_method_matches_the_twin",
-    "tests/test_object_light.py::test_matches_the_twin",
+    "tests/test_near_field.py::test_matches_the_twin",
     "tests/test_materials.py::test_phong_matches_reference",
     "tests/test_materials.py::test_ggx_matches_reference",
     "tests/test_shade.py::test_matches_reference",
     "tests/test_mirror_ball.py::test_matches_twin",
     "tests/test_composite.py::test_matches_twin",
     "tests/test_declip.py::test_matches_twin",
-    "tests/test_exposure.py::test_box_matches_twin",
+    "tests/test_expose.py::test_box_matches_twin",
 )
 """Tests that call ``tests.error_model.check_error``."""
 

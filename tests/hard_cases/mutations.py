@@ -45,7 +45,7 @@ MUTATIONS = (
     Mutation(
         1,
         "straight back divides 0 by 0: no plane through the axis is picked",
-        "kernels/probe.py",
+        "kernels/unwrap.py",
         "            side = any_perpendicular(axis)\n        side = wp.normalize(side)\n",
         "            pass\n        side = side / wp.length(side)\n",
         f"{HARD}test_rows01_03_probe.py::test_light_straight_back_along_an_axis",
@@ -69,10 +69,10 @@ MUTATIONS = (
     Mutation(
         2,
         "orthographic unwrapping: the reflected ray of a camera at infinity",
-        "kernels/probe.py",
+        "kernels/unwrap.py",
         "        toward = wp.vec2(distance - n[0], -n[1])\n",
         "        toward = wp.vec2(1.0e6, 0.0)\n",
-        "tests/test_probe.py::test_normals_reflect_every_direction_to_the_camera",
+        "tests/test_unwrap.py::test_normals_reflect_every_direction_to_the_camera",
     ),
     Mutation(
         2,
@@ -85,13 +85,13 @@ MUTATIONS = (
     Mutation(
         3,
         "samples outside the frame count",
-        "kernels/probe.py",
+        "kernels/unwrap.py",
         "                    if inside >= 0.0 and ramp > 0.0:\n",
         "                    if at[2] > rim_start:\n"
         "                        ramp = 1.0\n"
         "                        at[0] = wp.clamp(at[0], 0.0, last_column)\n"
         "                        at[1] = wp.clamp(at[1], 0.0, last_row)\n",
-        "tests/test_probe.py::test_partly_outside_the_frame",
+        "tests/test_unwrap.py::test_partly_outside_the_frame",
     ),
     Mutation(
         3,
@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         6,
         "negative light accumulates",
-        "kernels/environment.py",
+        "kernels/guards.py",
         "    if wp.min(radiance) < 0.0:\n        return 0.0\n",
         "",
         f"{HARD}test_row06_garbage.py::test_what_is_no_light_is_gone_with_its_frame",
@@ -153,7 +153,7 @@ MUTATIONS = (
     Mutation(
         6,
         "filters take texels as they are",
-        "kernels/pyramid.py",
+        "kernels/guards.py",
         "    if value > 0.0:  # false for NaN\n        return wp.min(value, MAX_RADIANCE)\n    return 0.0\n",
         "    return value\n",
         f"{HARD}test_row06_garbage.py::test_any_map_gives_finite_light",
@@ -161,10 +161,10 @@ MUTATIONS = (
     Mutation(
         6,
         "averages take in what stands beside an object",
-        "kernels/object_light.py",
+        "kernels/near_field.py",
         "if hit_object[i + a, j + b] == found and wp.dot",
         "if wp.dot",
-        "tests/test_object_light.py::test_averages_stop_at_the_edges_of_objects",
+        "tests/test_near_field.py::test_averages_stop_at_the_edges_of_objects",
     ),
     Mutation(
         6,
@@ -177,15 +177,15 @@ MUTATIONS = (
     Mutation(
         7,
         "a running mean that loses a little every frame",
-        "kernels/environment.py",
+        "kernels/accumulate.py",
         "        m = m + a * (x - m)\n",
         "        m = 0.99999 * m + a * (x - m)\n",
-        "tests/test_environment.py::test_no_drift_over_ten_thousand_frames",
+        "tests/test_accumulate.py::test_no_drift_over_ten_thousand_frames",
     ),
     Mutation(
         7,
         "a scale that became NaN stays NaN",
-        "kernels/exposure.py",
+        "kernels/expose.py",
         "    if before > 0.0:\n        aim = before",
         "    if before != 0.0:\n        aim = before",
         f"{HARD}test_row07_accumulation.py::test_an_automatic_exposure_that_was_spoilt_heals",
@@ -234,10 +234,10 @@ MUTATIONS = (
     Mutation(
         10,
         "the strongest light of an even environment dominates it",
-        "kernels/environment.py",
+        "kernels/key_lights.py",
         "light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)",
         "light.directionality = alone",
-        "tests/test_environment.py::test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share",
+        "tests/test_key_lights.py::test_a_lamp_in_a_uniform_environment_dominates_by_twice_its_share",
     ),
     Mutation(
         11,
@@ -258,7 +258,7 @@ MUTATIONS = (
     Mutation(
         12,
         "exposures above 1 are taken for 1",
-        "kernels/exposure.py",
+        "kernels/expose.py",
         "    scale_out[0] = wp.where(params[0].exposure_scale > 0.0, params[0].exposure_scale, 0.0)\n",
         "    scale_out[0] = wp.clamp(params[0].exposure_scale, 0.0, 1.0)\n",
         f"{HARD}test_rows11_12_exposure.py::test_exposures_at_their_ends",
@@ -363,15 +363,15 @@ MUTATIONS = (
     Mutation(
         16,
         "frames of a folder may have any size",
-        "warp_ar/input/sources.py",
-        "            _check_size(image, self.size, str(path), index)\n",
+        "warp_ar/input/frame_folder.py",
+        "            check_size(image, self.size, str(path), index)\n",
         "",
         "tests/test_sources.py::test_size_that_changes_is_named",
     ),
     Mutation(
         16,
         "of 16 bits the upper 8",
-        "warp_ar/input/sources.py",
+        "warp_ar/input/frame_folder.py",
         "((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)",
         "(picture >> 8).astype(np.uint8)",
         "tests/test_sources.py::test_grey_alpha_and_16_bit_become_rgb",
@@ -403,7 +403,7 @@ MUTATIONS = (
     Mutation(
         18,
         "objects read a part of a list as if it were drawn",
-        "warp_ar/stages/object_light.py",
+        "warp_ar/stages/near_field.py",
         'arrays["environment_samples"] if forms',
         'arrays["environment_samples_texels"] if forms',
         f"{HARD}test_row18_energy.py::test_what_surrounds_a_white_object_is_white",
@@ -412,8 +412,8 @@ MUTATIONS = (
         18,
         "objects that take light from the desk give none back",
         "kernels/environment_shadow.py",
-        "sent += stands_for * light.environment\n",
-        "sent += 0.0 * light.environment\n",
+        "sent += stands_for * light.distant\n",
+        "sent += 0.0 * light.distant\n",
         f"{HARD}test_row18_energy.py::test_white_objects_give_back_the_light_that_they_take",
     ),
     Mutation(
@@ -427,7 +427,7 @@ MUTATIONS = (
     Mutation(
         18,
         "holes are filled by a mean that is not normalised",
-        "kernels/environment.py",
+        "kernels/fill.py",
         "                mean += (weight / total) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
         "                mean += (weight / area) * (wp.vec3(texel[0], texel[1], texel[2]) - mean)\n",
         f"{HARD}test_row18_energy.py::test_a_constant_environment_under_any_mask",

@@ -35,9 +35,11 @@ from warp_ar.scene import (
     Scene,
 )
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Arrays, ArraySpec, Pass, Request, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, Pass, Stage, Wiring
+from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
+from warp_ar.stages.request import Request
 
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""
@@ -116,7 +118,7 @@ def make_scene(scale: float = 1.0, shift: Any = (0.0, 0.0, 0.0), **changes: Any)
 def make_quality(**methods: str) -> Quality:
     """The default preset at a small size, with every stage that a method can switch off switched on."""
     base = dataclasses.replace(PRESETS["medium"], environment_height=ENVIRONMENT_HEIGHT, edge_samples=4)
-    switched = {stage.name: stage.methods[1] for stage in STAGES if stage.methods[0] == "none"}
+    switched = {stage.name: list(stage.methods)[1] for stage in STAGES if "none" in stage.methods}
     return base.with_methods(**{**switched, **methods})
 
 
@@ -139,14 +141,14 @@ def with_sized_lights(scene: Scene, scale: float = 1.0) -> Scene:
 def request_for(stage: str, method: str) -> Request | None:
     """A request whose plan holds ``stage`` on ``method``; None if that method means that the stage does not run."""
     if method == SOFT:
-        request = request_for(stage, next(one.methods[-1] for one in STAGES if one.name == stage))
+        request = request_for(stage, next(list(one.methods)[-1] for one in STAGES if one.name == stage))
         assert request is not None
         quality = dataclasses.replace(request.quality.with_methods(light_shadow=SOFT), edge_samples=16)
         return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
     methods = {} if method == "default" else {stage: method}
     # Some stages run only where another one is on its best method, some only without a change of exposure, one only
     # where the frames alternate between exposure times.
-    best = {one.name: one.methods[-1] for one in STAGES if len(one.methods) > 1}
+    best = {one.name: list(one.methods)[-1] for one in STAGES if len(one.methods) > 1}
     for others, scale, times in itertools.product(({}, best), (0.7, 1.0), ((), BRACKET)):
         quality = make_quality(**{**others, **methods})
         request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment"), times)
@@ -251,13 +253,13 @@ class Rig:
         """Run one stage, its passes cut into bands; returns copies of what it writes."""
         stage, passes = self.stage(name)
         if isinstance(stage, Recover):
-            # As at a stream's start, where the solution is waited for: all its passes are due.
+            # As at a stream's start, where the solution is waited for: all its passes are enabled.
             if stage._progress.pending is not None:
                 stage._progress.pending.result()
             stage._progress.pending, stage._progress.frames = None, 0
         stage.begin()
         for step in passes:
-            if step.due is None or step.due():
+            if step.enabled is None or step.enabled():
                 for rows in _bands(step.rows, bands):
                     step.launch(rows)
         return self.written(name, stage)
@@ -331,12 +333,12 @@ def solid_angles(height: int, width: int) -> np.ndarray:
     return ((edges[:-1] - edges[1:]) * 2.0 * math.pi / width)[:, None]
 
 
-def _spec_of(name: str, request: Request) -> ArraySpec:
+def _spec_of(name: str, features: Features) -> ArraySpec:
     """What the stage that writes a resource declares of it."""
     for kind in STAGES:
-        wiring = kind.wire(request)
+        wiring = kind.wire(features)
         if isinstance(wiring, Wiring) and name in wiring.writes:
-            return kind(request, wiring).arrays()[name]
+            return kind(features, wiring).arrays()[name]
     raise ValueError(f"no stage writes {name}")
 
 
@@ -348,13 +350,14 @@ class LoneStage:
         assert request is not None
         request = dataclasses.replace(request, quality=dataclasses.replace(request.quality, environment_height=height))
         kind = next(stage for stage in STAGES if stage.name == name)
-        wiring = kind.wire(request)
+        features = find_features(request)
+        wiring = kind.wire(features)
         assert isinstance(wiring, Wiring)
-        self.stage = kind(request, wiring)
+        self.stage = kind(features, wiring)
         self.arrays = Arrays()
         with wp.ScopedDevice(device):
             for read in wiring.reads:
-                spec = _spec_of(read, request)
+                spec = _spec_of(read, features)
                 self.arrays.add(read, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             for own, spec in self.stage.arrays().items():
                 self.arrays.add(own, wp.full(spec.shape, spec.fill, dtype=spec.dtype))

@@ -1,4 +1,4 @@
-"""Writes the table of hard cases into docs/hard-cases.md from reports of pytest.
+"""Writes the table of hard cases into docs/numerics.md from reports of pytest.
 
     python -m pytest -q --junitxml=report.xml
     python -m tests.hard_cases.table REPORT.xml [...] [--note "when and on what"]
@@ -18,7 +18,7 @@ import xml.etree.ElementTree as ElementTree
 
 from tests.hard_cases import atlas
 
-FILE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "hard-cases.md"
+FILE = pathlib.Path(__file__).resolve().parents[2] / "docs" / "numerics.md"
 BEGIN, END = "<!-- table -->", "<!-- /table -->"
 
 ON_HOST = (atlas.TRACK, atlas.SOURCE)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, METHODS, SIZE, STAGE_METHODS, assert_finite, numbers
-from warp_ar.kernels.probe import RIM_START
+from warp_ar.kernels.unwrap import RIM_START
 
 MAP = (ENVIRONMENT_HEIGHT, 2 * ENVIRONMENT_HEIGHT)
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -21,7 +21,7 @@ BROKEN = generators.broken_maps(*MAP)
 # Light that a stage may read as a whole map.
 MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environment")
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
-GUARDED = ("accumulate", "fill", "diffuse", "specular", "environment_samples")
+GUARDED = ("accumulate", "fill", "irradiance", "prefilter", "environment_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
 SIGNED = ("irradiance_sh", "mirrored")
 MAP_READERS = [
@@ -168,7 +168,7 @@ def test_a_broken_texel_is_completed_from_its_neighbours(rig_for, bad):
 
 @pytest.mark.atlas(row=6)
 @pytest.mark.parametrize(
-    ("stage", "method"), [(stage, method) for stage in ("diffuse", "specular") for method in METHODS[stage]]
+    ("stage", "method"), [(stage, method) for stage in ("irradiance", "prefilter") for method in METHODS[stage]]
 )
 def test_a_broken_texel_counts_as_no_light(rig_for, stage, method):
     """NaN and negative texels act as black ones, to the bit: no neighbour is poisoned."""
@@ -247,7 +247,7 @@ def test_a_frame_pixel_changes_only_boxes_that_hold_it(rig_for):
         ("fill", "default"),
         ("key_lights", "default"),
         ("environment_samples", "default"),
-        *((s, r) for s in ("diffuse", "specular") for r in METHODS[s]),
+        *((s, r) for s in ("irradiance", "prefilter") for r in METHODS[s]),
     ],
 )
 @given(
@@ -262,4 +262,4 @@ def test_finite_at_any_magnitude(rig_for, stage, method, exponent, spread, row, 
     rig.poke(source, surroundings)
     if stage == "fill":
         rig.poke("environment_confidence", 1.0)
-    assert_light(rig.run(stage), f"for a lamp of {environment.max():g} over {environment.min():g}")
+    assert_light(rig.run(stage), f"for a lamp of {surroundings.max():g} over {surroundings.min():g}")

@@ -56,7 +56,7 @@ def test_outputs_do_not_depend_on_what_stood_in_them(rig_for, stage, method):
         if values.dtype.names is None and values.dtype.kind == "f" and name != "hit_depth":
             rig.poke(name, np.full_like(values, 3.0))
     second = rig.run(stage)
-    if stage == "object_light":  # defined where an object is seen
+    if stage == "near_field":  # defined where an object is seen
         seen = rig.get("hit_object") >= 0
         first, second = ({name: values[seen] for name, values in outputs.items()} for outputs in (first, second))
     assert_same_bits(first, second)

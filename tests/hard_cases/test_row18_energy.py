@@ -49,7 +49,7 @@ def test_a_constant_environment_under_any_mask(rig_for, seed, hidden, exponent):
 
 @pytest.mark.atlas(row=18)
 @pytest.mark.parametrize(
-    ("stage", "method"), [(stage, method) for stage in ("diffuse", "specular") for method in METHODS[stage]]
+    ("stage", "method"), [(stage, method) for stage in ("irradiance", "prefilter") for method in METHODS[stage]]
 )
 @given(row=st.integers(0, HEIGHT - 1), column=st.integers(0, 2 * HEIGHT - 1), sky=st.sampled_from([0.0, 1e-4, 1.0]))
 def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, method, row, column, sky):
@@ -61,7 +61,7 @@ def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, method, row, column
     if values.shape == (9, 3):  # coefficients: the constant one holds the mean
         assert values[0, 0] * 0.28209479 * 4 * np.pi == pytest.approx(np.pi * flux, rel=FURNACE)
         return
-    if stage == "diffuse":
+    if stage == "irradiance":
         total = float((solid_angles(*values.shape[:2]) * values[..., 0]).sum())
         # A series of order 4 is cut at zero: what is cut is at most its lobes' 4 %. Maps are sums of point samples.
         assert total == pytest.approx(np.pi * flux, rel=0.05 if method == "sh4" else 3e-3)
@@ -104,7 +104,7 @@ WHITE = {
 # A rough metal's lobe is looked up in two tables of 32 x 32, and its lost energy given back by a fit.
 TABLES = 0.02
 # What an object receives is a sum over one set of the environment's samples, averaged over its neighbours: see
-# tests/test_object_light.py.
+# tests/test_near_field.py.
 SAMPLED, SAMPLED_MEAN = 0.25, 0.03
 # Share of the light that dies out between white objects and the desk.
 LOST = 0.3
@@ -120,7 +120,7 @@ def furnace_for(rig_for):
 
     def made(stage, method, material):
         rig = rig_for(stage, method)
-        scene = rig.pipeline._host_scene.ray_scene
+        scene = rig.pipeline.inputs.host_scene.ray_scene
         for array in (scene.materials, scene.proxies):
             used.append((array, array.numpy().copy()))
         records = scene.materials.numpy().copy()
@@ -143,7 +143,7 @@ def furnace_for(rig_for):
             if name in rig.arrays:
                 rig.poke(name, value)
         names = [one.name for one, _ in rig.pipeline._scheduler._stages]
-        for name in names[min(map(names.index, {"key_lights", "diffuse"} & set(names))) : names.index(stage)]:
+        for name in names[min(map(names.index, {"key_lights", "irradiance"} & set(names))) : names.index(stage)]:
             if name not in ("environment_shadow", "relight"):
                 rig.run(name)
         return rig
@@ -168,11 +168,11 @@ def test_white_objects_cannot_be_told_from_a_white_environment(furnace_for, meth
         np.testing.assert_allclose(ratio, 1.0, atol=FURNACE)
 
 
-@pytest.mark.atlas(row=18, stage="object_light")
+@pytest.mark.atlas(row=18, stage="near_field")
 @pytest.mark.parametrize("name", WHITE)
 def test_what_surrounds_a_white_object_is_white(furnace_for, name):
-    rig = furnace_for("object_light", "default", WHITE[name])
-    outputs = rig.run("object_light")
+    rig = furnace_for("near_field", "default", WHITE[name])
+    outputs = rig.run("near_field")
     seen = rig.get("hit_object") >= 0
     mirrored = outputs["object_mirrored"][seen]
     np.testing.assert_allclose(mirrored[:, :3], mirrored[:, 3:].repeat(3, 1), atol=TABLES)

@@ -64,7 +64,7 @@ def test_light_straight_back_along_an_axis(rig_for, method, axis):
 
 def hide_proxies(rig):
     """Move what could hide the ball far away."""
-    proxies = rig.pipeline._host_scene.ray_scene.proxies
+    proxies = rig.pipeline.inputs.host_scene.ray_scene.proxies
     records = proxies.numpy().copy()
     records["position"] += np.float32([0, 0, -1e4])
     proxies.assign(records)
@@ -75,8 +75,8 @@ def _proxies_back(request, rig_for):
     yield
     for method in METHODS["unwrap"]:
         rig = rig_for("unwrap", method)
-        records = rig.pipeline._host_scene._proxies
-        rig.pipeline._host_scene.ray_scene.proxies.assign(records)
+        records = rig.pipeline.inputs.host_scene._proxies
+        rig.pipeline.inputs.host_scene.ray_scene.proxies.assign(records)
 
 
 @pytest.mark.atlas(row=1, stage="unwrap")

@@ -21,7 +21,7 @@ from warp_ar.scene import Pose
 FURNACE = 5e-4
 LIGHT_STAGES = [
     (stage, method)
-    for stage in ("fill", "key_lights", "diffuse", "specular", "environment_samples")
+    for stage in ("fill", "key_lights", "irradiance", "prefilter", "environment_samples")
     for method in METHODS[stage]
 ]
 AXIS_STAGES = (
@@ -29,7 +29,7 @@ AXIS_STAGES = (
     "visibility",
     "relight",
     "environment_shadow",
-    "object_light",
+    "near_field",
     "shade",
     "mirror_ball",
     "declip",
@@ -75,7 +75,7 @@ def test_a_white_furnace_at_any_size(device, stage, method, height, exponent):
         np.testing.assert_allclose(sh[1:] / sh[0], 0.0, atol=FURNACE)
     else:
         (values,) = out.values()
-        expected = radiance * (np.pi if stage == "diffuse" else 1.0)
+        expected = radiance * (np.pi if stage == "irradiance" else 1.0)
         np.testing.assert_allclose(values, expected, rtol=tolerance(method, height))
 
 
@@ -96,9 +96,9 @@ def test_no_answer_leaves_the_maps_range(device, stage, method, height, turn, se
         return
     else:
         (values,) = out.values()
-        values = values / (np.pi if stage == "diffuse" else 1.0)
+        values = values / (np.pi if stage == "irradiance" else 1.0)
     slack = 1.1 if method == "sh4" else 1 + tolerance(method, height)  # a truncated series rings
-    slack = 1.2 if stage == "specular" and method not in ("box_mip", "brute_force") else slack  # scaled to the energy
+    slack = 1.2 if stage == "prefilter" and method not in ("box_mip", "brute_force") else slack  # scaled to the energy
     assert surroundings.min() / slack <= values.min() <= values.max() <= surroundings.max() * slack
 
 
@@ -134,8 +134,8 @@ def evaluate_kernel(
     )
 
 
-@pytest.mark.atlas(row=5, stage="specular", method="*")
-@pytest.mark.atlas(row=5, stage="diffuse", method="*")
+@pytest.mark.atlas(row=5, stage="prefilter", method="*")
+@pytest.mark.atlas(row=5, stage="irradiance", method="*")
 def test_directions_an_ulp_beyond_unit_length(device):
     """Look-ups and lobes along axes, poles, seam and diagonals, and a few ulp beside them."""
     height = 8

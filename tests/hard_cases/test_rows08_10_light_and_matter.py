@@ -22,7 +22,7 @@ LIGHTS = generators.lights()
 WHOLE = (0, SIZE[1], 0, SIZE[0])
 SHADING = [
     (stage, method)
-    for stage in ("shade", "environment_shadow", "object_light", "mirror_ball")
+    for stage in ("shade", "environment_shadow", "near_field", "mirror_ball")
     for method in METHODS[stage]
 ]
 LIT = [(stage, method) for stage in ("relight", "shade", "mirror_ball") for method in METHODS[stage]]
@@ -43,7 +43,7 @@ ENDS = (
 
 
 def set_materials(rig, **fields):
-    materials = rig.pipeline._host_scene.ray_scene.materials
+    materials = rig.pipeline.inputs.host_scene.ray_scene.materials
     records = materials.numpy().copy()
     records["base_color"], records["specular"] = 0.8, 0.2
     for field, value in fields.items():
@@ -58,12 +58,12 @@ def rig_of(rig_for):
 
     def made(stage, method):
         rig = rig_for(stage, method)
-        used[id(rig)] = rig, rig.pipeline._host_scene.ray_scene.materials.numpy().copy()
+        used[id(rig)] = rig, rig.pipeline.inputs.host_scene.ray_scene.materials.numpy().copy()
         return rig
 
     yield made
     for rig, records in used.values():
-        rig.pipeline._host_scene.ray_scene.materials.assign(records)
+        rig.pipeline.inputs.host_scene.ray_scene.materials.assign(records)
 
 
 def set_lights(rig, **fields):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.hard_cases import generators
 from tests.hard_cases.rig import METHODS, SIZE
-from warp_ar.kernels import color, composite, exposure, summed_area
+from warp_ar.kernels import color, composite, expose, summed_area
 from warp_ar.kernels.structs import FrameParams
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -90,7 +90,7 @@ def tables(device):
     )
 
 
-def expose(method, image, scale, device):
+def exposed(method, image, scale, device):
     """The frame at another exposure, without layers."""
     decode, encode = tables(device)
     frame = wp.array(np.ascontiguousarray(image), dtype=wp.vec3ub)
@@ -100,10 +100,10 @@ def expose(method, image, scale, device):
     table, out = wp.zeros(frame.shape, dtype=wp.uint32), wp.zeros(frame.shape, dtype=wp.vec3ub)
     factor, codes = wp.zeros(1, dtype=wp.float32), wp.zeros(256, dtype=wp.vec3ub)
     summed_area.sum_area(frame, table)
-    exposure.read_scale(params, factor)
-    exposure.expose_codes(decode, encode, factor, codes)
-    exposure.expose(
-        exposure.ExposureConfig(method),
+    expose.read_scale(params, factor)
+    expose.expose_codes(decode, encode, factor, codes)
+    expose.expose(
+        expose.ExposeConfig(method),
         params,
         frame,
         decode,
@@ -127,7 +127,7 @@ KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", 
 @example(rows=70, columns=1, scale=JUST_BELOW_1)
 def test_a_white_frame_of_any_size_fades_evenly(device, method, rows, columns, scale):
     """Boxes that reach beyond the frame count what is inside it: no dark borders, no corners."""
-    out = expose(method, np.full((rows, columns, 3), 255, np.uint8), scale, device)
+    out = exposed(method, np.full((rows, columns, 3), 255, np.uint8), scale, device)
     assert (out == out[0, 0]).all()
 
 
@@ -136,14 +136,14 @@ def test_a_white_frame_of_any_size_fades_evenly(device, method, rows, columns, s
 @pytest.mark.parametrize("name", FRAMES)
 def test_exposures_at_their_ends(device, method, name):
     frame = FRAMES[name]
-    np.testing.assert_array_equal(expose(method, frame, 1.0, device), frame)
+    np.testing.assert_array_equal(exposed(method, frame, 1.0, device), frame)
     for black in (0.0, -1.0, np.nan, 1e-8):
-        assert (expose(method, frame, black, device) == 0).all()
-    np.testing.assert_array_equal(expose(method, frame, JUST_BELOW_1, device), frame)
-    brighter = expose(method, frame, 1e8, device)
+        assert (exposed(method, frame, black, device) == 0).all()
+    np.testing.assert_array_equal(exposed(method, frame, JUST_BELOW_1, device), frame)
+    brighter = exposed(method, frame, 1e8, device)
     np.testing.assert_array_equal(brighter, np.where(frame > 0, 255, 0))
     scales = (0.0, 0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0, 1.5, 3.0)
-    pictures = np.array([expose(method, frame, scale, device) for scale in scales]).astype(int)
+    pictures = np.array([exposed(method, frame, scale, device) for scale in scales]).astype(int)
     assert (np.diff(pictures, axis=0) >= 0).all(), "darker, yet a pixel got brighter"
 
 

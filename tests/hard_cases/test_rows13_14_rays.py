@@ -32,11 +32,12 @@ from tests.test_visibility import World, shoot
 from warp_ar.errors import SceneError
 from warp_ar.kernels import recover
 from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
-from warp_ar.scene.geometry import Mesh, load_mesh, rotation_matrix
+from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.scene.ray_scene import HostScene, trace_config
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
-RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "environment_shadow", "object_light", "mirror_ball", "declip")
+RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "environment_shadow", "near_field", "mirror_ball", "declip")
 """Stages whose outputs are those of the same picture at any scale; ``recover`` rests on a card of the marker's size."""
 RAY_METHODS = [(stage, method) for stage in RAY_STAGES for method in METHODS[stage]]
 LONG_RAYS, SHORT_RAYS = 10_000_000, 100_000

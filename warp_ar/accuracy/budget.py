@@ -17,9 +17,9 @@ only what errs less by ``GAIN`` is worth a change, and only after it would have 
 choice a setting moves at most one method in ``SETTING_SECONDS``, and all move until they are where they were to go, or
 the budget is exceeded; of a mixed move that would not fit, what saves goes first.
 
-**Switching.** Each set of methods has a pipeline of its own. It is built on a thread of its own while frames go on, and
-lights a few frames there that nobody sees: that loads its kernels, and tells what it costs. If that fits, it takes over
-the light, the clock and the track of the marker between two frames; if not, the choice is made anew.
+**Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
+frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
+not, the choice is made anew.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, TypeVar
@@ -60,6 +59,7 @@ from warp_ar.accuracy.costs import (
 from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
+from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import Quality
@@ -85,7 +85,7 @@ SETTLE = 2
 GAIN = 0.03
 """Share of the predicted error, or over the budget of the time, that a change must save."""
 PATIENCE = 2.0
-"""Seconds for which every frame must leave environment for what errs less before it is tried."""
+"""Seconds for which every frame must leave room for what errs less before it is tried."""
 SETTING_SECONDS = 0.5
 """Shortest time between two methods of one setting."""
 MEMORY = 60.0
@@ -138,7 +138,7 @@ class Controller:
         self._costs = costs
         method_costs = make_method_costs(costs, errors)
         self._errors = {(method_cost.setting, method_cost.method): method_cost.error for method_cost in method_costs}
-        self._ladders = {
+        self._methods = {
             setting: [
                 method_cost.method
                 for method_cost in pareto_optimal(
@@ -336,11 +336,11 @@ class Controller:
         moves: dict[str, str] = {}
         savings: dict[str, str] = {}
         for setting, method in self._target.items():
-            ladder = self._ladders[setting]
-            place, aim = ladder.index(self.settings[setting]), ladder.index(method)
+            methods = self._methods[setting]
+            place, aim = methods.index(self.settings[setting]), methods.index(method)
             if place == aim or now - self._moved.get(setting, -SETTING_SECONDS) < SETTING_SECONDS:
                 continue
-            moves[setting] = ladder[place + (1 if aim > place else -1)]
+            moves[setting] = methods[place + (1 if aim > place else -1)]
             if aim < place:
                 savings[setting] = moves[setting]
         # Where neither fits, what saves most goes first: not all that should save is known to.
@@ -402,33 +402,20 @@ class AutoPipeline:
         if not budget_ms > 0.0:
             raise UsageError(f"a budget of {budget_ms} ms is none; expected a number above 0")
         self.budget_ms = budget_ms
-        self._arguments: dict[str, Any] = {
-            "device": device,
-            "size": size,
-            "outputs": outputs,
-            "exposures": tuple(exposures),
-            "bands": bands,
-        }
         self._given, self._folder, self._clock = scene, folder or cache_folder(), clock
         self._errors = load_errors()
-        self._builder = ThreadPoolExecutor(1, "warp_ar-build")
-        self._building: Future[tuple[Pipeline, float | None]] | None = None
-        self._kept: dict[Quality, Pipeline] = {}
         self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
         self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
-        self.pipeline = self._open(turn(BASE, self._base))
+        self._switcher = PipelineSwitcher(device=device, bands=bands, keep=_KEPT_PIPELINES - 1)
+        self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures))
+        self.pipeline = self._switcher.open(self._target)
         """The one that lights the next frame."""
-        self._kept[self.quality] = self.pipeline
         self._costs = costs
         self._controller: Controller | None = None
         self._changes: list[dict[str, Any]] = []
         self._rejected: list[dict[str, Any]] = []
         self._frames = 0
         self._told = False
-
-    def _open(self, quality: Quality) -> Pipeline:
-        # On CUDA only a pipeline that profiles knows what the device takes.
-        return Pipeline(self._given, quality=quality, profile=True, **self._arguments)
 
     def __enter__(self) -> AutoPipeline:
         return self
@@ -444,11 +431,7 @@ class AutoPipeline:
 
     def close(self) -> None:
         """Stop the threads; arrays go when the last result that refers to them does."""
-        self._builder.shutdown(wait=True, cancel_futures=True)
-        if self._building is not None and not self._building.cancelled() and self._building.exception() is None:
-            self._building.result()[0].close()
-        for pipeline in self._kept.values():
-            pipeline.close()
+        self._switcher.close()
 
     plan = _OfTheLatest(lambda pipeline: pipeline.plan)
     quality = _OfTheLatest(lambda pipeline: pipeline.quality)
@@ -474,7 +457,7 @@ class AutoPipeline:
             return result
         if self._controller is None:
             self._controller = self._start(image, found)
-        elif self._building is None and self._wanted() == self.quality:
+        elif not self._switcher.busy and self._wanted() == self.quality:
             first = not self._changes
             changed = self._controller.observe(_spent_ms(result), self._clock())
             if changed or (first and self._controller.chosen):
@@ -504,11 +487,10 @@ class AutoPipeline:
 
     def _want(self, image: Any, pose: Pose | None) -> None:
         """Go over to the controller's settings, as soon as there is a pipeline for them."""
-        quality = self._wanted()
-        if quality in self._kept:
+        frame = np.array(_on_host(image))
+        self._target = dataclasses.replace(self._target, quality=self._wanted())
+        if self._switcher.want(self._target, lambda pipeline: self._time_alone(pipeline, frame, pose)):
             self._changes.append(self._record())
-        else:
-            self._building = self._builder.submit(self._build, quality, np.array(_on_host(image)), pose)
 
     def _record(self) -> dict[str, Any]:
         """The controller's settings as those of the next frame."""
@@ -520,43 +502,35 @@ class AutoPipeline:
             "expected_error": round(self._controller.expected_error, 5),
         }
 
-    def _build(self, quality: Quality, image: Any, pose: Pose | None) -> tuple[Pipeline, float | None]:
-        """A pipeline that is ready to light frames, and what it takes alone, if that can be told."""
-        pipeline = self._open(quality)
+    def _time_alone(self, pipeline: Pipeline, image: Any, pose: Pose | None) -> float | None:
+        """Make a new pipeline ready to light frames; what it takes alone, if that can be told."""
         costs = self._costs
         if costs is None or costs.work <= 0.0:
             pipeline.warm_up()
-            return pipeline, None
-        settings = {setting.name: chosen(quality, setting) for setting in self.settings}
-        return pipeline, time_alone(pipeline, image, pose, costs, settings)
+            return None
+        settings = {setting.name: chosen(pipeline.quality, setting) for setting in self.settings}
+        return time_alone(pipeline, image, pose, costs, settings)
+
+    def _admit(self, pipeline: Pipeline, alone: float | None) -> bool:
+        """Whether a pipeline may light frames, now that it is known what it takes."""
+        controller = self._controller
+        assert controller is not None
+        if alone is not None:
+            controller.learn(controller.settings, alone)
+        record = self._record()
+        admitted = controller.confirm()
+        (self._changes if admitted else self._rejected).append(record)
+        return admitted
 
     def _swap(self) -> None:
         """Go over to the wanted pipeline if it is ready."""
-        controller = self._controller
-        if controller is None:
+        if self._controller is None:
             return
-        if self._building is not None and self._building.done():
-            building, self._building = self._building, None
-            built, alone = building.result()
-            if alone is not None:
-                controller.learn(controller.settings, alone)
-            record = self._record()
-            if not controller.confirm():
-                self._rejected.append(record)
-                built.close()
-                return
-            self._kept[built.quality] = built
-            self._changes.append(record)
-        wanted = self._kept.get(self._wanted())
-        if wanted is None or wanted is self.pipeline:
-            return
-        wanted.continue_from(self.pipeline)
-        self.pipeline = wanted
-        controller.shown(self._clock())
-        # Latest last; the oldest goes.
-        self._kept[wanted.quality] = self._kept.pop(wanted.quality)
-        while len(self._kept) > _KEPT_PIPELINES:
-            self._kept.pop(next(iter(self._kept))).close()
+        latest = self._switcher.take(self._admit)
+        assert latest is not None
+        if latest is not self.pipeline:
+            self.pipeline = latest
+            self._controller.shown(self._clock())
 
     def _tell(self) -> None:
         """Say once that the budget is too small."""

@@ -26,8 +26,8 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import Request
 from warp_ar.stages.quality import PRESETS, Quality
+from warp_ar.stages.request import Request
 
 COST_TABLE = "cost_table.json"
 """The committed errors, beside this file."""
@@ -47,126 +47,40 @@ class Setting:
     @property
     def converges(self) -> bool:
         """Whether its methods approximate one object, which the last of them gives; others are models of their own."""
-        return self.name in _CONVERGING
+        return self.name in _SHARED or any(stage.converges for stage in STAGES if stage.name == self.name)
 
 
-_CONVERGING = (
-    "environment_height",
-    "edge_samples",
-    "light_shadow",
-    "unwrap",
-    "diffuse",
-    "specular",
-    "environment_shadow",
-    "mirror_ball",
-)
-_LIGHT = ("unwrap", "accumulate", "fill", "recover", "key_lights", "diffuse", "specular", "environment_samples")
-SETTINGS: tuple[Setting, ...] = (
-    Setting("environment_height", ("32", "64", "128", "256"), _LIGHT),
-    Setting("edge_samples", ("1", "4", "16"), ("relight", "shade")),
-    Setting("light_shadow", ("hard", "soft"), ("relight", "shade")),
-    *(Setting(stage.name, tuple(stage.methods), (stage.name,)) for stage in STAGES if len(stage.methods) > 1),
-)
-"""All there are."""
-WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
+def _shared(name: str, *methods: str) -> Setting:
+    """A setting that stages share: those that say so."""
+    return Setting(name, methods, tuple(stage.name for stage in STAGES if name in stage.settings))
+
+
+_SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "environment_height": ("rows of the map that holds the environment", {}),
     "edge_samples": ("samples per pixel along the outlines of virtual objects, and of shadows of virtual light", {}),
     "light_shadow": (
         "shadows of virtual lights",
         {"hard": "as if every lamp were a point (the paper)", "soft": "as wide as the lamp"},
     ),
-    "unwrap": (
-        "reading the light off the mirror ball, judged with a map of 32 rows",
-        {
-            "bilinear": "one sample between pixels (the paper)",
-            "area": "the mean over what a texel covers",
-        },
-    ),
-    "recover": (
-        "light that clips in the ball",
-        {
-            "clipped": "as the camera saw it (the paper)",
-            "white_card": "scaled until it lights the white card as brightly as the frame shows",
-            "shading": "shared among lamps as shading and shadows in the frame tell",
-        },
-    ),
-    "diffuse": (
-        "light that matt surfaces receive",
-        {
-            "top_mip": "a 4x8 map (the paper)",
-            "sh2": "spherical harmonics of order 2",
-            "sh4": "of order 4",
-            "clusters": "200 clusters of the environment, summed for every direction",
-            "brute_force": "every texel for every direction",
-        },
-    ),
-    "specular": (
-        "light that glossy surfaces reflect",
-        {
-            "box_mip": "a pyramid of means (the paper)",
-            "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
-            "fis32": "32 importance samples per texel",
-            "fis128": "128 importance samples per texel",
-            "brute_force": "every texel for every direction and width",
-        },
-    ),
-    "relight": (
-        "virtual light on the real desk",
-        {
-            "flat": "on a grey desk",
-            "paper": "blended by the frame's brightness (the paper)",
-            "relief": "the paper's blend, relief told from paint",
-            "reflectance": "on the reflectance that frame and environment light give",
-            "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
-            "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
-        },
-    ),
-    "environment_shadow": (
-        "shadows of virtual objects in the environment, and the light that they reflect onto the desk",
-        {
-            "none": "none (the paper)",
-            "coarse": "32 rays per estimate, every fifth pixel, and an estimate of reflected light",
-            "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
-            "brute_force": "every texel of the environment at every pixel",
-        },
-    ),
-    "shade": (
-        "what virtual objects reflect",
-        {"environment": "the environment (the paper)", "one_bounce": "the environment, the desk and each other"},
-    ),
-    "mirror_ball": (
-        "what the mirror ball in the picture shows of virtual objects",
-        {
-            "none": "nothing (the paper)",
-            "single": "one ray per pixel",
-            "smooth": "4 rays per pixel",
-            "brute_force": "64 rays per pixel",
-        },
-    ),
-    "expose": (
-        "clipped pixels at a shorter exposure",
-        {
-            "plain": "scaled",
-            "box": "scaled less where surroundings clip too (the paper)",
-            "glow": "from the glow around them",
-            "ball": "from the glow and the ball's view of the same lamp",
-        },
-    ),
+}
+_CHOICES = tuple(stage for stage in STAGES if len(stage.methods) > 1)
+SETTINGS: tuple[Setting, ...] = (
+    _shared("environment_height", "32", "64", "128", "256"),
+    _shared("edge_samples", "1", "4", "16"),
+    _shared("light_shadow", "hard", "soft"),
+    *(Setting(stage.name, tuple(stage.methods), (stage.name,)) for stage in _CHOICES),
+)
+"""All there are."""
+WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    **_SHARED,
+    **{stage.name: (stage.subject, stage.methods) for stage in _CHOICES},
 }
 """What every setting and every method is, for tables."""
 NUMBERS = ("environment_height", "edge_samples")
 """Settings that are numbers of ``Quality``, not methods."""
 
 
-_LIGHT_ONLY = {
-    "diffuse": "sh2",
-    "specular": "box_mip",
-    "relight": "paper",
-    "environment_shadow": "none",
-    "shade": "environment",
-    "mirror_ball": "none",
-    "edge_samples": "1",
-}
+_LIGHT_ONLY = {stage.name: stage.unseen_method for stage in STAGES if stage.unseen_method} | {"edge_samples": "1"}
 """Methods of what only shows the light, for frames that nobody looks at."""
 
 

@@ -25,6 +25,7 @@ import warp as wp
 from warp_ar.accuracy.cost_table import MethodCost, Scales, Setting, chosen, light_only, turn
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
+from warp_ar.engine.switcher import let_go
 from warp_ar.input.tracking import Tracker
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import PRESETS, Quality
@@ -101,12 +102,20 @@ def measure_costs(
         clock: Seconds, on CPU. None counts processor time, so that other programs matter little, and takes it by the
             ratio in which the base's stands to the time that passes.
     """
-    steps = measure_steps(scene, image, pose, device, size, settings, clock)
+    return finish_steps(measure_steps(scene, image, pose, device, size, settings, clock))
+
+
+def finish_steps(steps: Generator[float, None, Costs], advance: Callable[[float], None] = lambda share: None) -> Costs:
+    """Take all steps of ``measure_steps``; ``advance`` is told the share of the work that each was."""
+    done = 0.0
     while True:
         try:
-            next(steps)
+            share = next(steps)
         except StopIteration as end:
+            advance(1.0 - done)
             return cast(Costs, end.value)
+        advance(share - done)
+        done = share
 
 
 def measure_steps(
@@ -207,6 +216,7 @@ def _time_stages(
                 break
         worked = time.process_time() - begun
         on_cpu = pipeline.device.is_cpu
+    let_go(pipeline)
     if spread and on_cpu:
         return {NOW_AND_THEN: worked_ms(worked / count, clock)}
     return {name: statistics.median(own) for name, own in times.items()}

@@ -7,19 +7,20 @@ import html
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.accuracy.case_report import SAME_ERROR, SAME_TIME, CaseReport, Whole
+from warp_ar.accuracy.cases import Image
+from warp_ar.accuracy.charts import SIZE, SMALL, Point, scatter
 from warp_ar.accuracy.cost_table import SETTINGS, WORDS
+from warp_ar.accuracy.figures import Figure
 from warp_ar.accuracy.metrics import flip_map
+from warp_ar.accuracy.sweep import Row
 
-if TYPE_CHECKING:
-    from warp_ar.tradeoff import CaseReport, Figure, Row, Whole
-
-Image = npt.NDArray[np.uint8]
 Box = tuple[slice, slice]
 
 QUALITY = 82
@@ -28,15 +29,7 @@ CROP_WIDTH = 360
 """Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
 CROP_ASPECT = 4.0 / 3.0
 """Width over height of a crop."""
-PLOT = (560, 320)
-"""Width and height of a chart."""
-LETTER = 6.6
-"""Width of a letter of a chart's labels, on average."""
-SMALL_PLOT = (400, 280)
-"""Of one among many."""
-MARGIN = (64, 22, 40, 46)
-"""Left, right, top, bottom of a chart's plotting area."""
-SHOWN = ("paper", "ours in the paper's time", "medium", "high")
+SHOWN = ("paper", SAME_TIME, "medium", "high")
 """Wholes whose pictures are shown."""
 REAL_TIME = 1e3 / 30.0
 """Milliseconds of a frame at 30 frames per second."""
@@ -69,14 +62,10 @@ td{text-align:right;padding:3px 6px;border-bottom:1px solid var(--line);vertical
 tr:last-child td{border-bottom:0}td:first-child,th:first-child,td.text{text-align:left}td.text{color:var(--soft)}
 tr.out td{color:var(--soft)}tr.head td{font-weight:600;padding-top:12px}
 svg{display:block;width:100%;height:auto}
-svg text{fill:var(--soft);font-size:12.5px;paint-order:stroke;stroke:var(--card);stroke-width:4px;
-stroke-linejoin:round}svg .label{fill:var(--ink)}
-svg .axis{stroke:var(--line)}svg .limit{stroke:var(--warm);stroke-dasharray:4 4}svg text.limit{fill:var(--warm);
-stroke:var(--card);stroke-dasharray:none}svg .on{fill:var(--mark)}svg .off{fill:var(--card);stroke:var(--other);
-stroke-width:1.6}svg .front{fill:none;stroke:var(--mark);stroke-width:1.6;opacity:.55}
+svg text{font-family:inherit;paint-order:stroke;stroke:var(--card);stroke-width:3px;stroke-linejoin:round}
 .scale{display:inline-grid;grid-template-columns:repeat(5,44px);vertical-align:middle;margin:0 8px;font-size:11px;
 text-align:center}.scale img{grid-column:1/-1;width:100%;height:10px;border-radius:3px}
-@media(max-width:600px){main{padding:24px 16px 60px}h1{font-size:28px}svg text{font-size:17px}
+@media(max-width:600px){main{padding:24px 16px 60px}h1{font-size:28px}
 .row{grid-auto-columns:150px}table{font-size:13px}}
 """
 
@@ -152,111 +141,6 @@ def strip(columns: Sequence[tuple[str, Image]], reference: Image | None, box: Bo
     return "".join([*parts, "</div>"])
 
 
-# --------------------------------------------------------------------------------------------------------------- charts
-
-
-def _ticks(low: float, high: float) -> list[float]:
-    """Round values of a logarithmic axis: 1, 2 and 5 times powers of ten, thinned to at most eight."""
-    tens = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    values = [m * 10.0**e for e in tens for m in (1, 2, 5)]
-    inside = [value for value in values if low <= value <= high]
-    return inside if len(inside) <= 8 else [10.0**e for e in tens if low <= 10.0**e <= high]
-
-
-Rectangle = tuple[float, float, float, float]
-
-
-def _place(
-    label: str, px: float, py: float, taken: Sequence[Rectangle], inside: Rectangle
-) -> tuple[float, float, Rectangle]:
-    """Middle of a label's base line beside its point, and its box: the nearest place that hides nothing."""
-    half, tall = 0.5 * LETTER * len(label) + 2.0, 13.0
-    places = [(0.0, -10.0), (0.0, 20.0), (half + 9.0, 4.0), (-half - 9.0, 4.0)]
-    places += [
-        (side * (half + 4.0), sign * step) for step in (14.0, 26.0, 38.0, 50.0) for sign in (-1, 1) for side in (1, -1)
-    ]
-    best: tuple[float, float, float, Rectangle] | None = None
-    for dx, dy in places:
-        tx = min(max(px + dx, inside[0] + half), inside[2] - half)
-        ty = min(max(py + dy, inside[1] + tall), inside[3])
-        box = (tx - half, ty - tall + 2.0, tx + half, ty + 3.0)
-        hidden = sum(
-            max(0.0, min(box[2], other[2]) - max(box[0], other[0]))
-            * max(0.0, min(box[3], other[3]) - max(box[1], other[1]))
-            for other in taken
-        )
-        if best is None or hidden < best[0]:
-            best = hidden, tx, ty, box
-        if hidden == 0.0:
-            break
-    assert best is not None
-    return best[1:]
-
-
-def scatter(
-    points: Sequence[tuple[str, float, float, bool]],
-    x_title: str,
-    y_title: str,
-    limit: float | None = None,
-    size: tuple[int, int] = PLOT,
-) -> str:
-    """A chart of cost against error, cost logarithmic: points that nothing dominates are filled and joined.
-
-    Args:
-        points: Label, cost, error, whether something dominates it.
-        x_title: What the cost is.
-        y_title: What the error is.
-        limit: A cost to mark: that of a frame at 30 frames per second.
-        size: Width and height.
-    """
-    width, height = size
-    left, right, top, bottom = MARGIN
-    costs = [max(cost, 1e-3) for _, cost, _, _ in points]
-    low, high = min(costs) / 1.6, max(costs) * 2.2
-    if limit is not None and not low < limit < high:
-        limit = None
-    tall = max(max(error for _, _, error, _ in points) * 1.12, 1e-6)
-
-    def x(cost: float) -> float:
-        share = math.log(max(cost, 1e-3) / low) / math.log(high / low)
-        return left + share * (width - left - right)
-
-    def y(error: float) -> float:
-        return top + (1.0 - error / tall) * (height - top - bottom)
-
-    step = 10.0 ** math.floor(math.log10(tall))
-    step *= next(share for share in (0.2, 0.5, 1.0, 2.0) if tall / (share * step) <= 6.0)
-    title = f"{html.escape(y_title)} over {html.escape(x_title)}"
-    parts = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{title}">']
-    for count in range(int(tall / step) + 1):
-        at = y(count * step)
-        parts.append(f'<line class="axis" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(f'<text x="{left - 8}" y="{at + 4:.1f}" text-anchor="end">{count * step:.3g}</text>')
-    for value in _ticks(low, high):
-        parts.append(f'<text x="{x(value):.1f}" y="{height - bottom + 18}" text-anchor="middle">{value:g}</text>')
-    parts.append(f'<text x="{width - right}" y="{height - 6}" text-anchor="end">{html.escape(x_title)} →</text>')
-    parts.append(f'<text x="2" y="14">↑ {html.escape(y_title)}</text>')
-    if limit is not None:
-        at = x(limit)
-        parts.append(f'<line class="limit" x1="{at:.1f}" x2="{at:.1f}" y1="{top - 14}" y2="{height - bottom}"/>')
-        parts.append(f'<text class="limit" x="{at + 5:.1f}" y="{top - 6}">30 fps</text>')
-    front = sorted((cost, error) for _, cost, error, out in points if not out)
-    path = " ".join(f"{'M' if k == 0 else 'L'}{x(c):.1f} {y(e):.1f}" for k, (c, e) in enumerate(front))
-    parts.append(f'<path class="front" d="{path}"/>')
-    spots = [(x(cost), y(error)) for _, cost, error, _ in points]
-    taken = [(px - 6.0, py - 6.0, px + 6.0, py + 6.0) for px, py in spots]
-    for (label, cost, error, out), (px, py) in sorted(zip(points, spots, strict=True), key=lambda item: item[1]):
-        parts.append(
-            f'<circle class="{"off" if out else "on"}" cx="{px:.1f}" cy="{py:.1f}" r="5">'
-            f"<title>{html.escape(label)}: {cost:.3g} ms, {error:.4f}</title></circle>"
-        )
-        tx, ty, box = _place(label, px, py, taken, (0.0, 18.0, float(width), height - bottom - 2.0))
-        taken.append(box)
-        style = "" if out else ' class="label"'
-        parts.append(f'<text{style} x="{tx:.1f}" y="{ty:.1f}" text-anchor="middle">{html.escape(label)}</text>')
-    return "".join([*parts, "</svg>"])
-
-
 # --------------------------------------------------------------------------------------------------------------- tables
 
 
@@ -298,7 +182,7 @@ def _comparisons(rows: Sequence[Row]) -> str:
             best = min(same, key=lambda other: other.milliseconds)
             share = _share(best.milliseconds, row.milliseconds)
             lines.append(f"For the error of {row.method}, {best.method} takes {share} the time.")
-    return " ".join(dict.fromkeys(lines)) or "Every method buys something: none is beaten in both time and error."
+    return " ".join(dict.fromkeys(lines)) or "Every method is Pareto-optimal: none is beaten in both time and error."
 
 
 def _share(a: float, b: float) -> str:
@@ -314,12 +198,12 @@ def _beaten(whole: Whole, others: Sequence[Whole]) -> bool:
     )
 
 
-_SHORT = {"ours in the paper's time": "equal time", "ours at the paper's error": "equal error"}
+_SHORT = {SAME_TIME: "equal time", SAME_ERROR: "equal error"}
 
 
-def _whole_chart(report: CaseReport, limit: float | None, size: tuple[int, int] = PLOT) -> str:
+def _whole_chart(report: CaseReport, limit: float | None, size: tuple[float, float] = SIZE) -> str:
     points = [
-        (_SHORT.get(whole.label, whole.label), whole.milliseconds, whole.flip, _beaten(whole, report.wholes))
+        Point(_SHORT.get(whole.label, whole.label), whole.milliseconds, whole.flip, _beaten(whole, report.wholes))
         for whole in report.wholes
     ]
     against = "truth" if report.case.truth else "reference"
@@ -331,7 +215,7 @@ def _glance(report: CaseReport, anchor: str, limit: float | None) -> str:
     words = html.escape(_whole_words(report.wholes, brief=True))
     return (
         f'<div class="card"><h4><a href="#{anchor}">{html.escape(report.case.name)}</a></h4>'
-        f"{_whole_chart(report, limit, SMALL_PLOT)}<p class=soft>{words}</p></div>"
+        f"{_whole_chart(report, limit, SMALL)}<p class=soft>{words}</p></div>"
     )
 
 
@@ -377,15 +261,15 @@ def _whole_words(wholes: Sequence[Whole], *, brief: bool = False) -> str:
     if paper is None:
         return ""
     lines = []
-    if "ours in the paper's time" in by_label:
-        ours = by_label["ours in the paper's time"]
+    if SAME_TIME in by_label:
+        ours = by_label[SAME_TIME]
         lines.append(
-            f"Equal time ({ours.milliseconds:.1f} ms, the paper's way {paper.milliseconds:.1f}): "
-            f"{_less(ours.flip, paper.flip)} error."
+            f"Equal time ({ours.milliseconds:.1f} ms, {_times(ours.over_paper)} the paper's way, "
+            f"{paper.milliseconds:.1f} ms): {_less(ours.flip, paper.flip)} error."
         )
         lines += [] if brief else [f"It runs {_settings(ours)}."]
-    if "ours at the paper's error" in by_label:
-        ours = by_label["ours at the paper's error"]
+    if SAME_ERROR in by_label:
+        ours = by_label[SAME_ERROR]
         lines.append(
             f"Equal error ({ours.flip:.3f}, the paper's way {paper.flip:.3f}): "
             f"{_less(ours.milliseconds, paper.milliseconds)} time."
@@ -416,7 +300,7 @@ def _setting_section(report: CaseReport, rows: Sequence[Row]) -> str:
     difference = np.abs(pictures[0][1].astype(int) - pictures[-1][1].astype(int)).max(-1)
     box = bounding_box(difference > max(4, int(0.3 * difference.max())), difference.shape)
     columns = [*pictures, ("truth", reference)] if report.case.truth else pictures
-    points = [(row.method, row.milliseconds, row.error, row.dominated) for row in rows]
+    points = [Point(row.method, row.milliseconds, row.error, row.dominated) for row in rows]
     about = next((name.converges for name in SETTINGS if name.name == setting), True) or not report.case.truth
     against = f"error: FLIP to {rows[-1].method}" if about else "error: FLIP to the truth, above the best method's"
     what, words = WORDS.get(setting, ("", {}))
@@ -471,8 +355,9 @@ def _list_section(reports: Sequence[CaseReport]) -> str:
     return (
         '<section id="list"><h2>The cost table</h2><p>Every method over all scenes. Its error is FLIP per changed '
         "pixel: where methods approximate one quantity, the distance from the most exact; where they are models, "
-        "the distance from the truth above that of the best. Grey: another method is no dearer and no worse everywhere."
-        '</p><div class="card"><table><thead><tr><th>method</th><th style="text-align:left">what it does</th>'
+        "the distance from the truth above that of the best. Grey: in every scene another method costs no more and "
+        'errs no more.</p><div class="card"><table><thead><tr><th>method</th>'
+        '<th style="text-align:left">what it does</th>'
         "<th>ms per frame</th><th>error</th><th>scenes</th></tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div></section>"
     )
@@ -517,9 +402,10 @@ def render(
         '<p class="lead">Every stage has methods, from the paper\'s way to brute force. Here is what each takes and '
         "what it errs: lower is truer, further left is faster.</p>",
         f'<p class="soft">Measured on {html.escape(str(made["device"]))} with Warp {html.escape(str(made["warp"]))}, '
-        f"marker tracking left out.{counted} Filled points are worth their cost; hollow grey ones are beaten by "
-        "another in both time and error. <b>Equal time</b> is the choice that by the cost table errs least in the time "
-        "of the paper's way; <b>equal error</b> the cheapest that errs no more than it.</p>",
+        f"marker tracking left out.{counted} Filled points are the Pareto front; of hollow grey ones "
+        "another costs less and errs less. <b>Equal time</b> is sought as the choice that errs least by the cost table "
+        "and takes no longer than the paper's way, <b>equal error</b> as the cheapest that errs no more; what they "
+        "took and erred when all ran in turn is stated for each scene.</p>",
         f'<p class="soft">Error maps show FLIP: <span class="scale"><img alt="black to yellow" src="{data_uri(ramp)}">'
         f"{marks}</span></p><nav>",
         *(f'<a href="#{anchor}">{html.escape(report.case.name)}</a>' for anchor, report in anchors),

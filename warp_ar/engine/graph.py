@@ -8,7 +8,9 @@ from __future__ import annotations
 import dataclasses
 
 from warp_ar.stages import STAGES
-from warp_ar.stages.base import LeftOut, Request, Stage, Wiring
+from warp_ar.stages.base import LeftOut, Stage, Wiring
+from warp_ar.stages.features import Features, find_features
+from warp_ar.stages.request import Request
 
 # What the pipeline itself provides for every frame.
 INPUTS = ("frame", "pose", "lights", "objects", "exposure", "clock", "short_frames")
@@ -18,12 +20,18 @@ INPUTS = ("frame", "pose", "lights", "objects", "exposure", "clock", "short_fram
 class Plan:
     """The stages of a request, in the order in which they run."""
 
-    request: Request
+    features: Features
+    """What the request calls for."""
     stages: tuple[tuple[type[Stage], Wiring], ...]
     left_out: tuple[tuple[str, str], ...]
     """(stage, reason) of every stage that does not run."""
     inputs: tuple[str, ...]
     """The pipeline's own inputs that some stage or output needs."""
+
+    @property
+    def request(self) -> Request:
+        """What the plan was made for."""
+        return self.features.request
 
     def needs(self, name: str) -> bool:
         """Whether some stage reads the input ``name`` or the caller asked for it."""
@@ -31,15 +39,16 @@ class Plan:
 
 
 def make_plan(request: Request) -> Plan:
-    """Wire in the stages that the scene calls for, then walk back from the outputs and drop what nothing consumes.
+    """Wire in the stages that the request calls for, then walk back from the outputs and drop what nothing consumes.
 
     Raises:
         ValueError: An output that nothing produces was asked for, or a stage reads what no earlier stage writes.
     """
+    features = find_features(request)
     wired: list[tuple[type[Stage], Wiring]] = []
     reasons: dict[str, str] = {}
     for stage in STAGES:
-        wiring = stage.wire(request)
+        wiring = stage.wire(features)
         if isinstance(wiring, LeftOut):
             reasons[stage.name] = wiring.reason
         else:
@@ -55,7 +64,7 @@ def make_plan(request: Request) -> Plan:
     kept: list[tuple[type[Stage], Wiring]] = []
     for stage, wiring in reversed(wired):
         if wanted.isdisjoint(wiring.writes):
-            reasons[stage.name] = f"nothing reads its {' or '.join(wiring.writes)}"
+            reasons[stage.name] = stage.unread or f"nothing reads its {' or '.join(wiring.writes)}"
             continue
         kept.append((stage, wiring))
         wanted |= set(wiring.reads)
@@ -69,4 +78,4 @@ def make_plan(request: Request) -> Plan:
         available |= set(wiring.writes)
     order = {stage.name: index for index, stage in enumerate(STAGES)}
     left_out = tuple(sorted(reasons.items(), key=lambda item: order[item[0]]))
-    return Plan(request, tuple(kept), left_out, tuple(name for name in INPUTS if name in wanted))
+    return Plan(features, tuple(kept), left_out, tuple(name for name in INPUTS if name in wanted))

@@ -1,7 +1,7 @@
 """Runs a plan: skips what has not changed, splits CPU passes into bands of rows, times every stage.
 
 On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
-graph. In the graph a stage waits only for those whose output it reads, and for those that it gives way to, so that
+graph. In the graph a stage waits only for those whose output it reads, and for those that it runs after, so that
 short kernels, which leave most of the device idle, run beside others. On CPU it is the same: native threads (see
 ``crew``) take rows of whatever stage has its inputs, the first in order first, so that nobody waits for a pass that
 cannot be split, or for the last rows of one that can.
@@ -21,7 +21,7 @@ import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating
 from warp_ar.engine.crew import Crew
-from warp_ar.engine.graph import INPUTS, Plan
+from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
@@ -86,7 +86,7 @@ class Scheduler:
         """Seconds by which stages are timed on the host."""
         with wp.ScopedDevice(device), translating(device):
             for kind, wiring in plan.stages:
-                stage = kind(plan.request, wiring)
+                stage = kind(plan.features, wiring)
                 for name, spec in stage.arrays().items():
                     arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
                     self._fills[name] = spec.fill
@@ -96,7 +96,7 @@ class Scheduler:
         self._readers = _find_readers([stage for stage, _ in self._stages])
         self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
-        self._changing = {stage.name for stage, passes in self._stages if any(step.due for step in passes)}
+        self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -229,7 +229,7 @@ class Scheduler:
                 timings[stage.name] = SKIPPED
                 continue
             start = self.clock()
-            for step in _due_passes(stage, passes):
+            for step in _enabled_passes(stage, passes):
                 # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
                 self._launch(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
@@ -271,7 +271,7 @@ class Scheduler:
             return False
         assert self._crew is not None
         late = _says_in_the_end(stage)
-        due = [(step, self._rows_of(step)) for step in _due_passes(stage, dict(self._stages)[stage])]
+        due = [(step, self._rows_of(step)) for step in _enabled_passes(stage, dict(self._stages)[stage])]
         self._crew.begin(stage, due, tell=late)
         self._seen[stage.name] = versions
         self._ran.add(stage.name)
@@ -302,7 +302,7 @@ class Scheduler:
             if versions is None:
                 timings[stage.name] = SKIPPED
                 continue
-            chosen = _due_passes(stage, passes)
+            chosen = _enabled_passes(stage, passes)
             due.append((stage, chosen))
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
@@ -364,12 +364,12 @@ class Scheduler:
         begun = stream.record_event()
         written: dict[str, Any] = {}
         ends: dict[str, Any] = {}
-        for own, (stage, passes) in zip(self._streams, _giving_way(part), strict=False):
+        for own, (stage, passes) in zip(self._streams, _in_launch_order(part), strict=False):
             own.wait_event(begun)
             for name in stage.wiring.reads:
                 if name in written:
                     own.wait_event(written[name])
-            for name in stage.gives_way():
+            for name in stage.runs_after():
                 if name in ends:
                     own.wait_event(ends[name])
             with wp.ScopedStream(own, sync_enter=False):
@@ -398,10 +398,10 @@ def _ids(steps: list[Pass]) -> tuple[int, ...]:
     return tuple(map(id, steps))
 
 
-def _due_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
+def _enabled_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
     """Passes of a stage that take part in this frame."""
     stage.begin()
-    return [step for step in passes if step.due is None or step.due()]
+    return [step for step in passes if step.enabled is None or step.enabled()]
 
 
 def _says_in_the_end(stage: Stage) -> bool:
@@ -409,8 +409,8 @@ def _says_in_the_end(stage: Stage) -> bool:
     return type(stage).changed is not Stage.changed
 
 
-def _giving_way(part: list[Step]) -> list[Step]:
-    """Stages in the order of their launch: after those that they give way to, but before those that read them."""
+def _in_launch_order(part: list[Step]) -> list[Step]:
+    """Stages in the order of their launch: after those that they run after, but before those that read them."""
     ordered = list(part)
     for step in part:
         stage = step[0]
@@ -419,7 +419,7 @@ def _giving_way(part: list[Step]) -> list[Step]:
             other = ordered[behind][0]
             if not set(stage.wiring.writes).isdisjoint(other.wiring.reads):
                 break
-            if other.name in stage.gives_way():
+            if other.name in stage.runs_after():
                 place = behind
         ordered.insert(place, ordered.pop(at))
     return ordered
@@ -443,12 +443,3 @@ def _find_readers(stages: list[Stage]) -> dict[str, list[str]]:
         ]
         for index, stage in enumerate(stages)
     }
-
-
-def add_inputs(arrays: Arrays, inputs: Mapping[str, Any]) -> None:
-    """Add the pipeline's inputs, and the tables that stages share, to the resources."""
-    for name, array in inputs.items():
-        arrays.add(name, array)
-    for name in INPUTS:
-        if name not in arrays:
-            arrays.add(name, None)

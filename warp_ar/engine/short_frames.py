@@ -17,8 +17,9 @@ import warp as wp
 from warp_ar.kernels.bracket import BracketExposure
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.scene import Pose
-from warp_ar.stages.base import Arrays, Request, Wiring
-from warp_ar.stages.bracket import UNWRAPPED
+from warp_ar.stages.base import Arrays, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.probe_maps import UNWRAPPED
 from warp_ar.stages.unwrap import Unwrap
 
 KEPT_SECONDS = 3.0
@@ -28,23 +29,23 @@ KEPT_SECONDS = 3.0
 class ShortFrames:
     """Takes frames of every exposure but the reference's."""
 
-    def __init__(self, request: Request, arrays: Arrays, device: Any) -> None:
+    def __init__(self, features: Features, arrays: Arrays, device: Any) -> None:
         """Allocate and build.
 
         Args:
-            request: What the plan was made for; its stages hold ``bracket``.
+            features: Of the plan; its stages hold ``bracket``.
             arrays: Of the pipeline.
             device: Warp device.
         """
-        self._ratios = request.exposures
+        self._ratios = features.request.exposures
         self._arrays = arrays
         self._own = Arrays()
         self._taken = [-math.inf] * len(self._ratios)
         self._told: tuple[bool, ...] | None = None
         self._merged = 1
-        wiring = Unwrap.wire(request)
+        wiring = Unwrap.wire(features)
         assert isinstance(wiring, Wiring)
-        stage = Unwrap(request, wiring)
+        stage = Unwrap(features, wiring)
         for name in ("probes", "ray_scene", "decode", "rays"):
             self._own.add(name, arrays[name])
         with wp.ScopedDevice(device):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.input.tracking import make_board
+from warp_ar.input.markers import make_board
 from warp_ar.scene import Camera, CharucoBoard, Marker
 
 Image = NDArray[np.uint8]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import SinkError, UsageError
-from warp_ar.input.tracking import find_dictionary, make_board
+from warp_ar.input.markers import find_dictionary, make_board
 from warp_ar.scene import CharucoBoard, Marker
 
 Image = NDArray[np.uint8]

@@ -25,62 +25,79 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import functools
 from collections.abc import Sequence
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
+from warp_ar.input.marker_pattern import make_pattern
+from warp_ar.input.markers import Detection, MarkerDetector
 from warp_ar.kernels.color import decode_table
-from warp_ar.scene import Camera, CharucoBoard, GridBoard, Marker, Pose
+from warp_ar.scene import Camera, Marker, Pose
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_WINDOWS = (7, 23)
-"""Widths in pixels of the two adaptive thresholds: sharp small markers, and large or blurred ones."""
 _ENVIRONMENT = 0.6
 """Half width of the search around the last marker, beyond the marker itself, in its own sizes."""
+
 _TAPS = 9
 """Samples across an edge."""
+
 _REACH = (4.0, 3.0, 2.5, 2.5)
 """Half width of the sampled window in pixels, per Gauss-Newton step; a cell that is narrower limits it further."""
+
 _LOST_REACH = (9.0, 6.0, 4.0, 3.0, 2.5)
 """The same where the pose is only a prediction from earlier frames."""
+
 _MIN_REACH = 1.0
 """Pixels: an edge with less environment than this to its neighbours is not measured; the blur of one would reach the
 other."""
+
 _DONE = 0.05
 """Pixels: a Gauss-Newton step that moves no edge further is the last; it converges fast enough that the next would move
 a tenth of it."""
+
 _MIN_EDGES = 16
 """Fewest measured edge points for a refinement: seven unknowns, and something left to vote."""
+
 _NOISE_FLOOR = 0.03
 """Pixels: smallest standard deviation that an edge point is ever given credit for (sampling, lens model, print)."""
+
 _CORRELATED = 2.0
 """Neighbouring edge points share pixels, so that many of them count as one."""
+
 _CORNER_NOISE = 0.5
 """Pixels: standard deviation of a detected corner where edges are too small to refine."""
+
 _PATTERN = 0.7
 """Least correlation of the cells' brightness with the printed pattern."""
+
 _SUPPORT = 0.4
 """Least share of the printed edges that must agree with a pose: with less, chance and clutter could."""
+
 _ENOUGH = 0.7
 """Share of a board's edges that makes detection needless."""
+
 _ALIKE = 3.0
 """The second pose of a plane is examined when its reprojection error is less than this many times that of the first
 ..."""
+
 _ALIKE_PIXELS = 0.5
 """... or less than this many pixels larger."""
+
 _FLIP_EVIDENCE = 12.0
 """Log likelihood that must pile up against the current one of the two poses before the other is taken: e^12."""
+
 _FRAME_EVIDENCE = 4.0
 """Most that one frame may add to it, so that one bad frame cannot flip the pose."""
+
 _SETTLE = 9.0
 """Squared deviations (in standard deviations, per degree of freedom) at which half of an innovation is believed."""
+
 _FORGET = 0.4
 """Seconds in which a steadied pose forgets at least 1 - 1/e of what came before."""
 
@@ -114,206 +131,6 @@ class Track:
     reprojection_error: float
     """Root mean square distance in pixels between predicted and measured edges (corners, where too small); infinite if
     not measured."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Detection:
-    """One marker found in an image."""
-
-    id: int
-    """Number in its dictionary."""
-    corners: NDArray[np.float32]
-    """(4, 2) pixels, clockwise from the marker's own top left."""
-
-
-def find_dictionary(name: str) -> Any:
-    """OpenCV's predefined marker dictionary of that name.
-
-    Args:
-        name: such as ``"DICT_4X4_50"`` or ``"DICT_APRILTAG_36h11"``.
-
-    Raises:
-        UsageError: if OpenCV has none of that name.
-    """
-    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
-    if not isinstance(number, int):
-        known = ", ".join(sorted(key for key in dir(cv2.aruco) if key.startswith("DICT_")))
-        raise UsageError(f"marker dictionary: OpenCV has no {name!r}; it has {known}")
-    return cv2.aruco.getPredefinedDictionary(number)
-
-
-def make_board(marker: Marker) -> Any:
-    """OpenCV's board object for a marker with ``board`` set; its own axes start at the top left, y down.
-
-    Raises:
-        UsageError: if the dictionary holds too few markers, or none of that name exists.
-    """
-    board = marker.board
-    assert board is not None
-    dictionary = find_dictionary(marker.dictionary)
-    available = len(dictionary.bytesList)
-    if available < board.marker_count:
-        raise UsageError(
-            f"marker board: {board} needs {board.marker_count} markers; {marker.dictionary} has {available}"
-        )
-    if isinstance(board, CharucoBoard):
-        return cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_length, board.marker_length, dictionary)
-    return cv2.aruco.GridBoard((board.columns, board.rows), board.marker_length, board.separation, dictionary)
-
-
-class MarkerDetector:
-    """Finds every marker of a dictionary, with sub-pixel corners; mirrored and inverted prints are not accepted."""
-
-    def __init__(self, dictionary: str) -> None:
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = _WINDOWS
-        parameters.adaptiveThreshWinSizeStep = _WINDOWS[1] - _WINDOWS[0]
-        # Cells read from their middle, at twice OpenCV's resolution, and markers at the border taken: on a real clip of
-        # six markers and 145 frames, 119 frames show all six, where OpenCV's defaults show 95, and no other marker is
-        # seen.
-        parameters.perspectiveRemovePixelPerCell = 8
-        parameters.perspectiveRemoveIgnoredMarginPerCell = 0.3
-        parameters.minDistanceToBorder = 0
-        # Against path-traced poses, root mean square per coordinate: 0.65 pixel unrefined, 0.75 by contour lines,
-        # 0.28 by gradients (this one); AprilTag's quads are 0.45 pixel off in x and y. Edges refine the rest.
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        self._parameters = parameters
-        self._detector = cv2.aruco.ArucoDetector(find_dictionary(dictionary), parameters)
-
-    def detect(self, gray: Image, smallest: float = 10.0) -> list[Detection]:
-        """Markers in a uint8 (h, w) image, in OpenCV's order.
-
-        Args:
-            gray: the image.
-            smallest: mean edge length in pixels of the smallest marker of interest; most time goes into what is
-                smaller.
-        """
-        # OpenCV counts in shares of the longer image side.
-        self._parameters.minMarkerPerimeterRate = 4 * smallest / max(gray.shape)
-        self._detector.setDetectorParameters(self._parameters)
-        corners, ids, _ = self._detector.detectMarkers(gray)
-        if ids is None:
-            return []
-        return [
-            Detection(int(i), np.asarray(c, np.float32).reshape(4, 2))
-            for i, c in zip(np.ravel(ids), corners, strict=True)
-        ]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Pattern:
-    """The print as geometry, in the world's frame: m edge points, c cells."""
-
-    markers: dict[int, Array]
-    """Corners (4, 3) of each marker by its id, clockwise from top left."""
-    outline: Array
-    """Corners (4, 3) of the whole."""
-    points: Array
-    """Points on the borders between black and white, (m, 3)."""
-    tangents: Array
-    """Unit direction of the border at each point, (m, 3)."""
-    normals: Array
-    """Unit direction toward white, (m, 3)."""
-    environments: Array
-    """Distance to the nearest parallel border, (m,) metres."""
-    cells: Array
-    """Centres of cells, (c, 3)."""
-    white: Array
-    """1 where a cell is white, 0 where black, (c,)."""
-
-
-def _cell_edges(
-    cells: NDArray[np.bool_], left: float, top: float, size: float, environment: float
-) -> list[tuple[float, ...]]:
-    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length, space."""
-    edges: list[tuple[float, ...]] = []
-    for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
-        sign = 1.0 if cells[row, column + 1] else -1.0
-        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, environment))
-    for row, column in np.argwhere(cells[1:] != cells[:-1]):
-        sign = -1.0 if cells[row + 1, column] else 1.0
-        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, environment))
-    return edges
-
-
-@functools.cache
-def _make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | GridBoard | None) -> _Pattern:
-    book = find_dictionary(dictionary)
-    bits = int(book.markerSize) + 2
-    edges: list[tuple[float, ...]] = []
-    if board is None:
-        if not 0 <= id < len(book.bytesList):
-            raise UsageError(f"marker id: {dictionary} has ids 0 to {len(book.bytesList) - 1}, not {id}")
-        if not (np.isfinite(size) and size > 0):
-            raise UsageError(f"marker size: {size} should be the edge length in metres, above 0")
-        places, width, height, margin = {id: (-size / 2, size / 2)}, size, size, size / bits
-    else:
-        printed = make_board(Marker(dictionary, board=board))
-        size, (width, height) = board.marker_length, board.size
-        places = {
-            int(number): (float(corners[0][0]) - width / 2, height / 2 - float(corners[0][1]))
-            for number, corners in zip(np.ravel(printed.getIds()), printed.getObjPoints(), strict=True)
-        }
-        if isinstance(board, CharucoBoard):
-            # The top left square is black, in OpenCV's layout since 4.6.
-            squares = (np.add.outer(np.arange(board.rows), np.arange(board.columns)) % 2).astype(bool)
-            square = board.square_length
-            margin = (square - size) / 2
-            edges += _cell_edges(squares, -width / 2, height / 2, square, min(margin, square / 2))
-        else:
-            margin = board.separation
-    cell = size / bits
-    margin = min(margin, cell)
-    centres, white = [], []
-    for number, (left, top) in places.items():
-        image = cv2.aruco.generateImageMarker(book, number, bits, borderBits=1)
-        pattern = np.pad(np.asarray(image) > 127, 1, constant_values=True)
-        edges += _cell_edges(pattern, left - cell, top + cell, cell, margin)
-        rows_, columns_ = np.indices((bits, bits))
-        centres.append(
-            np.stack([left + (columns_ + 0.5) * cell, top - (rows_ + 0.5) * cell, 0.0 * rows_], -1).reshape(-1, 3)
-        )
-        white.append(pattern[1:-1, 1:-1].ravel())
-    table = np.array(edges, float)
-    # Inner points of an edge only: its ends are corners, where another edge's blur is near.
-    count = int(np.clip(240 // len(table), 1, 4))
-    along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
-    table = np.repeat(table[:: -(-len(table) // 300)], count, axis=0)
-    shift = np.tile(along, len(table) // count) * table[:, 6]
-    flat = np.zeros((len(table), 1))
-    tangents, normals = np.hstack([table[:, 2:4], flat]), np.hstack([table[:, 4:6], flat])
-    corners = {n: _square(x + size / 2, y - size / 2, size, size) for n, (x, y) in places.items()}
-    return _Pattern(
-        markers=corners,
-        outline=_square(0.0, 0.0, width, height),
-        points=np.hstack([table[:, :2], flat]) + tangents * shift[:, None],
-        tangents=tangents,
-        normals=normals,
-        environments=table[:, 7],
-        cells=np.concatenate(centres),
-        white=np.concatenate(white).astype(float),
-    )
-
-
-def printed_cells(marker: Marker) -> tuple[Array, NDArray[np.bool_], float, Array]:
-    """What is printed where.
-
-    Args:
-        marker: Marker or board.
-
-    Returns:
-        Centres of all cells (c, 3), which of them are white (c,), the side of a cell in metres, and the whole's
-        corners (4, 3).
-    """
-    pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
-    size = marker.size if marker.board is None else marker.board.marker_length
-    side = size / (int(find_dictionary(marker.dictionary).markerSize) + 2)
-    return pattern.cells, pattern.white > 0.5, side, pattern.outline
-
-
-def _square(x: float, y: float, width: float, height: float) -> Array:
-    w, h = width / 2, height / 2
-    return np.array([[x - w, y + h, 0.0], [x + w, y + h, 0.0], [x + w, y - h, 0.0], [x - w, y - h, 0.0]])
 
 
 def _rotation(vector: Array) -> Array:
@@ -368,7 +185,7 @@ class Tracker:
     """
 
     def __init__(self, marker: Marker, camera: Camera, *, hold: float = 0.2, steady: bool = True) -> None:
-        self._pattern = _make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
+        self._pattern = make_pattern(marker.dictionary, marker.id, marker.size, marker.board)
         self._detector = MarkerDetector(marker.dictionary)
         self._shape = (camera.height, camera.width)
         self._matrix = np.asarray(camera.matrix(), float)

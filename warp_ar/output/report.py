@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import statistics
 import time
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
 
 import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.accuracy.budget import AUTO, AutoPipeline
 from warp_ar.engine.graph import Plan
-from warp_ar.engine.pipeline import TRACK, Pipeline, Result
+from warp_ar.engine.pipeline import TRACK, Result
 from warp_ar.scene import Pose
 from warp_ar.stages import STAGES
 
@@ -20,10 +20,19 @@ from warp_ar.stages import STAGES
 WARM_UP = 3
 
 
+@runtime_checkable
+class Choosing(Protocol):
+    """One that changes its quality while frames run, to keep a budget."""
+
+    def status(self) -> Mapping[str, Any]:
+        """What it chose, and why."""
+
+
 class RunLog:
     """Collects poses and timings, frame by frame."""
 
-    def __init__(self, pipeline: Pipeline | AutoPipeline) -> None:
+    def __init__(self, pipeline: Any) -> None:
+        """``pipeline`` is a ``Pipeline``, or what holds one and changes it (``Choosing``)."""
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: dict[str, int] = {}
@@ -90,9 +99,9 @@ class RunLog:
         return {
             "device": str(self._pipeline.device),
             "warp": wp.__version__,
-            "quality": AUTO if isinstance(self._pipeline, AutoPipeline) else self._pipeline.quality.name,
+            "quality": "auto" if isinstance(self._pipeline, Choosing) else self._pipeline.quality.name,
             "fps": round(self.fps, 3),
-            **({"auto": self._pipeline.status()} if isinstance(self._pipeline, AutoPipeline) else {}),
+            **({"auto": self._pipeline.status()} if isinstance(self._pipeline, Choosing) else {}),
             "steps_ms": {name: round(milliseconds, 3) for name, milliseconds in self.steps().items()},
             "critical_path": max(self.steps(), key=self.steps().__getitem__, default=None),
             "frames": self._frames,
@@ -127,6 +136,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     table.add_column("median ms", justify="right")
     table.add_column("what it does, or why it is left out")
     summaries = {stage.name: stage.summary for stage in STAGES} | {TRACK: "finds the marker and the camera's pose"}
+    methods = {stage.name: stage.method_for(plan.features) for stage, _ in plan.stages} | {TRACK: "default"}
     for name in stage_names(plan):
         milliseconds = log.median_ms(name) if log is not None else None
         skipped = log.skipped(name) if log is not None else 0
@@ -134,7 +144,7 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
             "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
         )
         time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
-        table.add_row(name, plan.request.quality.method(name), state, time_text, summaries[name])
+        table.add_row(name, methods[name], state, time_text, summaries[name])
     for name, reason in left_out(plan):
         table.add_row(name, "", "left out", "", reason, style="dim")
     Console().print(table)

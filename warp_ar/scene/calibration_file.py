@@ -10,6 +10,7 @@ from typing import Any, Final, NoReturn
 import cv2
 
 from warp_ar.errors import SceneError
+from warp_ar.files import bracket_depth, check_depth, indentation_depth, is_file, read_text, tag_depth
 from warp_ar.scene.description import Camera
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, show_value
 
@@ -36,10 +37,11 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
         SceneError: The file is missing, damaged, lacks a key, or holds a camera that is not a pinhole.
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise SceneError(f"{path}: no such calibration file")
+    text = _checked_text(path)
     try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         if not storage.isOpened():
             raise SceneError(f"{path}: the calibration cannot be read; expected OpenCV's YAML, JSON or XML")
         found = {
@@ -83,6 +85,19 @@ def load_calibration(path: str | Path, transfer: str | Path = "srgb") -> Camera:
     if len(distortion) not in (4, 5, 8) or not all(map(math.isfinite, distortion)):
         fail(_DISTORTION_NAMES, distortion, "expected 4, 5 or 8 finite values (k1 k2 p1 p2 [k3 [k4 k5 k6]])")
     return Camera(int(size[0]), int(size[1]), k[0], k[4], k[2], k[5], tuple(distortion), transfer)
+
+
+def _checked_text(path: Path) -> str:
+    """A calibration that OpenCV may read: its parsers call themselves at every level, and crash from some depth on."""
+    text = read_text(path, SceneError, expected="OpenCV's YAML, JSON or XML")
+    start = text.lstrip()[:1]
+    depth = tag_depth(text) if start == "<" else bracket_depth(text)
+    if start not in ("<", "{", "["):
+        depth += indentation_depth(text)
+    check_depth(depth, str(path), SceneError)
+    if "\0" in text or not start:
+        raise SceneError(f"{path}: the calibration cannot be read; expected OpenCV's YAML, JSON or XML")
+    return text
 
 
 def _calibration_numbers(storage: Any, names: Sequence[str]) -> list[float] | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_ar.cache_folder import cache_folder
-from warp_ar.scene import geometry
+from warp_ar.scene import geometry, mesh_files
 
 WHOLE = (".ply", ".stl", ".off", ".glb")
 """Formats without files beside them."""
@@ -24,21 +24,22 @@ MOST_BYTES = 256 << 20
 
 
 def load_kept_mesh(path: Path) -> geometry.Mesh:
-    """As ``geometry.load_mesh``, from what an earlier run kept if the file is the same.
+    """As ``mesh_files.load_mesh``, from what an earlier run kept if the file is the same.
 
     Raises:
-        SceneError: As ``geometry.load_mesh``.
+        SceneError: As ``mesh_files.load_mesh``.
     """
     try:
         if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
-            return geometry.load_mesh(path)
-        key = hashlib.sha256(Path(geometry.__file__).read_bytes() + path.read_bytes()).hexdigest()[:32]
+            return mesh_files.load_mesh(path)
+        code = b"".join(Path(module.__file__).read_bytes() for module in (geometry, mesh_files))
+        key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
     except OSError:
-        return geometry.load_mesh(path)  # which says what is wrong
+        return mesh_files.load_mesh(path)  # which says what is wrong
     kept = cache_folder() / "meshes" / f"{key}{path.suffix.lower()}.npz"
     with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile), np.load(kept) as values:
         return geometry.Mesh(**{name: values[name] for name in values.files})
-    mesh = geometry.load_mesh(path)
+    mesh = mesh_files.load_mesh(path)
     values = {field.name: getattr(mesh, field.name) for field in dataclasses.fields(mesh)}
     part = kept.with_suffix(f".{os.getpid()}.npz")
     with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again

@@ -17,7 +17,7 @@ def show_value(value: object) -> str:
     """A value as a TOML file would have it, on one line and not too long."""
     try:
         text = json.dumps(value, ensure_ascii=False, default=str)
-    except ValueError:  # an integer with more digits than Python turns into text
+    except (ValueError, RecursionError):  # an integer with more digits than Python turns into text
         return "a number of thousands of digits"
     return text if len(text) <= 80 else f"{text[:60]}... ({len(text)} characters)"
 

@@ -1,4 +1,4 @@
-"""A scene as rays meet it: meshes, materials, textures and lights on a device, and what of the screen they can touch.
+"""A scene as rays meet it: meshes, materials, textures and lights on a device.
 
 Positions are metres in the world, angles of the device's records radians, colours linear RGB.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,25 +22,22 @@ from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
-from warp_ar.scene import Pose
-from warp_ar.scene.geometry import Mesh, load_texture, rotation_matrix, silhouette_tolerance, torus_mesh
+from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.mesh_cache import load_kept_mesh
+from warp_ar.scene.mesh_files import load_texture
+from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
+from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
 
 FloatArray = npt.NDArray[np.float64]
-
-Rect = tuple[int, int, int, int]
-"""Part of the screen: row_start, row_stop, column_start, column_stop; all zero where nothing of it is needed."""
-
-EMPTY: Final[Rect] = (0, 0, 0, 0)
 
 BOX_MARGIN: Final = 2.0**-18
 """How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
 
 BVH_CONSTRUCTOR: Final = "sah"
 """On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
+
 BVH_LEAF_SIZE: Final = 1
 """Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
-
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
 _LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
 _MODELS: Final[dict[type, int]] = {
@@ -51,29 +47,8 @@ _MODELS: Final[dict[type, int]] = {
     scenes.MirrorMaterial: structs.MIRROR,
 }
 
-SHADOW_REACH: Final = 12.0
-"""How far an object's shadow of the environment is followed, in radii of the sphere around it.
-
-A sphere that rests on a desk hides (r / d)^3 of an even sky's light from a point at distance d: under 1/512 from 8
-radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees high or more.
-"""
-
-# Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
-_CONE_SIDES: Final = 8
-# From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
-_WIDE_CONE: Final = math.radians(75.0)
 # Planes whose normals have a larger cosine, 2.6 degrees, send each other less than a hundredth of their light.
 _ONE_WAY: Final = 0.999
-# Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
-_FACES: Final = (
-    (0, 2, 6, 4),
-    (1, 3, 7, 5),
-    (0, 1, 5, 4),
-    (2, 3, 7, 6),
-    (0, 1, 3, 2),
-    (4, 5, 7, 6),
-)
-_CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
 def shape_kind(item: scenes.Object | scenes.Proxy) -> int:
@@ -270,7 +245,7 @@ class HostScene:
         self._placed = b""  # the objects that the polygons below are of
         self._outline = Outline(())
         self._shaded: Outline | None = None
-        self._balls = _ball_outline(scene)
+        self._balls = ball_outline(scene)
         self._lights_edited = False
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -296,7 +271,7 @@ class HostScene:
         self._place_objects()
         self.ray_scene.materials.assign(self._material_records())
         self._lit = None
-        self._balls = _ball_outline(scene)
+        self._balls = ball_outline(scene)
         self._lights_edited = True
 
     def _place_objects(self) -> None:
@@ -406,19 +381,19 @@ class HostScene:
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
-            self._outline = Outline([face for record in self._objects for face in _faces(record)])
+            self._outline = Outline([face for record in self._objects for face in box_faces(record)])
             self._shaded = None
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
         """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
-            faces = [_faces(record) for record in self._proxies]
-            self._lit = Outline([part for light in self._lights for own in faces for part in _lit_faces(light, own)])
+            faces = [box_faces(record) for record in self._proxies]
+            self._lit = Outline([part for light in self._lights for own in faces for part in lit_faces(light, own)])
             self._bounced = None
         if not bounced:
             return self._lit
         if self._bounced is None:
-            self._bounced = Outline([*self._lit.polygons, *_bounced_faces(self._lights, self._proxies)])
+            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._lights, self._proxies)])
         return self._bounced
 
     def ball_outline(self) -> Outline:
@@ -429,9 +404,9 @@ class HostScene:
         """Where virtual objects can change the environment on proxies."""
         self._follow_objects()
         if self._shaded is None:
-            proxies = [_faces(record) for record in self._proxies]
+            proxies = [box_faces(record) for record in self._proxies]
             self._shaded = Outline(
-                [part for record in self._objects for faces in proxies for part in _shaded_faces(record, faces)]
+                [part for record in self._objects for faces in proxies for part in shaded_faces(record, faces)]
             )
         return self._shaded
 
@@ -468,229 +443,3 @@ def _update(records_out: npt.NDArray[Any], records: npt.NDArray[Any]) -> bool:
         return False
     records_out[...] = records
     return True
-
-
-def _faces(record: Any) -> list[FloatArray]:
-    """Faces of the box around a shape in the world, (4, 3) each."""
-    half = np.array(record["extent"], np.float64)
-    # Float32 records are rounded; a part in a million more keeps the box around what the device sees.
-    corners = _CORNERS * (half * (1.0 + 1e-6)) * float(record["scale"])
-    corners = corners @ np.array(record["rotation"], np.float64).T + np.array(record["position"], np.float64)
-    if record["kind"] == structs.PLANE:
-        return [corners[[0, 2, 6, 4]]]
-    return [corners[list(face)] for face in _FACES]
-
-
-def _ball_outline(scene: scenes.Scene) -> Outline:
-    """Boxes around the mirror balls."""
-    boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in scene.probes]
-    return Outline([box[list(face)] for box in boxes for face in _FACES])
-
-
-def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
-    """The part of a convex polygon (n, 3) where normal . p >= offset (Sutherland, Hodgman); empty if there is none."""
-    height = polygon @ normal - offset
-    if (height >= 0.0).all():
-        return polygon
-    points: list[FloatArray] = []
-    for index in range(len(polygon)):
-        a, b = height[index - 1], height[index]
-        if (a < 0.0) != (b < 0.0):
-            points.append(polygon[index - 1] + (polygon[index] - polygon[index - 1]) * (a / (a - b)))
-        if b >= 0.0:
-            points.append(polygon[index])
-    return np.array(points).reshape(-1, 3)
-
-
-def _lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
-    """Parts of a box's faces that a light may reach.
-
-    A spot's cone is taken as the pyramid around it. For a mesh, whose surface lies inside its box, the parts of the
-    faces inside the pyramid and, if the light is in the box, the light itself span all that can be lit.
-    """
-    if light["kind"] != structs.SPOT or light["outer_angle"] >= _WIDE_CONE:
-        return faces
-    apex = np.array(light["position"], np.float64)
-    axis = np.array(light["direction"], np.float64)
-    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side /= np.linalg.norm(side)
-    across = np.cross(axis, side)
-    # A plane that touches the cone along a line contains its apex; its normal leans by the half angle toward the axis.
-    outer = float(light["outer_angle"]) + 1e-6
-    parts = []
-    for face in faces:
-        part = face
-        for turn in np.arange(_CONE_SIDES) * (2.0 * math.pi / _CONE_SIDES):
-            outward = math.cos(turn) * side + math.sin(turn) * across
-            normal = math.sin(outer) * axis - math.cos(outer) * outward
-            part = _clip(part, normal, float(normal @ apex) - 1e-9)
-            if len(part) == 0:
-                break
-        if len(part):
-            parts.append(part)
-    if len(faces) > 1:
-        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        if all((apex - face.mean(axis=0)) @ (center - face.mean(axis=0)) >= 0.0 for face in faces):
-            parts.append(apex[None, :])
-    return parts
-
-
-def _outward(face: FloatArray, center: FloatArray, kind: int, rotation: FloatArray) -> FloatArray:
-    """Unit normal of a face of a shape: a plane's own, a box's away from its middle."""
-    if kind == structs.PLANE:
-        return rotation[:, 2]
-    away = face.mean(axis=0) - center
-    normal = np.cross(face[1] - face[0], face[2] - face[1])
-    length = float(np.linalg.norm(normal))
-    return normal * (math.copysign(1.0, float(normal @ away)) / length) if length > 0.0 else np.zeros(3)
-
-
-def _bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[FloatArray]:
-    """Parts of the proxies' faces before which some lit face stands, and behind which it does not.
-
-    The surface of a mesh lies in its box and looks every way: it sends from all of its box to all sides.
-    """
-    sources: list[tuple[FloatArray, FloatArray | None]] = []  # lit parts, and the normal if there is one
-    for record in proxies:
-        faces, rotation = _faces(record), np.array(record["rotation"], np.float64)
-        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for light in lights:
-            if record["kind"] == structs.MESH:
-                if _lit_faces(light, faces):
-                    sources += [(face, None) for face in faces]
-                continue
-            for face in faces:
-                facing = _outward(face, center, int(record["kind"]), rotation)
-                at, direction = (np.array(light[name], np.float64) for name in ("position", "direction"))
-                directional = light["kind"] == structs.DIRECTIONAL
-                if (float(-direction @ facing) if directional else float((at - face[0]) @ facing)) > 0.0:
-                    sources += [(part, facing) for part in _lit_faces(light, [face])]
-    reached: list[FloatArray] = []
-    for record in proxies:
-        faces, rotation = _faces(record), np.array(record["rotation"], np.float64)
-        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for face in faces:
-            inward = -_outward(face, center, int(record["kind"]), rotation)
-            for part, normal in sources:
-                if record["kind"] != structs.MESH and (part @ inward >= float(face[0] @ inward) - 1e-9).all():
-                    continue
-                seen = face if normal is None else _clip(face, normal, float(normal @ part[0]) - 1e-9)
-                if len(seen):
-                    reached.append(seen)
-    return reached
-
-
-def _shaded_faces(record: Any, faces: list[FloatArray]) -> list[FloatArray]:
-    """Parts of a box's faces inside the cube of ``SHADOW_REACH`` around an object, and of the cube's inside the box."""
-    radius = float(record["scale"]) * float(np.linalg.norm(record["extent"]))
-    center = np.array(record["position"], np.float64)
-    cube = [center + SHADOW_REACH * radius * _CORNERS[list(face)] for face in _FACES]
-    near = [_clip_to_cube(face, center, SHADOW_REACH * radius) for face in faces]
-    if len(faces) > 1:  # a mesh lies inside its box, where the cube may end
-        middle = np.mean([face.mean(axis=0) for face in faces], axis=0)
-        for part in cube:
-            for face in faces:
-                inward = middle - face.mean(axis=0)
-                if len(part):
-                    part = _clip(part, inward, float(inward @ face[0]))
-            near.append(part)
-    return [part for part in near if len(part)]
-
-
-def _clip_to_cube(polygon: FloatArray, center: FloatArray, reach: float) -> FloatArray:
-    """The part of a convex polygon within ``reach`` of a point along every axis."""
-    for axis in np.eye(3):
-        for normal in (axis, -axis):
-            if len(polygon):
-                polygon = _clip(polygon, normal, float(normal @ center) - reach)
-    return polygon
-
-
-@functools.lru_cache(maxsize=8)
-def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
-    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included.
-
-    In ascending order: where a lens bends rows or columns back, a bound is that of all columns to one side.
-    """
-    if not any(camera.distortion):
-        x = (np.arange(camera.width) - camera.cx) / camera.fx
-        y = (np.arange(camera.height) - camera.cy) / camera.fy
-        bounds = (x, x, y, y)
-    else:
-        from warp_ar.scene.pixel_rays import pixel_rays
-
-        rays = pixel_rays(camera).astype(np.float64)
-        bounds = (rays[..., 0].min(0), rays[..., 0].max(0), rays[..., 1].min(1), rays[..., 1].max(1))
-    return (
-        np.minimum.accumulate(bounds[0][::-1])[::-1] - 1.0 / camera.fx,
-        np.maximum.accumulate(bounds[1]) + 1.0 / camera.fx,
-        np.minimum.accumulate(bounds[2][::-1])[::-1] - 1.0 / camera.fy,
-        np.maximum.accumulate(bounds[3]) + 1.0 / camera.fy,
-    )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Outline:
-    """Convex polygons in the world, looked at in every frame from somewhere else."""
-
-    polygons: Sequence[FloatArray]
-    """(n, 3) each."""
-
-    @functools.cached_property
-    def corners(self) -> FloatArray:
-        """Those of all polygons, (n, 3)."""
-        return np.concatenate(self.polygons)
-
-
-def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera) -> list[Rect]:
-    """Smallest rectangles of pixels whose rays can meet the convex hulls of outlines, one pixel of margin included.
-
-    Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
-    are picked by their undistorted rays, not by distorting the polygons. All at once, because a frame has several, and
-    NumPy takes no longer for all than for one.
-
-    Args:
-        outlines: What to look at, each by itself.
-        pose: ``camera_from_world``.
-        camera: The camera of the frames.
-    """
-    rects = [EMPTY] * len(outlines)
-    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
-    if not parts:
-        return rects
-    points = pose.apply(np.concatenate(list(parts.values())))
-    if points[:, 2].min() < _nearest(points):
-        clipped = {index: _in_front(outlines[index], pose) for index in parts}
-        parts = {index: part for index, part in clipped.items() if len(part)}
-        if not parts:
-            return rects
-        points = np.concatenate(list(parts.values()))
-    projected = points[:, :2] / points[:, 2:]
-    starts = list(itertools.accumulate(map(len, parts.values()), initial=0))[:-1]
-    low, high = np.minimum.reduceat(projected, starts), np.maximum.reduceat(projected, starts)
-    x_low, x_high, y_low, y_high = _ray_bounds(camera)
-    edges = (
-        y_high.searchsorted(low[:, 1]),
-        y_low.searchsorted(high[:, 1], "right"),
-        x_high.searchsorted(low[:, 0]),
-        x_low.searchsorted(high[:, 0], "right"),
-    )
-    for index, top, bottom, left, right in zip(parts, *(edge.tolist() for edge in edges), strict=True):
-        if top < bottom and left < right:
-            rects[index] = top, bottom, left, right
-    return rects
-
-
-def _nearest(points: FloatArray) -> float:
-    """Depth from which on points of the camera's space are looked at."""
-    return 1e-6 * max(float(np.abs(points).max()), 1e-12)
-
-
-def _in_front(outline: Outline, pose: Pose) -> FloatArray:
-    """Corners of what is left of an outline, in the camera's space, when what is behind the camera is cut off."""
-    points = pose.apply(outline.corners)
-    near = _nearest(points)
-    if points[:, 2].min() >= near:
-        return points
-    forward = np.array([0.0, 0.0, 1.0])
-    return np.concatenate([_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons])

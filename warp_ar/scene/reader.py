@@ -21,6 +21,7 @@ from typing import Any, Final, NoReturn, TypeVar, cast
 import cv2
 
 from warp_ar.errors import SceneError
+from warp_ar.files import bracket_depth, check_depth, is_file, read_text
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
     RGB,
@@ -46,8 +47,8 @@ from warp_ar.scene.description import (
     SourceSpec,
     Vec3,
 )
-from warp_ar.scene.geometry import MESH_SUFFIXES
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
 
 _TOP_KEYS: Final = ("schema", "name")
@@ -60,6 +61,10 @@ _BOARDS: Final = (
 )
 
 _DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
+
+_MOST_DOTS: Final = 16
+_PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{_MOST_DOTS}}}")
 
 _T = TypeVar("_T")
 
@@ -179,7 +184,7 @@ class _Table:
 
     def file(self, key: str, right: str) -> Path:
         path = self.resolve(key, right)
-        if not path.is_file():
+        if not is_file(path):
             self.fail(key, f"no such file: {path}")
         return path
 
@@ -230,7 +235,7 @@ def _read_transfer(table: _Table) -> str | Path:
             table.fail("transfer", 'expected a gamma from 0.1 to 10, such as "gamma:2.2"')
         return value
     path = table.resolve("transfer", _TRANSFERS)
-    if not path.is_file():
+    if not is_file(path):
         table.fail("transfer", f"expected {_TRANSFERS}; no such file: {path}")
     return path
 
@@ -447,23 +452,21 @@ def load_scene(path_or_name: str | Path) -> Scene:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
     """
     path = Path(path_or_name)
-    try:
-        found = path.is_file()
-    except (OSError, ValueError):  # too long, or a zero byte
-        found = False
-    if not found:
+    if not is_file(path):
         bundled = bundled_scenes()
         if str(path_or_name) not in bundled:
             hint = f"a file, or a bundled scene ({nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
         path = bundled[str(path_or_name)]
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not a text file in UTF-8 (byte {error.start}); expected TOML") from error
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}") from error
-    return loads_scene(text, path)
+    return loads_scene(read_text(path, SceneError, expected="TOML"), path)
+
+
+def _check_dots(text: str, label: str) -> None:
+    """Complain about dotted keys of many parts, each of which is a table in a table: TOML's reader takes long."""
+    match = _MANY_DOTS.search(text)
+    if match is not None:
+        line = text.count("\n", 0, match.start()) + 1
+        raise SceneError(f"{label}: line {line}: a key of more than {_MOST_DOTS} parts; the longest here has 3")
 
 
 def loads_scene(text: str, path: str | Path | None = None) -> Scene:
@@ -480,6 +483,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     path = None if path is None else Path(path)
     label = "scene" if path is None else str(path)
     folder = Path.cwd() if path is None else path.parent.resolve()
+    check_depth(bracket_depth(text), label, SceneError)
+    _check_dots(text, label)
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: TOMLDecodeError, and integers of too many digits

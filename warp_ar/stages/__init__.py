@@ -7,18 +7,18 @@ from warp_ar.stages.base import Stage
 from warp_ar.stages.bracket import Bracket
 from warp_ar.stages.composite import Composite
 from warp_ar.stages.declip import Declip
-from warp_ar.stages.diffuse import Diffuse
 from warp_ar.stages.environment_samples import EnvironmentSamples
 from warp_ar.stages.environment_shadow import EnvironmentShadow
 from warp_ar.stages.expose import Expose
 from warp_ar.stages.fill import Fill
+from warp_ar.stages.irradiance import Irradiance
 from warp_ar.stages.key_lights import KeyLights
 from warp_ar.stages.mirror_ball import MirrorBall
-from warp_ar.stages.object_light import ObjectLight
+from warp_ar.stages.near_field import NearField
+from warp_ar.stages.prefilter import Prefilter
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.relight import Relight
 from warp_ar.stages.shade import Shade
-from warp_ar.stages.specular import Specular
 from warp_ar.stages.summed_area import SummedArea
 from warp_ar.stages.unwrap import Unwrap
 from warp_ar.stages.visibility import Visibility
@@ -30,14 +30,14 @@ STAGES: tuple[type[Stage], ...] = (
     Fill,
     Recover,
     KeyLights,
-    Diffuse,
-    Specular,
+    Irradiance,
+    Prefilter,
     Visibility,
     SummedArea,
     EnvironmentSamples,
     Relight,
     EnvironmentShadow,
-    ObjectLight,
+    NearField,
     Shade,
     MirrorBall,
     Composite,

@@ -1,8 +1,11 @@
 """What a stage is: what it reads and writes, the methods it has, and the passes that do its work.
 
-A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the scene and the quality alone,
+A stage has two lives. While a plan is made, only its class speaks: ``wire`` says, from the request's features alone,
 what it would read and write, or why the scene does not call for it. Nothing of Warp is touched then. When a pipeline is
 built, ``build`` turns a wired stage into passes over arrays that have been allocated from what ``arrays`` declared.
+
+All that is to be known of a stage stands in its class: its methods with what tables say of them, how precisely it
+computes, which settings of ``Quality`` it shares with others. Stages know the features, never each other.
 """
 
 from __future__ import annotations
@@ -12,28 +15,9 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
-from warp_ar.scene import Scene
-from warp_ar.stages.quality import Quality
+from warp_ar.stages.features import Features
 
 Rows = tuple[int, int]
-
-
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """What a plan is made for; equal requests give equal plans."""
-
-    scene: Scene
-    """What the user wants to see."""
-    quality: Quality
-    """The method of every stage, and its numbers."""
-    size: tuple[int, int]
-    """Width and height of the frames in pixels."""
-    outputs: tuple[str, ...] = ("image",)
-    """Names of the resources that the caller wants: ``image``, ``environment``, ``pose``."""
-    exposures: tuple[float, ...] = ()
-    """Exposures between which frames alternate, as ratios to the longest, which comes first; empty: only one."""
-    waits: bool = False
-    """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +58,38 @@ class Pass:
     extent: Callable[[], Rows] | None = None
     """Rows that matter in this frame, asked on CPU before splitting; None means all."""
     on_host: bool = False
-    """Works on the host between launches: it cannot be part of a captured graph, which is cut where it is due."""
-    due: Callable[[], bool] | None = None
+    """Works on the host between launches: it cannot be part of a captured graph, which is cut where it is enabled."""
+    enabled: Callable[[], bool] | None = None
     """Whether the pass takes part in this frame, asked once, after ``Stage.begin``; None means always."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Numerics:
+    """What to expect of a stage's numbers.
+
+    Errors are those of float32 arithmetic alone, over the largest value of the output, or in 8-bit codes: what a method
+    leaves out (the distance of an emitter, the lobes of an order-2 series) is the cost table's matter.
+    """
+
+    precision: str
+    """What it computes in."""
+    bound: float
+    """Worst error by analysis; tests check it wherever a float64 twin exists."""
+    cause: str
+    """Where that error comes from."""
+    measured: float
+    """Worst error against a float64 twin on CPU; in a checkout ``python -m tests.hard_cases.measure_errors`` measures
+    it anew."""
+    rows: tuple[int, ...]
+    """Rows of the atlas of hard cases that concern it."""
+    codes: bool = False
+    """Whether errors are in 8-bit codes."""
+
+    @property
+    def expected(self) -> str:
+        """Bound and cause, as ``explain`` prints them."""
+        bound = f"{self.bound:g} codes" if self.codes else f"{self.bound:.0e}"
+        return f"{bound}: {self.cause}"
 
 
 class Arrays(Mapping[str, Any]):
@@ -115,31 +128,57 @@ class Arrays(Mapping[str, Any]):
         return tuple(map(self._versions.__getitem__, names))
 
 
+NO_BALL = "the scene has no mirror ball, so the environment is unknown"
+NO_OBJECT = "the scene has no virtual object"
+"""Reasons that several stages give."""
+
+
 class Stage(abc.ABC):
     """One step on the way of a frame."""
 
     name: ClassVar[str]
     """As in reports and in ``Quality``."""
-    methods: ClassVar[tuple[str, ...]]
-    """Ways to do the work, cheapest first."""
+    methods: ClassVar[Mapping[str, str]] = {"default": ""}
+    """Ways to do the work, cheapest first, and what tables say of each."""
     summary: ClassVar[str]
     """What it does, in one line for ``explain``."""
+    subject: ClassVar[str] = ""
+    """What its methods are about, for tables; only where there is a choice."""
+    unread: ClassVar[str] = ""
+    """Why a plan can do without it where nothing reads what it writes."""
+    converges: ClassVar[bool] = False
+    """Whether its methods approximate one result, which the last of them gives; others are models of their own."""
+    numerics: ClassVar[Numerics]
+    """How precisely it computes."""
+    settings: ClassVar[tuple[str, ...]] = ()
+    """Settings of ``Quality`` that it shares with other stages and that change its work: ``environment_height``,
+    ``edge_samples``, ``light_shadow``."""
+    unseen_method: ClassVar[str | None] = None
+    """Method for frames that nobody looks at, where the stage only shows the light; None: as in all frames."""
     remembers: ClassVar[tuple[str, ...]] = ()
     """Its arrays that carry over from frame to frame, and so to the pipeline of another quality."""
 
-    def __init__(self, request: Request, wiring: Wiring) -> None:
-        self.request = request
-        self.wiring = wiring
+    def __init__(self, features: Features, wiring: Wiring) -> None:
+        self.features, self.wiring = features, wiring
+        self.request = features.request
+
+    @classmethod
+    def method_for(cls, features: Features) -> str:
+        """Method on which the stage runs: the quality's, unless the scene leaves no choice."""
+        return features.request.quality.method(cls.name)
 
     @property
     def method(self) -> str:
-        """The method that the quality picks."""
-        return self.request.quality.method(self.name)
+        """Method of this stage."""
+        return self.method_for(self.features)
 
     @classmethod
     @abc.abstractmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Say what the stage would read and write for ``request``, or why the scene does not call for it."""
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Say what the stage would read and write, or why the scene does not call for it.
+
+        Whether anything reads what it writes is not asked here: a stage that nothing reads is dropped from the plan.
+        """
 
     @abc.abstractmethod
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -156,7 +195,7 @@ class Stage(abc.ABC):
         """Kernels that its steps on the host launch: they are compiled with the others."""
         return ()
 
-    def gives_way(self) -> tuple[str, ...]:
+    def runs_after(self) -> tuple[str, ...]:
         """Names of stages that are slower beside this one than before it: on CUDA it waits for them.
 
         For a stage that nobody waits for before those are done, and that fills the device by itself.

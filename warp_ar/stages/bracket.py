@@ -9,30 +9,34 @@ import warp as wp
 
 from warp_ar.kernels import bracket as kernels
 from warp_ar.kernels.launch import copy
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.recover import recovers
-from warp_ar.stages.unwrap import NO_PROBE
-
-UNWRAPPED = ("radiance", "confidence", "clipped")
-"""What unwrapping a frame gives; arrays are named ``probe_*``, those of all exposures ``bracket_*``."""
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.probe_maps import UNWRAPPED
 
 
 class Bracket(Stage):
     """The latest frame of every exposure, merged; frames of shorter exposures come in through ``ShortFrames``."""
 
     name: ClassVar[str] = "bracket"
-    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
+    unread: ClassVar[str] = "nothing asks for the environment"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; running means",
+        bound=2e-6,
+        cause="a dozen roundings of weights and means",
+        measured=3e-08,
+        rows=(4, 6, 7, 17, 18),
+    )
     remembers: ClassVar[tuple[str, ...]] = tuple(f"bracket_{part}" for part in UNWRAPPED)
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball, and a source whose frames alternate between exposures."""
-        if not request.scene.probes:
-            return LeftOut(NO_PROBE)
-        if len(request.exposures) < 2:
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        if len(features.request.exposures) < 2:
             return LeftOut("the source tells of no alternating exposures")
-        if not recovers(request):
+        if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             (*(f"probe_{part}" for part in UNWRAPPED), "short_frames"), tuple(f"merged_{part}" for part in UNWRAPPED)
@@ -78,8 +82,3 @@ class Bracket(Stage):
             )
 
         return [Pass(store), Pass(spread, rows=height), Pass(merge, rows=height)]
-
-
-def merges(request: Request) -> bool:
-    """Whether exposures are merged for ``request``."""
-    return isinstance(Bracket.wire(request), Wiring)

@@ -9,25 +9,30 @@ import warp as wp
 
 from warp_ar.kernels import declip
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import exposes
-from warp_ar.stages.recover import recovers
-from warp_ar.stages.variants import trace_variant
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Declip(Stage):
     """Estimates radiance above clipping, which another exposure shows; its methods are those of ``expose``."""
 
     name: ClassVar[str] = "declip"
-    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "estimates how bright clipped pixels were, by hue, depth and the ball"
+    unread: ClassVar[str] = "nothing asks how bright clipped pixels were"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; sums of sums over a pyramid",
+        bound=2e-5,
+        cause="sums over ten levels, and a power",
+        measured=1.9e-07,
+        rows=(1, 2, 5, 6, 12, 13, 14, 17),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Wired where a shorter exposure is asked for at a method that looks above clipping."""
-        if not declips(request):
-            return LeftOut("no shorter exposure asks how bright clipped pixels were")
-        return Wiring(("frame", "pose", "environment") if asks_ball(request) else ("frame",), ("declipped",))
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Reads the ball's light too where the exposure's method asks for it."""
+        reads = ("frame", "pose", "environment") if features.declipped_by_ball else ("frame",)
+        return Wiring(reads, ("declipped",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The frame's radiance near what clips, tiles that say where that is, and a pyramid of hues."""
@@ -41,10 +46,9 @@ class Declip(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Twice up and down the pyramid: for pixels that clip in some channels, then for those that clip in all."""
-        ball = asks_ball(self.request)
-        config = declip.DeclipConfig(
-            ball, trace_variant(trace_config(self.request.scene), device).proxies if ball else ()
-        )
+        ball = self.features.declipped_by_ball
+        kinds = trace_variant(trace_config(self.request.scene), device).proxies
+        config = declip.DeclipConfig(ball, kinds if ball else ())
         declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
         marked, active = arrays["declip_marked"], arrays["declip_active"]
@@ -75,15 +79,3 @@ class Declip(Stage):
             Pass(lambda rows: declip.fill_levels(active, shape, levels)),
             Pass(core, rows=shape[0]),
         ]
-
-
-def declips(request: Request) -> bool:
-    """Whether clipped pixels are to be estimated: only a shorter exposure shows them."""
-    scale = request.scene.exposure.scale
-    shorter = isinstance(scale, str) or scale < 1.0
-    return exposes(request) and shorter and request.quality.method("expose") in ("glow", "ball")
-
-
-def asks_ball(request: Request) -> bool:
-    """Whether the ball's light says more: only with the energy put back that clipping took there too."""
-    return request.quality.method("expose") == "ball" and bool(request.scene.probes) and recovers(request)

@@ -3,41 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import exposure
+from warp_ar.kernels import expose
 from warp_ar.kernels.codes import by_warps
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.composite import composite_config, exposes, layer_names, layers_of
-from warp_ar.stages.declip import declips
-from warp_ar.stages.variants import composite_variant
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.layers import composite_config, layers_of
+from warp_ar.stages.shared.variants import composite_variant
 
 
 class Expose(Stage):
     """Composes the picture and scales its light, over-exposed regions by what they are guessed to have been."""
 
-    name = "expose"
-    methods = ("plain", "box", "glow", "ball")
-    remembers = ("expose_scale",)
-    summary = "another exposure: over-exposed regions keep what they can be guessed to have had"
+    name: ClassVar[str] = "expose"
+    methods: ClassVar[Mapping[str, str]] = {
+        "plain": "scaled",
+        "box": "scaled less where surroundings clip too (the paper)",
+        "glow": "from the glow around them",
+        "ball": "from the glow and the ball's view of the same lamp",
+    }
+    remembers: ClassVar[tuple[str, ...]] = ("expose_scale",)
+    summary: ClassVar[str] = "another exposure: over-exposed regions keep what they can be guessed to have had"
+    subject: ClassVar[str] = "clipped pixels at a shorter exposure"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32 to 8-bit codes by exact thresholds",
+        bound=0.501,
+        cause="rounding to codes; exposure 1 to the bit",
+        measured=0.5,
+        rows=(6, 7, 11, 12, 17),
+        codes=True,
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Reads the layers, and what its method knows of clipped pixels."""
-        if not exposes(request):
-            return LeftOut(
-                "exposure is 1"
-                if request.scene.exposure.scale == 1.0
-                else "exposure is auto and no virtual light falls"
-            )
-        reads = ["frame", "exposure", *layer_names(request)]
-        if request.scene.exposure.scale == "auto":
+        scale = features.request.scene.exposure.scale
+        if not features.exposed:
+            return LeftOut("exposure is 1" if scale == 1.0 else "exposure is auto and no virtual light falls")
+        reads = ["frame", "exposure", *features.layers]
+        if scale == "auto":
             reads.append("clock")
-        if uses_table(request):
+        if features.boxed:
             reads.append("summed_area")
-        if declips(request):
+        if features.declipped:
             reads.append("declipped")
         return Wiring(tuple(reads), ("image",))
 
@@ -50,17 +61,17 @@ class Expose(Stage):
             "expose_codes": ArraySpec((256,), wp.vec3ub),
         }
         if self.request.scene.exposure.scale == "auto":
-            strips = -(-height // exposure.AUTO_STRIDE)
-            specs["expose_levels"] = ArraySpec((strips, exposure.LEVELS), wp.int32)
+            strips = -(-height // expose.AUTO_STRIDE)
+            specs["expose_levels"] = ArraySpec((strips, expose.LEVELS), wp.int32)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        composed = composite_variant(composite_config(layer_names(self.request)), device)
-        config = exposure.ExposureConfig(
-            "box" if uses_table(self.request) else "declipped" if declips(self.request) else "plain", composed
+        composed = composite_variant(composite_config(self.features.layers), device)
+        config = expose.ExposeConfig(
+            "box" if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
         )
-        exposure.make_expose_kernel(config, by_warps(device, self.request.size[0]))
+        expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         layers = layers_of(arrays)
@@ -69,16 +80,16 @@ class Expose(Stage):
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                exposure.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
+                expose.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
-            passes.append(Pass(lambda rows: exposure.adapt_scale(params, levels, scale)))
+            passes.append(Pass(lambda rows: expose.adapt_scale(params, levels, scale)))
         else:
-            passes.append(Pass(lambda rows: exposure.read_scale(params, scale)))
-        passes.append(Pass(lambda rows: exposure.expose_codes(decode, encode, scale, codes)))
+            passes.append(Pass(lambda rows: expose.read_scale(params, scale)))
+        passes.append(Pass(lambda rows: expose.expose_codes(decode, encode, scale, codes)))
 
         def launch(rows: Rows | None) -> None:
-            exposure.expose(
+            expose.expose(
                 config,
                 params,
                 frame,
@@ -95,9 +106,3 @@ class Expose(Stage):
 
         passes.append(Pass(launch, rows=self.request.size[1]))
         return passes
-
-
-def uses_table(request: Request) -> bool:
-    """Whether darkening looks at a pixel's surroundings: only the box does, and only where light is taken away."""
-    scale = request.scene.exposure.scale
-    return exposes(request) and request.quality.method("expose") == "box" and (isinstance(scale, str) or scale < 1.0)

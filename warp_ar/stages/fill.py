@@ -8,26 +8,32 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import environment
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.bracket import merges
-from warp_ar.stages.recover import recovers
-from warp_ar.stages.unwrap import NO_PROBE
+from warp_ar.kernels import change, fill
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
 
 
 class Fill(Stage):
     """The complete map: what everything downstream reads, or what ``recover`` starts from."""
 
     name: ClassVar[str] = "fill"
-    methods: ClassVar[tuple[str, ...]] = ("default",)
     summary: ClassVar[str] = "completes the blind cone and hidden parts from confident neighbours"
+    unread: ClassVar[str] = "nothing asks for the environment"
+    settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; running means, normalised",
+        bound=1e-5,
+        cause="one rounding a level and texel",
+        measured=4.8e-07,
+        rows=(3, 4, 6, 17, 18),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not request.scene.probes:
-            return LeftOut(NO_PROBE)
-        written = "filled_radiance" if recovers(request) else "environment"
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        written = "filled_radiance" if features.recovered else "environment"
         return Wiring(("environment_radiance", "environment_confidence"), (written,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -36,7 +42,7 @@ class Fill(Stage):
         shape = (height, 2 * height)
         return {
             self.wiring.writes[0]: ArraySpec(shape, wp.vec3),
-            "fill_levels": ArraySpec((environment.fill_level_offsets(*shape)[-1],), wp.vec4),
+            "fill_levels": ArraySpec((fill.fill_level_offsets(*shape)[-1],), wp.vec4),
             "fill_published": ArraySpec(shape, wp.vec3),
             "fill_difference": ArraySpec((height,), wp.float32),
         }
@@ -48,22 +54,22 @@ class Fill(Stage):
         height = self.request.quality.environment_height
         # What one exposure gives is no more than this. Of merged ones, lamps are spread into the unseen no further.
         most = math.inf
-        if merges(self.request):
+        if self.features.merged:
             most = 1.0 / max(min(min(probe.reflectance) for probe in self.request.scene.probes), 1e-3)
 
         def seed(rows: Rows | None) -> None:
-            environment.seed_fill(
+            fill.seed_fill(
                 arrays["environment_radiance"], arrays["environment_confidence"], arrays["fill_levels"], rows=rows
             )
 
         def push_pull(rows: Rows | None) -> None:
-            environment.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
+            fill.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
 
         def finish(rows: Rows | None) -> None:
-            environment.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
+            fill.finish_fill(arrays["fill_levels"], arrays[self.wiring.writes[0]], rows=rows)
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_difference(
+            change.measure_difference(
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 

@@ -42,8 +42,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "paper",
                 64,
                 4,
-                diffuse="top_mip",
-                specular="box_mip",
+                irradiance="top_mip",
+                prefilter="box_mip",
                 relight="relief",
                 recover="clipped",
                 environment_shadow="none",
@@ -55,8 +55,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "low",
                 64,
                 4,
-                diffuse="clusters",
-                specular="energy_mip",
+                irradiance="clusters",
+                prefilter="energy_mip",
                 light_shadow="hard",
                 relight="reflectance",
                 recover="white_card",
@@ -69,8 +69,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "medium",
                 64,
                 4,
-                diffuse="clusters",
-                specular="energy_mip",
+                irradiance="clusters",
+                prefilter="energy_mip",
                 light_shadow="soft",
                 relight="reflectance",
                 recover="shading",
@@ -83,8 +83,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "high",
                 128,
                 16,
-                diffuse="clusters",
-                specular="energy_mip",
+                irradiance="clusters",
+                prefilter="energy_mip",
                 light_shadow="soft",
                 relight="bounce",
                 recover="shading",
@@ -97,8 +97,8 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "reference",
                 256,
                 16,
-                diffuse="brute_force",
-                specular="fis128",
+                irradiance="brute_force",
+                prefilter="fis128",
                 light_shadow="soft",
                 relight="brute_force",
                 recover="shading",
@@ -113,7 +113,7 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
 DEFAULT_PRESET = "medium"
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
 """Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included. A preset errs
-least by the cost table within ``SHARE`` of its budget: docs/costs.md gives the rule and what departs from it,
+least by the cost table within ``SHARE`` of its budget: docs/accuracy.md gives the rule and what departs from it,
 ``python -m bench.write_cost_tables`` applies it. ``paper`` is the paper's method, ``reference`` the last methods that
 end within a lifetime: neither has a budget."""
 SHARE = 0.8

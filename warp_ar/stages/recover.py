@@ -11,15 +11,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.kernels import environment
+from warp_ar.kernels import change
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
+from warp_ar.light.config import CONFIG
+from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.host_copies import HostCopies
-from warp_ar.stages.unwrap import NO_PROBE
-from warp_ar.stages.variants import trace_variant
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.host_copies import HostCopies
+from warp_ar.stages.shared.variants import trace_variant
 
 EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
@@ -29,7 +31,7 @@ LATENCY = 0.1
 """Seconds, by the frames' clock, after which an estimate takes effect, unless the request is to wait for it: it is
 solved for beside them. They are fixed, so that the same frames give the same pictures; where it is not solved for in
 time, the frame waits."""
-MOST_LAMPS = recovery.MOST_CANDIDATES * len(recovery.DISTANCES)
+MOST_LAMPS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
 @dataclasses.dataclass
@@ -63,20 +65,34 @@ class Recover(Stage):
     """
 
     name: ClassVar[str] = "recover"
-    methods: ClassVar[tuple[str, ...]] = recovery.METHODS
+    methods: ClassVar[Mapping[str, str]] = {
+        "clipped": "as the camera saw it (the paper)",
+        "white_card": "scaled until it lights the white card as brightly as the frame shows",
+        "shading": "shared among lamps as shading and shadows in the frame tell",
+    }
     summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
+    subject: ClassVar[str] = "light that clips in the ball"
+    unread: ClassVar[str] = "nothing asks for the environment"
+    settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32 transfer, float64 solution",
+        bound=6e-4,
+        cause="three steps of the search for the mirroring point",
+        measured=0.00016,
+        rows=(1, 3, 4, 5, 6, 7, 12, 13, 14, 17, 18),
+    )
     remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "recover_cells", "lamps")
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball and a method that does something."""
-        if not request.scene.probes:
-            return LeftOut(NO_PROBE)
-        if not recovers(request):
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
-            ("environment", "lamps") if request.quality.method(cls.name) == "shading" else ("environment",),
+            ("environment", "lamps") if features.emitters else ("environment",),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -84,11 +100,11 @@ class Recover(Stage):
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
         cells = kernels.cell_shape(*shape)
-        self._surfaces = recovery.find_surfaces(self.request.scene, card_only=self.method == "white_card")
+        self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
-            **{name: ArraySpec((recovery.PEAKS,), Emitter) for name in self.wiring.writes if name == "lamps"},
+            **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "lamps"},
             "recover_excess": ArraySpec(cells, wp.vec3),
             "recover_lacking": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
@@ -108,8 +124,8 @@ class Recover(Stage):
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         scene = self.request.scene
         height = self.request.quality.environment_height
-        self._arrays, self._device = arrays, device
         proxies = self._proxies = trace_variant(trace_config(scene), device).proxies
+        self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
         ball = scene.probes[0]
         solver = recovery.Recovery(
@@ -188,17 +204,17 @@ class Recover(Stage):
             )
 
         def measure(rows: Rows | None) -> None:
-            environment.measure_difference(
+            change.measure_difference(
                 arrays["environment"], arrays["recover_published"], arrays["recover_difference"], rows=rows
             )
 
         passes = [
-            Pass(self._take, on_host=True, due=lambda: self._arrives),
+            Pass(self._take, on_host=True, enabled=lambda: self._arrives),
             Pass(weigh, rows=height),
-            Pass(condense, rows=cells.shape[0], due=lambda: self._asks),
-            Pass(observe, rows=points, due=lambda: self._asks),
-            Pass(transfer, rows=points, due=lambda: self._asks),
-            Pass(self._ask, on_host=True, due=lambda: self._asks),
+            Pass(condense, rows=cells.shape[0], enabled=lambda: self._asks),
+            Pass(observe, rows=points, enabled=lambda: self._asks),
+            Pass(transfer, rows=points, enabled=lambda: self._asks),
+            Pass(self._ask, on_host=True, enabled=lambda: self._asks),
             Pass(add, rows=cells.shape[0]),
         ]
         return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
@@ -230,7 +246,7 @@ class Recover(Stage):
 
     def _at_once(self) -> bool:
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
-        return self.request.waits or self._progress.frames <= EVERY_FRAME
+        return self.request.synchronous or self._progress.frames <= EVERY_FRAME
 
     def _solve(self, solver: recovery.Recovery) -> _Solution | None:
         """In the worker. Nothing writes the equations before this is done: it takes effect before the next begins."""
@@ -281,7 +297,7 @@ class Recover(Stage):
         now.estimate = solution.estimate
         values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
         if "lamps" in self.wiring.writes:
-            records = np.zeros(recovery.PEAKS, np.dtype(Emitter.numpy_dtype()))
+            records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
             for record, lamp in zip(records, solution.estimate.lamps, strict=False):
                 record["origin"], record["direction"] = lamp.origin, lamp.direction
                 record["distance"], record["power"] = lamp.distance, lamp.power
@@ -326,14 +342,3 @@ class Recover(Stage):
             for lamp in estimate.lamps
         ]
         return {"lower_bound": list(estimate.lower_bound), "lamps": lamps}
-
-
-def recovers(request: Request) -> bool:
-    """Whether the quality asks for recovery."""
-    return request.quality.method("recover") not in ("default", "clipped")
-
-
-def knows_emitters(request: Request) -> bool:
-    """Whether a stage finds lamps at a distance: a resource ``lamps`` of ``Emitter``."""
-    wiring = Recover.wire(request)
-    return isinstance(wiring, Wiring) and "lamps" in wiring.writes

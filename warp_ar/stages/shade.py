@@ -3,67 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.reflect import DistantLightConfig
-from warp_ar.kernels.shade import ShadeConfig, shade
-from warp_ar.scene.ray_scene import has_sized_lights, light_kind
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.reflect import distant_light_arrays, distant_light_config, distant_light_reads, make_distant_light
-from warp_ar.stages.variants import shade_variant
-from warp_ar.stages.visibility import GrowingRows
-
-
-def shade_config(request: Request) -> ShadeConfig:
-    """What the shading of a request's objects calls for."""
-    scene = request.scene
-    return ShadeConfig(
-        distant=distant_light_config(request),
-        lights=tuple(sorted({light_kind(light) for light in scene.lights})),
-        edge_samples=request.quality.edge_samples,
-        soft=casts_soft(request),
-        near=bool(scene.probes) and sees_near(request),
-    )
-
-
-def casts_soft(request: Request) -> bool:
-    """Whether sized virtual lights cast soft shadows: ``light_shadow`` names a way of two stages, hard or soft."""
-    return request.quality.method("light_shadow") == "soft" and has_sized_lights(request.scene)
-
-
-def sees_near(request: Request) -> bool:
-    """Whether the quality asks for what surrounds the objects at close range."""
-    return request.quality.method("shade") == "one_bounce"
-
-
-def near_names(config: DistantLightConfig) -> tuple[str, ...]:
-    """Resources of what surrounds the objects, those that their materials show."""
-    diffuse = () if config.diffuse == "none" else ("object_irradiance",)
-    return (*diffuse, "object_mirrored") if config.specular else diffuse
+from warp_ar.kernels.shade import shade
+from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
+from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.shading import shade_config
+from warp_ar.stages.shared.variants import shade_variant
 
 
 class Shade(Stage):
     """Radiance and coverage of virtual objects, with smooth edges."""
 
-    name = "shade"
-    methods = ("environment", "one_bounce")
-    summary = "shade virtual objects by the environment and virtual lights, shadowed and anti-aliased"
+    name: ClassVar[str] = "shade"
+    methods: ClassVar[Mapping[str, str]] = {
+        "environment": "the environment (the paper)",
+        "one_bounce": "the environment, the desk and each other",
+    }
+    summary: ClassVar[str] = "shade virtual objects by the environment and virtual lights, shadowed and anti-aliased"
+    subject: ClassVar[str] = "what virtual objects reflect"
+    settings: ClassVar[tuple[str, ...]] = (
+        "edge_samples",
+        "light_shadow",
+    )
+    unseen_method: ClassVar[str | None] = "environment"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; log1p for exponents, cross products for peaks",
+        bound=1e-4,
+        cause="1e-7 of an angle, to the power of 1e5",
+        measured=4.1e-07,
+        rows=(5, 6, 8, 9, 13, 14, 17, 18),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Reads only the forms of light that its materials reflect."""
-        if not request.scene.objects:
-            return LeftOut("the scene has no virtual object")
-        config = shade_config(request)
+        if not features.request.scene.objects:
+            return LeftOut(NO_OBJECT)
+        config = shade_config(features)
         reads = ["pose", "objects", "hit_object", "hits"]
         if config.lights:
             reads.append("lights")
-        reads += distant_light_reads(config.distant)
+        reads += distant_light_reads(features)
         if config.near:
-            reads += near_names(config.distant)
+            reads += features.near_names
         return Wiring(tuple(reads), ("virtual",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -72,20 +60,20 @@ class Shade(Stage):
         return {
             "virtual": ArraySpec((height, width), wp.vec4),
             **edge_arrays(self.request, self.name),
-            **distant_light_arrays(distant_light_config(self.request), self.name),
+            **distant_light_arrays(self.features, self.name),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
-        config = shade_config(self.request)
-        variant = shade_variant(config, self.request, device)
+        config = shade_config(self.features)
+        variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)
         inputs = (
             arrays["params"],
             arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
-            make_distant_light(config.distant, self.request, arrays, self.name),
+            make_distant_light(self.features, arrays, self.name),
             arrays["hit_object"],
             arrays["hits"],
         )

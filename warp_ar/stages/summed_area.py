@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels import summed_area
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Stage, Wiring
-from warp_ar.stages.composite import layer_names
-from warp_ar.stages.expose import uses_table
-from warp_ar.stages.relight import relight_method
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
 
 
 class SummedArea(Stage):
     """Sums the frame's intensity so that any box's mean costs four look-ups."""
 
-    name = "summed_area"
-    methods = ("default",)
-    summary = "summed-area table of the frame: means over boxes of any size"
+    name: ClassVar[str] = "summed_area"
+    summary: ClassVar[str] = "summed-area table of the frame: means over boxes of any size"
+    unread: ClassVar[str] = "neither relighting nor the exposure looks at means of a pixel's surroundings"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="uint32 modulo 2^32",
+        bound=0.0,
+        cause="exact for boxes of up to 2^32 / 255 pixels",
+        measured=0,
+        rows=(6, 11, 12, 17),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
-        """Wired for darkening by the paper's box, and for relief against its surroundings."""
-        lit = "physical_added" in layer_names(request)
-        relief = lit and relight_method(request) not in ("flat", "paper")
-        if not uses_table(request) and not relief:
-            return LeftOut("the exposure is not lowered and no virtual light needs the desk's relief")
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Reads the frame alone."""
         return Wiring(("frame",), ("summed_area",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -2,47 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Request, Rows, Stage, Wiring
-from warp_ar.stages.variants import trace_variant
-
-
-class GrowingRows:
-    """Rows of this frame and of the one before: what moved away must be cleared from where it was."""
-
-    def __init__(self, current: Callable[[], Rows]) -> None:
-        self._current = current
-        self._previous: Rows = (0, 0)
-
-    def __call__(self) -> Rows:
-        """Rows to run over; asked once per frame."""
-        rows, previous = self._current(), self._previous
-        self._previous = rows
-        if previous[0] >= previous[1]:
-            return rows
-        if rows[0] >= rows[1]:
-            return previous
-        return min(rows[0], previous[0]), max(rows[1], previous[1])
+from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Visibility(Stage):
     """Traces primary rays, only where virtual objects can be on screen."""
 
-    name = "visibility"
-    methods = ("default",)
-    summary = "trace which virtual object each pixel sees, hidden by proxies in front"
+    name: ClassVar[str] = "visibility"
+    summary: ClassVar[str] = "trace which virtual object each pixel sees, hidden by proxies in front"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; error bound carried with every hit",
+        bound=3e-5,
+        cause="twenty roundings at a grazing angle of 3 degrees",
+        measured=4.6e-07,
+        rows=(5, 13, 14, 17),
+    )
 
     @classmethod
-    def wire(cls, request: Request) -> Wiring | LeftOut:
+    def wire(cls, features: Features) -> Wiring | LeftOut:
         """Left out of scenes without virtual objects."""
-        if not request.scene.objects:
-            return LeftOut("the scene has no virtual object")
+        if not features.request.scene.objects:
+            return LeftOut(NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hit_depth", "hits"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:

@@ -24,12 +24,12 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.geometry import load_mesh
+from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.viewer.protocol import EFFECTS
 
-MOST_THINGS: Final = 16
+MOST_PARTS: Final = 16
 """Objects or lights in a scene that the page may add to."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
@@ -134,8 +134,8 @@ def _material(material: Material, key: str, value: Any) -> Material:
 def add_part(scene: Scene, part: str, kind: str) -> Scene:
     """The scene with a new object or light of ``kind``."""
     items = getattr(scene, _LISTS[part])
-    if len(items) >= MOST_THINGS:
-        raise UsageError(f"{len(items)} are on the desk already; {MOST_THINGS} at most: take one away first")
+    if len(items) >= MOST_PARTS:
+        raise UsageError(f"{len(items)} are in the scene already; {MOST_PARTS} at most: take one away first")
     return _with_list(scene, part, (*items, _NEW[kind]))
 
 
@@ -174,8 +174,8 @@ class Wanted:
             scene,
             objects=seen("object", "objects"),
             lights=seen("light", "lights"),
-            probes=seen("probe", "room"),
-            proxies=seen("proxy", "desk"),
+            probes=seen("probe", "environment"),
+            proxies=seen("proxy", "receiver"),
             exposure=Exposure() if "exposure" in self.off else scene.exposure,
         )
 
@@ -192,6 +192,11 @@ class Wanted:
         """With one object or light removed; what is hidden stays hidden."""
         hidden = {(t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index)}
         return dataclasses.replace(self, scene=remove_part(self.scene, part, index), hidden=frozenset(hidden))
+
+    def with_part_shown(self, part: str, index: int, on: bool) -> Wanted:
+        """With one object or light shown or hidden."""
+        item = {(part, index)}
+        return dataclasses.replace(self, hidden=self.hidden - item if on else self.hidden | item)
 
     def with_method(self, stage: str, method: str) -> Wanted:
         """With a stage on another method than the preset's; an empty name goes back.
@@ -242,7 +247,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 
 
 def _reach(item: Object) -> float:
-    """Radius in metres of a circle on the desk around an object, about its size."""
+    """Radius in metres of a circle on the ground around an object, about its size."""
     if item.shape == "mesh":
         assert item.file is not None
         return item.scale * _mesh_reach(item.file)

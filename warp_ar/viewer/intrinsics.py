@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.input.tracking import MarkerDetector
+from warp_ar.input.markers import MarkerDetector
 from warp_ar.scene import Camera, Marker
 
 DEFAULT_FIELD_OF_VIEW: Final = 60.0

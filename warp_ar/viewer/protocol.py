@@ -26,9 +26,9 @@ MAX_PICTURE: Final = 1 << 20
 SMALLEST_CAMERA: Final = (64, 48)
 LARGEST_CAMERA: Final = (1920, 1080)
 
-EFFECTS: Final = ("objects", "lights", "room", "desk", "exposure", "relief", "environment_shadow")
+EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "relief", "environment_shadow")
 """What the page can switch off."""
-THINGS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
+PARTS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
 """What of a scene the page can edit."""
 KINDS: Final = {"object": ("sphere", "box", "torus"), "light": ("point", "spot", "directional")}
 """What the page can add. Meshes are files, and the page names no file."""
@@ -64,7 +64,7 @@ class Set:
 
 @dataclasses.dataclass(frozen=True)
 class Add:
-    """Put something new on the desk."""
+    """Put something new into the scene."""
 
     part: str
     kind: str
@@ -262,7 +262,7 @@ _ID = _integer(0, 1 << 53)
 _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callable[[Any], Any]]]]] = {
     "ack": (Ack, {"id": _ID}),
     "ping": (Ping, {"sent": _number(0.0, 1e15)}),
-    "set": (Set, {"part": _choice(*THINGS), "index": _INDEX, "key": _name, "value": _value}),
+    "set": (Set, {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value}),
     "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*KINDS["object"], *KINDS["light"])}),
     "remove": (Remove, {"part": _choice(*KINDS), "index": _INDEX}),
     "show": (Show, {"part": _choice(*KINDS), "index": _INDEX, "on": _flag}),

@@ -10,15 +10,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import errno
+import functools
 import hmac
 import importlib.resources
 import json
 import socket
 import ssl
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
@@ -29,7 +32,11 @@ from warp_ar.errors import UsageError, WarpArError
 from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
-from warp_ar.viewer.host import Host, Lit
+from warp_ar.viewer.gate import BACKLOG, HEADER_SECONDS, Gate
+
+if TYPE_CHECKING:
+    from warp_ar.viewer.frames import Lit
+    from warp_ar.viewer.host import Host
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE: Final = ("0.0.0.0", "::", "")
@@ -42,6 +49,8 @@ IN_FLIGHT: Final = 2
 SEND_SECONDS: Final = 20.0
 """A viewer that takes nothing for so long is dropped."""
 STATE_SECONDS: Final = 0.5
+STOP_SECONDS: Final = 0.7
+"""How long the end waits for a frame in hand, and as long for what is being built."""
 MESSAGES_PER_SECOND: Final = 240.0
 CONNECTIONS_PER_SECOND: Final = 50.0
 """From one address; each takes about a millisecond."""
@@ -142,7 +151,7 @@ class _Viewer:
         self.picture: asyncio.Task[None] | None = None
 
     def tell(self, message: str | bytes) -> None:
-        """Send a message when there is environment; a viewer that lets 64 pile up misses some."""
+        """Send a message when there is room for it; a viewer that lets 64 pile up misses some."""
         with contextlib.suppress(asyncio.QueueFull):
             self.queue.put_nowait(message)
         self.wake.set()
@@ -151,12 +160,15 @@ class _Viewer:
 class Server:
     """The page of one host."""
 
-    def __init__(self, make_host: Callable[..., Host], address: Address) -> None:
-        """Build the host and the application.
+    def __init__(
+        self, make_host: Callable[..., Host], address: Address, *, header_seconds: float = HEADER_SECONDS
+    ) -> None:
+        """Build the application.
 
         Args:
-            make_host: Called with ``publish`` and ``notify``; gives the host.
+            make_host: Called with ``publish`` and ``notify`` once the page is served; gives the host.
             address: Where to serve.
+            header_seconds: How long a connection may take for a request's header.
         """
         self.address = address
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -174,8 +186,14 @@ class Server:
         # Read once: no request's path ever becomes a file's.
         folder = importlib.resources.files("warp_ar.viewer") / "static"
         self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
-        self.host = make_host(publish=self._publish, notify=self._notify)
+        self._make_host = make_host
+        self._host: Host | None = None
+        self._starting: asyncio.Future[Host] | None = None
+        self.ended = True
+        """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
+        self.gate = Gate(_HEADERS, header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
+        self.app.on_response_prepare.append(self._add_headers)
         self.app.add_routes(
             [
                 web.get("/", self._page),
@@ -207,14 +225,20 @@ class Server:
         public = request.path.startswith("/static/")
         if self.address.token is not None and not public and not _same(given, self.address.token):
             return self._refuse("a token is needed: open the whole address that the program printed")
-        response = await handler(request)
-        if not response.prepared:
-            response.headers.update(_HEADERS)
-        return response
+        if not public or self.address.token is None:
+            self.gate.admit(request)
+        with self.gate.answering(request):
+            return await handler(request)
 
     @staticmethod
     def _refuse(reason: str) -> web.Response:
-        return web.Response(status=403, text=f"warp_ar: {reason}\n", headers=_HEADERS)
+        response = web.Response(status=403, text=f"warp_ar: {reason}\n")
+        response.force_close()
+        return response
+
+    @staticmethod
+    async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
+        response.headers.update(_HEADERS)
 
     # ------------------------------------------------------------------------------------------------------------ files
 
@@ -228,16 +252,14 @@ class Server:
         return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
 
     async def _download(self, request: web.Request) -> web.Response:
+        host = await self._started()
         makers: dict[str, tuple[str, Callable[[], bytes]]] = {
-            "frame.png": ("image/png", self.host.snapshot),
-            "environment.exr": ("image/x-exr", self.host.environment_exr),
-            "scene.toml": (
-                "application/toml",
-                lambda: self.host.scene_toml(full_paths=self.address.loopback).encode(),
-            ),
-            "recording.mp4": ("video/mp4", self.host.recording),
-            "camera.yml": ("application/yaml", self.host.camera_file),
-            "board.png": ("image/png", self.host.board_picture),
+            "frame.png": ("image/png", host.snapshot),
+            "environment.exr": ("image/x-exr", host.environment_exr),
+            "scene.toml": ("application/toml", lambda: host.scene_toml(full_paths=self.address.loopback).encode()),
+            "recording.mp4": ("video/mp4", host.recording),
+            "camera.yml": ("application/yaml", host.camera_file),
+            "board.png": ("image/png", host.board_picture),
         }
         name = request.match_info["name"]
         if name not in makers:
@@ -361,36 +383,32 @@ class Server:
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if len(self._viewers) >= MOST_VIEWERS:
-            return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n", headers=_HEADERS)
+            return web.Response(status=503, text=f"{MOST_VIEWERS} viewers are here already\n")
         if not await self._may_come(request.remote or ""):
-            return web.Response(status=429, text="too many connections\n", headers=_HEADERS)
+            return web.Response(status=429, text="too many connections\n")
+        host = await self._started()
         socket = web.WebSocketResponse(max_msg_size=LARGEST_MESSAGE, heartbeat=30.0, compress=False)
         await socket.prepare(request)
+        self.gate.upgrade(request)
         viewer = _Viewer(socket)
         self._viewers.add(viewer)
-        self.host.watch(1)
+        host.watch(1)
         sender = asyncio.create_task(self._send_safely(viewer))
         try:
             viewer.tell(json.dumps(self._hello()))
-            for message in (
-                self.host.plan_message(),
-                self.host.scene_message(),
-                self.host.dial_message(),
-                self.host.calibration_message(),
-                self.host.state_message(),
-            ):
+            for message in host.greetings():
                 viewer.tell(json.dumps(message))
-            viewer.tell(await self._light_message(self.host.light()))
+            viewer.tell(await self._light_message(host.light()))
             await self._receive(viewer)
         finally:
             self._viewers.discard(viewer)
-            self.host.watch(-1)
+            host.watch(-1)
             sender.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await sender
             if viewer.picture is not None:
                 viewer.picture.cancel()
-            await asyncio.get_running_loop().run_in_executor(self._hands, self.host.leave_camera, viewer)
+            await asyncio.get_running_loop().run_in_executor(self._hands, host.leave_camera, viewer)
         return socket
 
     async def _may_come(self, address: str) -> bool:
@@ -493,46 +511,125 @@ class Server:
         """
         self._loop = asyncio.get_running_loop()
         runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
-        frames = ThreadPoolExecutor(1, "warp-ar-frames")
         running: asyncio.Future[None] | None = None
         ticker: asyncio.Task[None] | None = None
         try:
             await runner.setup()
-            await self._listen(runner, tries)
-            running = self._loop.run_in_executor(frames, self.host.run)
-            ticker = asyncio.create_task(self._tick())
+            assert runner.server is not None
+            self.gate.start(runner.server, await self._listen(tries), self.address.tls)
             ready(self.address)
+            # The page is there before kernels, and even their libraries, are loaded.
+            self._starting = self._loop.run_in_executor(
+                self._hands, functools.partial(self._make_host, publish=self._publish, notify=self._notify)
+            )
+            self._host = await asyncio.shield(self._starting)
+            ticker = asyncio.create_task(self._tick())
+            running = self._run_frames(self._host)
             await asyncio.shield(running)
         finally:
-            self.host.stop()
             if ticker is not None:
                 ticker.cancel()
-            for viewer in tuple(self._viewers):
-                await self._drop(viewer, WSCloseCode.GOING_AWAY, "the program has ended")
-            if running is not None:
-                with contextlib.suppress(WarpArError):
-                    await running
+            await self._end(running)
             self._loop = None
+            await self.gate.close()
             await runner.cleanup()
-            for pool in (frames, self._encoder, self._hands):
-                pool.shutdown()
-            self.host.close()
 
-    async def _listen(self, runner: web.AppRunner, tries: int) -> None:
+    def _run_frames(self, host: Host) -> asyncio.Future[None]:
+        """Start the thread of the frames."""
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
+
+        def finish(error: BaseException | None) -> None:
+            if not done.done():
+                done.set_result(None) if error is None else done.set_exception(error)
+
+        def run() -> None:
+            error: BaseException | None = None
+            try:
+                host.run()
+            except BaseException as raised:
+                error = raised
+            with contextlib.suppress(RuntimeError):  # the loop has closed: nobody waits for this any more
+                loop.call_soon_threadsafe(finish, error)
+
+        # A frame of many seconds must not keep the program: the thread is left behind if need be.
+        threading.Thread(target=run, name="warp-ar-frames", daemon=True).start()
+        return done
+
+    async def _end(self, running: asyncio.Future[None] | None) -> None:
+        """End the host and the viewers; what takes too long is left behind."""
+        host = self._host
+        if host is not None:
+            host.stop()
+        for viewer in tuple(self._viewers):
+            await self._drop(viewer, WSCloseCode.GOING_AWAY, "the program has ended")
+        ended = True
+        waited: asyncio.Future[Any] | None = running if running is not None else self._starting
+        if waited is not None:
+            done, _ = await asyncio.wait({waited}, timeout=STOP_SECONDS)
+            ended = bool(done)
+            if done and not waited.cancelled() and waited.exception() is None and host is None:
+                host = waited.result()
+        for pool in (self._encoder, self._hands):
+            pool.shutdown(wait=ended, cancel_futures=True)
+        if host is not None:
+            ended = host.close(wait_seconds=STOP_SECONDS, frames_ended=ended)
+        self.ended = ended
+
+    async def _started(self) -> Host:
+        """The host, once it is there."""
+        while self._host is None:
+            await asyncio.sleep(0.05)
+        return self._host
+
+    @property
+    def host(self) -> Host:
+        """The host; there is one as soon as a viewer has been let in."""
+        assert self._host is not None
+        return self._host
+
+    async def _listen(self, tries: int) -> list[socket.socket]:
         first = self.address.port
         for port in range(first, first + max(tries, 1)):
-            site = web.TCPSite(runner, self.address.host, port, ssl_context=self.address.tls)
             try:
-                await site.start()
+                listeners = await listen(self.address.host, port)
             except OSError as error:
                 if port + 1 < first + tries:
                     continue
                 raise UsageError(
                     f"cannot serve at {self.address.host} port {port}: {error.strerror or error}; choose another --port"
                 ) from error
-            bound = runner.addresses[0][1] if port == 0 else port
-            self.address = dataclasses.replace(self.address, port=bound)
-            return
+            self.address = dataclasses.replace(self.address, port=listeners[0].getsockname()[1])
+            return listeners
+        raise AssertionError("a port was tried at least")
+
+
+async def listen(host: str, port: int) -> list[socket.socket]:
+    """Sockets that listen at all addresses that a name stands for.
+
+    Raises:
+        OSError: There is none, or it is taken.
+    """
+    found = await asyncio.get_running_loop().getaddrinfo(
+        host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )
+    listeners: list[socket.socket] = []
+    try:
+        for family, address in dict.fromkeys((family, address) for family, _, _, _, address in found):
+            # A free port that was found for the first address is taken for the others too.
+            chosen = listeners[0].getsockname()[1] if listeners else port
+            try:
+                own = socket.create_server((address[0], chosen), family=family, backlog=BACKLOG)
+            except OSError as error:
+                if listeners and error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
+                    continue  # a machine without the other kind of address
+                raise
+            listeners.append(own)
+    except OSError:
+        for own in listeners:
+            own.close()
+        raise
+    return listeners
 
 
 def _same(given: str, expected: str) -> bool:

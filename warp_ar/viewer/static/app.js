@@ -54,7 +54,7 @@ handles.addEventListener("released", () => {
 });
 
 connection.addEventListener("plan", ({ detail }) => (time.plan = detail));
-connection.addEventListener("dial", ({ detail }) => (quality.dial = detail));
+connection.addEventListener("budget", ({ detail }) => (quality.budget = detail));
 
 connection.addEventListener("state", ({ detail }) => {
   const before = state;
@@ -71,6 +71,7 @@ connection.addEventListener("state", ({ detail }) => {
   }
   $("compare").value = state.compare;
   showSplit();
+  showBuilding();
   $("use-clip").setAttribute("aria-pressed", String(!state.camera));
   $("use-camera").setAttribute("aria-pressed", String(state.camera));
   $("fps").title = `Shown per second here; the program lights ${state.fps.toFixed(1)} a second for ${state.watchers} viewer${state.watchers === 1 ? "" : "s"}`;
@@ -117,7 +118,7 @@ view.addEventListener("shown", ({ detail: frame }) => {
   light.draw();
   time.frame(frame);
   $("track-state").className = `chip ${frame.state ?? ""}`;
-  $("track-state").lastElementChild.textContent = frame.state === null ? "no marker needed" : { tracked: "marker found", held: "marker hidden", lost: "no marker" }[frame.state];
+  $("track-state").lastElementChild.textContent = frame.state === null ? (frame.plan ? "no marker needed" : "not lit yet") : { tracked: "marker found", held: "marker hidden", lost: "no marker" }[frame.state];
 });
 view.addEventListener("resize", () => $("figure").style.setProperty("--aspect", $("canvas").width / $("canvas").height));
 
@@ -183,6 +184,15 @@ function showSplit() {
   view.draw();
 }
 
+function showBuilding() {
+  const { building } = state;
+  $("building").hidden = !building;
+  if (!building) return;
+  const count = building.count ? ` (${building.done} of ${building.count})` : "";
+  const meanwhile = view.stats.plan ? "" : " The camera's picture is shown meanwhile.";
+  $("building").lastElementChild.textContent = `Compiling kernels for ${building.quality}, once for this kind of scene${count}.${meanwhile}`;
+}
+
 function showCamera() {
   if (!camera) return;
   const field = (2 * Math.atan((0.5 * camera.width) / camera.fx) * 180) / Math.PI;
@@ -203,9 +213,9 @@ document.addEventListener("pointerdown", (event) => {
 });
 for (const button of document.querySelectorAll("[data-add]")) {
   button.addEventListener("click", () => {
-    const [thing, kind] = button.dataset.add.split(" ");
-    scenePanel.select(`${thing} ${scene[`${thing}s`].length}`);
-    connection.send("add", { thing, kind });
+    const [part, kind] = button.dataset.add.split(" ");
+    scenePanel.select(`${part} ${scene[`${part}s`].length}`);
+    connection.send("add", { part, kind });
   });
 }
 const tabs = [...document.querySelectorAll("[role=tab]")];

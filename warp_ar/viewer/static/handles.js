@@ -1,4 +1,4 @@
-// Handles on the desk: rings around objects, lamps on stems, dragged with pointer, wheel or keys.
+// Handles on the desk: rings around objects, lights on stems, dragged with pointer, wheel or keys.
 
 import { deskAxes, onPlane, project } from "./geometry.js";
 
@@ -71,38 +71,38 @@ export class Handles extends EventTarget {
     this.#place();
   }
 
-  #thing(item) {
-    return item.thing === "object" ? this.#scene.objects[item.index] : this.#scene.lights[item.index];
+  #part(item) {
+    return item.part === "object" ? this.#scene.objects[item.index] : this.#scene.lights[item.index];
   }
 
   #rebuild() {
     this.#svg.replaceChildren();
     this.#items = [];
-    // Lights last: a lamp or its target over an object's ring is the smaller thing to hit.
+    // Lights last: a light or its target over an object's ring is the smaller one to hit.
     this.#scene.objects.forEach((object, index) => {
       const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
       item.halo = make("path", { class: "halo" }, item.group);
-      item.ring = this.#part(item, "at", make("path", { class: "ring" }, item.group));
-      item.setting = make("circle", { class: "setting", r: 6 }, item.group);
-      item.settingHit = this.#part(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
+      item.ring = this.#grip(item, "at", make("path", { class: "ring" }, item.group));
+      item.turn = make("circle", { class: "turn", r: 6 }, item.group);
+      item.turnHit = this.#grip(item, "turn", make("circle", { class: "hit", r: 20 }, item.group));
     });
     this.#scene.lights.forEach((light, index) => {
       const item = this.#group("light", index, `${light.kind} light ${index + 1}`);
       item.stem = make("line", { class: "stem" }, item.group);
-      item.floor = this.#part(item, "floor", make("path", { class: "ring" }, item.group));
+      item.floor = this.#grip(item, "floor", make("path", { class: "ring" }, item.group));
       if (light.target) {
         item.beam = make("line", { class: "stem" }, item.group);
-        item.target = make("circle", { class: "setting", r: 5 }, item.group);
-        item.targetHit = this.#part(item, "target", make("circle", { class: "hit", r: 18 }, item.group));
+        item.target = make("circle", { class: "turn", r: 5 }, item.group);
+        item.targetHit = this.#grip(item, "target", make("circle", { class: "hit", r: 18 }, item.group));
       }
-      item.lamp = make("circle", { class: "lamp", r: 10 }, item.group);
-      item.hit = this.#part(item, "at", make("circle", { class: "hit", r: 24 }, item.group));
+      item.bulb = make("circle", { class: "bulb", r: 10 }, item.group);
+      item.hit = this.#grip(item, "at", make("circle", { class: "hit", r: 24 }, item.group));
     });
   }
 
-  #group(thing, index, label) {
-    const group = make("g", { class: "thing", tabindex: 0, role: "button", "aria-label": `${label}: arrows move it` }, this.#svg);
-    const item = { thing, index, key: `${thing} ${index}`, group };
+  #group(part, index, label) {
+    const group = make("g", { class: "part", tabindex: 0, role: "button", "aria-label": `${label}: arrows move it` }, this.#svg);
+    const item = { part, index, key: `${part} ${index}`, group };
     group.dataset.key = item.key;
     group.addEventListener("focus", () => this.#select(item.key));
     group.addEventListener("keydown", (event) => this.#key(event, item));
@@ -110,8 +110,8 @@ export class Handles extends EventTarget {
     return item;
   }
 
-  #part(item, part, element) {
-    element.addEventListener("pointerdown", (event) => this.#grab(event, item, part));
+  #grip(item, grip, element) {
+    element.addEventListener("pointerdown", (event) => this.#grab(event, item, grip));
     return element;
   }
 
@@ -126,7 +126,7 @@ export class Handles extends EventTarget {
     return `M${points.join("L")}Z`;
   }
 
-  #lampAt(light) {
+  #lightAt(light) {
     if (light.kind !== "directional") return light.at;
     const size = Math.hypot(...light.direction) || 1;
     return light.direction.map((d) => (-SUN * d) / size);
@@ -142,11 +142,11 @@ export class Handles extends EventTarget {
     // Sizes are in pixels of the screen, whatever the picture's.
     const unit = width / (this.#svg.clientWidth || width);
     for (const item of this.#items) {
-      const thing = this.#thing(item);
-      item.group.style.display = thing.visible ? "" : "none";
-      if (!thing.visible) continue;
-      if (item.thing === "object") this.#placeObject(item, thing, unit);
-      else this.#placeLight(item, thing, unit);
+      const part = this.#part(item);
+      item.group.style.display = part.visible ? "" : "none";
+      if (!part.visible) continue;
+      if (item.part === "object") this.#placeObject(item, part, unit);
+      else this.#placeLight(item, part, unit);
     }
   }
 
@@ -156,21 +156,21 @@ export class Handles extends EventTarget {
     item.ring.setAttribute("d", path);
     item.halo.setAttribute("d", path);
     const angle = (object.rotate[2] * Math.PI) / 180;
-    const setting = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
-    for (const [element, size] of [[item.setting, 5.5], [item.settingHit, 18]]) put(element, setting, size * unit);
+    const turn = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
+    for (const [element, size] of [[item.turn, 5.5], [item.turnHit, 18]]) put(element, turn, size * unit);
   }
 
   #placeLight(item, light, unit) {
-    const at = this.#lampAt(light);
-    const lamp = project(this.#camera, this.#pose, at);
+    const at = this.#lightAt(light);
+    const bulb = project(this.#camera, this.#pose, at);
     const floor = project(this.#camera, this.#pose, light.kind === "directional" ? [0, 0, 0] : [at[0], at[1], 0]);
-    // A lamp above the picture hangs at its border, where it can still be taken.
+    // A light above the picture hangs at its border, where it can still be taken.
     const rim = 14 * unit;
-    const held = lamp && [clamp(lamp[0], rim, this.#camera.width - rim), clamp(lamp[1], rim, this.#camera.height - rim)];
-    put(item.lamp, held, 9 * unit);
+    const held = bulb && [clamp(bulb[0], rim, this.#camera.width - rim), clamp(bulb[1], rim, this.#camera.height - rim)];
+    put(item.bulb, held, 9 * unit);
     put(item.hit, held, 24 * unit);
-    item.group.classList.toggle("beyond", !!lamp && (held[0] !== lamp[0] || held[1] !== lamp[1]));
-    item.lamp.setAttribute("fill", css(light.color));
+    item.group.classList.toggle("beyond", !!bulb && (held[0] !== bulb[0] || held[1] !== bulb[1]));
+    item.bulb.setAttribute("fill", css(light.color));
     line(item.stem, held, floor);
     item.floor.setAttribute("d", light.kind === "directional" ? "" : this.#circle(at, 0.014, 0));
     if (item.target) {
@@ -193,15 +193,15 @@ export class Handles extends EventTarget {
     return [((event.clientX - box.left) / box.width) * width - 0.5, ((event.clientY - box.top) / box.height) * height - 0.5];
   }
 
-  #grab(event, item, part) {
+  #grab(event, item, grip) {
     if (event.button !== 0 || !this.#pose) return;
     event.preventDefault();
     event.stopPropagation();
-    const thing = this.#thing(item);
-    const point = item.thing === "object" || part === "floor" ? [thing.at[0], thing.at[1], 0] : part === "target" ? thing.target : this.#lampAt(thing);
+    const part = this.#part(item);
+    const point = item.part === "object" || grip === "floor" ? [part.at[0], part.at[1], 0] : grip === "target" ? part.target : this.#lightAt(part);
     const seen = project(this.#camera, this.#pose, point) ?? [0, 0];
     const [u, v] = this.#pointer(event);
-    this.#drag = { item, part, point, off: [seen[0] - u, seen[1] - v], height: thing.at[2], from: v };
+    this.#drag = { item, grip, point, off: [seen[0] - u, seen[1] - v], height: part.at[2], from: v };
     this.#svg.setPointerCapture(event.pointerId);
     item.group.focus({ preventScroll: true });
     this.#select(item.key);
@@ -209,24 +209,24 @@ export class Handles extends EventTarget {
 
   #move(event) {
     if (!this.#drag || !this.#pose) return;
-    const { item, part, point, off, from, height } = this.#drag;
-    const thing = this.#thing(item);
+    const { item, grip, point, off, from, height } = this.#drag;
+    const part = this.#part(item);
     const [u, v] = this.#pointer(event);
-    if (part === "turn") {
+    if (grip === "turn") {
       const at = onPlane(this.#camera, this.#pose, u, v, 0);
-      if (at) this.#put(item, "rotate", [thing.rotate[0], thing.rotate[1], (Math.atan2(at[1] - thing.at[1], at[0] - thing.at[0]) * 180) / Math.PI]);
+      if (at) this.#put(item, "rotate", [part.rotate[0], part.rotate[1], (Math.atan2(at[1] - part.at[1], at[0] - part.at[0]) * 180) / Math.PI]);
       return;
     }
-    if (event.shiftKey && part === "at" && thing.kind !== "directional") {
-      this.#put(item, "at", [thing.at[0], thing.at[1], clamp(height + (from - v) * 0.001, -1, 3)]);
+    if (event.shiftKey && grip === "at" && part.kind !== "directional") {
+      this.#put(item, "at", [part.at[0], part.at[1], clamp(height + (from - v) * 0.001, -1, 3)]);
       return;
     }
     const at = onPlane(this.#camera, this.#pose, u + off[0], v + off[1], point[2]);
     if (!at) return;
     const [x, y] = [clamp(at[0], -3, 3), clamp(at[1], -3, 3)];
-    if (part === "target") this.#put(item, "target", [x, y, thing.target[2]]);
-    else if (thing.kind === "directional") this.#put(item, "direction", [-x, -y, -point[2]]);
-    else this.#put(item, "at", [x, y, thing.at[2]]);
+    if (grip === "target") this.#put(item, "target", [x, y, part.target[2]]);
+    else if (part.kind === "directional") this.#put(item, "direction", [-x, -y, -point[2]]);
+    else this.#put(item, "at", [x, y, part.at[2]]);
   }
 
   #release() {
@@ -236,45 +236,45 @@ export class Handles extends EventTarget {
   }
 
   #wheel(event) {
-    const key = event.target.closest?.(".thing")?.dataset.key ?? this.#selected;
+    const key = event.target.closest?.(".part")?.dataset.key ?? this.#selected;
     const item = this.#items.find((one) => one.key === key);
     if (!item || !this.#pose) return;
     event.preventDefault();
     const step = clamp(event.deltaY * (event.deltaMode === 1 ? 30 : 1), -240, 240);
-    if (item.thing === "light") this.#raise(item, -step * 0.0002);
+    if (item.part === "light") this.#raise(item, -step * 0.0002);
     else if (event.shiftKey) this.#raise(item, -step * 0.0001);
     else this.#turn(item, step * 0.06);
     this.#select(item.key);
   }
 
   #raise(item, by) {
-    const thing = this.#thing(item);
-    if (thing.kind === "directional") {
-      const [x, y, z] = this.#lampAt(thing);
+    const part = this.#part(item);
+    if (part.kind === "directional") {
+      const [x, y, z] = this.#lightAt(part);
       this.#put(item, "direction", [-x, -y, -clamp(z + by, 0.01, 3)]);
-    } else this.#put(item, "at", [thing.at[0], thing.at[1], clamp(thing.at[2] + by, item.thing === "light" ? 0.01 : -1, 3)]);
+    } else this.#put(item, "at", [part.at[0], part.at[1], clamp(part.at[2] + by, item.part === "light" ? 0.01 : -1, 3)]);
   }
 
   #turn(item, degrees) {
-    const thing = this.#thing(item);
-    if (item.thing === "object") this.#put(item, "rotate", [thing.rotate[0], thing.rotate[1], thing.rotate[2] + degrees]);
+    const part = this.#part(item);
+    if (item.part === "object") this.#put(item, "rotate", [part.rotate[0], part.rotate[1], part.rotate[2] + degrees]);
   }
 
   #key(event, item) {
     const step = event.shiftKey ? 0.001 : 0.006;
     const axes = deskAxes(this.#pose);
     const arrows = { ArrowRight: axes.right, ArrowLeft: axes.right.map((a) => -a), ArrowUp: axes.away, ArrowDown: axes.away.map((a) => -a) };
-    const thing = this.#thing(item);
+    const part = this.#part(item);
     if (arrows[event.key]) {
       const [x, y] = arrows[event.key];
-      if (thing.kind === "directional") {
-        const at = this.#lampAt(thing);
+      if (part.kind === "directional") {
+        const at = this.#lightAt(part);
         this.#put(item, "direction", [-at[0] - x * step, -at[1] - y * step, -at[2]]);
-      } else this.#put(item, "at", [thing.at[0] + x * step, thing.at[1] + y * step, thing.at[2]]);
+      } else this.#put(item, "at", [part.at[0] + x * step, part.at[1] + y * step, part.at[2]]);
     } else if (event.key === "PageUp" || event.key === "PageDown") this.#raise(item, event.key === "PageUp" ? step : -step);
     else if (event.key === "[" || event.key === "]") this.#turn(item, event.key === "]" ? 5 : -5);
-    else if (event.key === "v") this.#connection.send("show", { thing: item.thing, index: item.index, on: false });
-    else if (event.key === "Delete") this.#connection.send("remove", { thing: item.thing, index: item.index });
+    else if (event.key === "v") this.#connection.send("show", { part: item.part, index: item.index, on: false });
+    else if (event.key === "Delete") this.#connection.send("remove", { part: item.part, index: item.index });
     else return;
     event.preventDefault();
     event.stopPropagation();
@@ -282,9 +282,9 @@ export class Handles extends EventTarget {
 
   /** Change a value here at once, and on the server. */
   #put(item, key, value) {
-    const thing = this.#thing(item);
-    thing[key] = rounded(value);
-    this.#connection.set(item.thing, item.index, key, thing[key]);
+    const part = this.#part(item);
+    part[key] = rounded(value);
+    this.#connection.set(item.part, item.index, key, part[key]);
     this.#place();
     this.dispatchEvent(new CustomEvent("edited", { detail: item.key }));
   }

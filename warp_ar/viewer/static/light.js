@@ -1,4 +1,4 @@
-// The room's light: the map of all directions as it comes, and as a mirror ball that stands where the camera looks.
+// The environment: the map of all directions as it comes, and as a mirror ball that stands where the camera looks.
 
 import { toWorld } from "./geometry.js";
 

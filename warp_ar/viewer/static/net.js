@@ -54,8 +54,8 @@ export class Connection extends EventTarget {
   }
 
   /** Change a value of the scene; of several changes of one value within 30 ms only the last is sent. */
-  set(thing, index, key, value) {
-    this.#edits.set(`${thing} ${index} ${key}`, { thing, index, key, value });
+  set(part, index, key, value) {
+    this.#edits.set(`${part} ${index} ${key}`, { part, index, key, value });
     if (this.#flushing) return;
     this.#flushing = true;
     this.#flush();

@@ -1,4 +1,4 @@
-// The panels: what is on the desk, effects, exposure, quality, time.
+// The panels: objects and lights, effects, exposure, quality, time.
 
 import { lightColor } from "./handles.js";
 
@@ -57,9 +57,9 @@ const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambe
 const EFFECTS = {
   objects: ["Virtual objects", ""],
   lights: ["Virtual lights", ""],
-  room: ["Light of the room", "captured from the mirror ball"],
-  desk: ["The desk's shape", "receives light and shadow, hides what is behind it"],
-  environment_shadow: ["Shadows of the room's light", "under virtual objects"],
+  environment: ["Environment", "light captured from the mirror ball"],
+  receiver: ["Shape of the desk", "receives light and shadow, hides what is behind it"],
+  environment_shadow: ["Shadows of the environment", "under virtual objects"],
   relief: ["Relief of the desk", "virtual light brings out its bumps"],
   exposure: ["Exposure", "darkens as a camera would"],
 };
@@ -74,7 +74,7 @@ export class ScenePanel {
   constructor(connection, handles) {
     this.#connection = connection;
     this.#handles = handles;
-    this.things = document.getElementById("things");
+    this.parts = document.getElementById("parts");
     this.inspector = document.getElementById("inspector");
     handles.addEventListener("select", ({ detail }) => this.select(detail, false));
     handles.addEventListener("edited", ({ detail }) => detail === this.#selected && this.#fill());
@@ -83,20 +83,20 @@ export class ScenePanel {
   select(key, tellHandles = true) {
     this.#selected = key;
     if (tellHandles) this.#handles.selected = key;
-    for (const item of this.things.children) item.classList.toggle("on", item.dataset.key === key);
+    for (const item of this.parts.children) item.classList.toggle("on", item.dataset.key === key);
     this.#inspect();
   }
 
   set scene(scene) {
     this.#scene = scene;
     const entries = [...scene.objects.map((o, i) => ["object", i, o]), ...scene.lights.map((l, i) => ["light", i, l])];
-    this.things.replaceChildren(...entries.map(([thing, index, item]) => this.#entry(thing, index, item)));
-    if (!entries.length) this.things.append(el("li", { class: "note" }, "Nothing yet: add an object or a light."));
-    if (!this.#selected || !this.things.querySelector(`[data-key="${this.#selected}"]`)) {
+    this.parts.replaceChildren(...entries.map(([part, index, item]) => this.#entry(part, index, item)));
+    if (!entries.length) this.parts.append(el("li", { class: "note" }, "Nothing yet: add an object or a light."));
+    if (!this.#selected || !this.parts.querySelector(`[data-key="${this.#selected}"]`)) {
       this.#selected = entries.length ? `${entries[0][0]} ${entries[0][1]}` : null;
       this.#handles.selected = this.#selected;
     }
-    for (const item of this.things.children) item.classList.toggle("on", item.dataset.key === this.#selected);
+    for (const item of this.parts.children) item.classList.toggle("on", item.dataset.key === this.#selected);
     const inside = this.inspector.contains(document.activeElement);
     const shape = JSON.stringify([scene.name, this.#selected, this.#item() && Object.keys(this.#item()), this.#item()?.material?.model, this.#item()?.target === null]);
     if (shape !== this.#shape || !inside) this.#inspect();
@@ -105,28 +105,28 @@ export class ScenePanel {
     this.#exposure(scene);
   }
 
-  #entry(thing, index, item) {
-    const key = `${thing} ${index}`;
-    const tint = thing === "light" ? item.color : item.material.base_color ?? item.material.diffuse;
-    const dot = el("i", { class: thing });
-    const css = Array.isArray(tint) ? (thing === "light" ? lightColor(tint) : toHex(tint)) : "#999";
+  #entry(part, index, item) {
+    const key = `${part} ${index}`;
+    const tint = part === "light" ? item.color : item.material.base_color ?? item.material.diffuse;
+    const dot = el("i", { class: part });
+    const css = Array.isArray(tint) ? (part === "light" ? lightColor(tint) : toHex(tint)) : "#999";
     dot.style.background = css;
     dot.style.setProperty("--c", css);
-    const name = thing === "light" ? { point: "Point light", spot: "Spotlight", directional: "Sun" }[item.kind] : item.file?.replace(/\.\w+$/, "") ?? item.shape;
+    const name = part === "light" ? { point: "Point light", spot: "Spotlight", directional: "Sun" }[item.kind] : item.file?.replace(/\.\w+$/, "") ?? item.shape;
     const title = name[0].toUpperCase() + name.slice(1);
     const entry = el("li", { class: item.visible ? "" : "off" },
       el("button", { class: "pick", onclick: () => this.select(key) }, dot, title),
       el("button", { class: "eye", "aria-label": `${item.visible ? "Hide" : "Show"} ${title}`, title: item.visible ? "Hide" : "Show",
-        onclick: () => this.#connection.send("show", { thing, index, on: !item.visible }) }, svg(item.visible ? EYE : SHUT)),
-      el("button", { class: "drop", "aria-label": `Remove ${title}`, title: "Remove", onclick: () => this.#connection.send("remove", { thing, index }) }, svg(BIN)));
+        onclick: () => this.#connection.send("show", { part, index, on: !item.visible }) }, svg(item.visible ? EYE : SHUT)),
+      el("button", { class: "drop", "aria-label": `Remove ${title}`, title: "Remove", onclick: () => this.#connection.send("remove", { part, index }) }, svg(BIN)));
     entry.dataset.key = key;
     return entry;
   }
 
   #item() {
     if (!this.#selected || !this.#scene) return null;
-    const [thing, index] = this.#selected.split(" ");
-    return (thing === "object" ? this.#scene.objects : this.#scene.lights)[index] ?? null;
+    const [part, index] = this.#selected.split(" ");
+    return (part === "object" ? this.#scene.objects : this.#scene.lights)[index] ?? null;
   }
 
   /** Bring the numbers of the inspector up to date with a drag. */
@@ -137,30 +137,30 @@ export class ScenePanel {
   #inspect() {
     const item = this.#item();
     if (!item) return this.inspector.replaceChildren();
-    const [thing, number] = this.#selected.split(" ");
+    const [part, number] = this.#selected.split(" ");
     const index = Number(number);
     const set = (key, value, holder = item) => {
       holder[key] = value;
-      this.#connection.set(thing, index, key, value);
+      this.#connection.set(part, index, key, value);
       if (holder === item) this.#handles.scene = this.#scene;
     };
-    const part = (key, axis) => (value) => {
+    const along = (key, axis) => (value) => {
       const changed = [...item[key]];
       changed[axis] = value;
       set(key, changed);
     };
     const rows = [];
     if (item.kind !== "directional") {
-      rows.push(slider("Height", { low: thing === "light" ? 0.01 : 0, high: thing === "light" ? 1 : 0.3, curve: 1.6 }, item.at[2], part("at", 2)));
+      rows.push(slider("Height", { low: part === "light" ? 0.01 : 0, high: part === "light" ? 1 : 0.3, curve: 1.6 }, item.at[2], along("at", 2)));
     }
-    if (thing === "object") rows.push(...this.#object(item, set, part));
+    if (part === "object") rows.push(...this.#object(item, set, along));
     else rows.push(...this.#light(item, set));
     this.inspector.replaceChildren(...rows);
   }
 
-  #object(item, set, part) {
+  #object(item, set, along) {
     const { material } = item;
-    const rows = [slider("Turn", { low: -180, high: 180, step: 1 }, ((item.rotate[2] + 540) % 360) - 180, part("rotate", 2))];
+    const rows = [slider("Turn", { low: -180, high: 180, step: 1 }, ((item.rotate[2] + 540) % 360) - 180, along("rotate", 2))];
     const scale = item.scale;
     rows.push(slider("Size", { low: scale * 0.25, high: scale * 2.5, step: scale / 200 }, scale, (value) => set("scale", value)));
     const model = el("select", { "aria-label": "Material", onchange: () => set("model", model.value, {}) },
@@ -330,9 +330,9 @@ export class TimePanel {
   }
 }
 
-const DIAL = { low: 1, high: 1000 };
+const BUDGET = { low: 1, high: 1000 }; // milliseconds
 const AIM = 0.9; // the share of a budget that the program plans for
-const along = (ms) => Math.min(Math.max(Math.log(ms / DIAL.low) / Math.log(DIAL.high / DIAL.low), 0), 1);
+const share = (ms) => Math.min(Math.max(Math.log(ms / BUDGET.low) / Math.log(BUDGET.high / BUDGET.low), 0), 1);
 const brief = (ms) => ms.toFixed(ms < 10 ? 1 : 0);
 const SVG = "http://www.w3.org/2000/svg";
 const shape = (name, attributes, text = "") => {
@@ -346,7 +346,7 @@ export class QualityPanel {
   #connection;
   #time;
   #state = null;
-  #dial = null;
+  #budget = null;
   #later = 0;
 
   constructor(connection, time) {
@@ -372,7 +372,7 @@ export class QualityPanel {
   }
 
   get #ms() {
-    return DIAL.low * Math.pow(DIAL.high / DIAL.low, this.range.value / 1000);
+    return BUDGET.low * Math.pow(BUDGET.high / BUDGET.low, this.range.value / 1000);
   }
 
   get #on() {
@@ -400,8 +400,8 @@ export class QualityPanel {
     for (const button of this.holder.children) button.setAttribute("aria-checked", String(button.dataset.preset === scene.quality));
   }
 
-  set dial(dial) {
-    this.#dial = dial;
+  set budget(budget) {
+    this.#budget = budget;
     this.#draw();
   }
 
@@ -409,7 +409,7 @@ export class QualityPanel {
     this.#state = state;
     if (!this.#later && !this.range.matches(":active")) {
       this.flip.setAttribute("aria-checked", String(state.budget !== null));
-      if (state.budget !== null && document.activeElement !== this.range) this.range.value = 1000 * along(state.budget);
+      if (state.budget !== null && document.activeElement !== this.range) this.range.value = 1000 * share(state.budget);
     }
     for (const button of this.holder.children) {
       const cost = state.costs[button.dataset.preset];
@@ -420,7 +420,7 @@ export class QualityPanel {
 
   /** What the slider's budget buys, as the program chooses; null while costs are unknown. */
   #bought() {
-    const { known, base, choices } = this.#dial ?? {};
+    const { known, base, choices } = this.#budget ?? {};
     if (!known) return null;
     const factor = this.#state?.auto?.factor ?? 1;
     const took = (choice) => factor * (base + choice.ms);
@@ -444,11 +444,11 @@ export class QualityPanel {
   }
 
   #note(bought) {
-    const { measuring } = this.#dial ?? {};
+    const { measuring } = this.#budget ?? {};
     if (typeof measuring === "number") return `Measuring what each method costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
     if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once, in about half a minute.";
     const { choice, took, fits } = bought;
-    if (this.#dial.choices.every((one) => one.error === 0)) return "What these methods err is not in the price list, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
+    if (this.#budget.choices.every((one) => one.error === 0)) return "What these methods err is not in the cost table, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
     const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];
     if (!fits) parts.push("Nothing cheaper is left.");
     const { difference, compare } = this.#state ?? {};
@@ -458,10 +458,10 @@ export class QualityPanel {
 
   /** Error over time of all that can be bought, over the slider's own scale. */
   #plot({ choice, took }) {
-    const { choices, presets, base } = this.#dial;
+    const { choices, presets, base } = this.#budget;
     const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
     const [left, top] = [8, 14];
-    const x = (ms) => left + along(ms) * (width - 2 * left);
+    const x = (ms) => left + share(ms) * (width - 2 * left);
     const most = Math.max(...choices.map((c) => c.error), ...Object.values(presets).map((p) => p.error), 1e-6);
     const y = (e) => top + (1 - e / most) * (height - top - 6);
     const placed = [];
@@ -478,8 +478,8 @@ export class QualityPanel {
       shape("path", { class: "area", d: `${path}H${width - left}V${height}H${x(took(choices[0])).toFixed(1)}Z` }),
       shape("path", { class: "line", d: `${path}H${width - left}` }),
       shape("line", { class: "budget", x1: at, x2: at, y1: 4, y2: height }),
-      ...Object.entries(presets).flatMap(([name, price]) => {
-        const [px, py] = [x(took({ ms: price.ms })), y(price.error)];
+      ...Object.entries(presets).flatMap(([name, cost]) => {
+        const [px, py] = [x(took({ ms: cost.ms })), y(cost.error)];
         return [shape("circle", { class: "preset", cx: px, cy: py, r: 3 }), ...label(name, px, py)];
       }),
       shape("circle", { class: "choice", cx: x(took(choice)), cy: y(choice.error), r: 5 }),
@@ -489,10 +489,10 @@ export class QualityPanel {
   }
 
   #methods(choice) {
-    return Object.entries(this.#dial.ladders).map(([name, ladder], index) => {
+    return Object.entries(this.#budget.settings).map(([name, methods], index) => {
       const place = choice.methods[index];
-      const pips = el("span", { class: "pips", "aria-hidden": "true" }, ...ladder.map((_, i) => el("i", { class: i <= place ? "on" : "" })));
-      return el("li", {}, el("span", { class: "name" }, name.replaceAll("_", " ")), pips, el("span", {}, ladder[place].replaceAll("_", " ")));
+      const pips = el("span", { class: "pips", "aria-hidden": "true" }, ...methods.map((_, i) => el("i", { class: i <= place ? "on" : "" })));
+      return el("li", {}, el("span", { class: "name" }, name.replaceAll("_", " ")), pips, el("span", {}, methods[place].replaceAll("_", " ")));
     });
   }
 }

@@ -5,7 +5,7 @@ const median = (values) => [...values].sort((a, b) => a - b)[values.length >> 1]
 export class View extends EventTarget {
   split = 0.5;
   /** What is measured: frames shown in all, per second, and milliseconds from capture to screen. */
-  stats = { shown: 0, fps: 0, latency: null, id: 0, stamped: false };
+  stats = { shown: 0, fps: 0, latency: null, id: 0, stamped: false, plan: 0 };
   #canvas;
   #context;
   #connection;
@@ -76,5 +76,6 @@ export class View extends EventTarget {
     stats.fps = span > 0 ? ((this.#times.length - 1) * 1000) / span : 0;
     stats.shown += 1;
     stats.id = frame.id;
+    stats.plan = frame.plan;
   }
 }

@@ -1,0 +1,67 @@
+"""Parts of the documentation that are made from the code when the site is built.
+
+A page says ``<!-- made: NAME -->`` where the part belongs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import re
+from typing import Any
+
+COMMANDS = ("live", "explain", "calibrate", "tradeoff")
+"""Commands whose options are listed, in the order of the page."""
+
+
+def scene_keys() -> str:
+    """Tables of a scene file's keys."""
+    from warp_ar.scene.reference import as_markdown
+
+    return as_markdown()
+
+
+def command_line() -> str:
+    """Every command with its options."""
+    parts = []
+    for name in COMMANDS:
+        parser = importlib.import_module(f"warp_ar.{name}").make_parser()
+        parts += [f"## `python -m warp_ar.{name}`", "", parser.description or "", "", *_options(parser)]
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for sub, own in action.choices.items():
+                    parts += [f"### `{name} {sub}`", "", own.description or "", "", *_options(own)]
+    return "\n".join(parts)
+
+
+def _options(parser: argparse.ArgumentParser) -> list[str]:
+    rows = ["| argument | meaning |", "| --- | --- |"]
+    for action in parser._actions:
+        if isinstance(action, argparse._HelpAction | argparse._SubParsersAction):
+            continue
+        metavar = (
+            action.metavar if isinstance(action.metavar, str) else (action.dest.upper() if action.nargs != 0 else "")
+        )
+        name = f"{action.option_strings[-1]} {metavar}".strip() if action.option_strings else metavar
+        text = (action.help or "").replace("|", "\\|")
+        rows.append(f"| `{name.replace('|', ' or ')}` | {text} |")
+    return [*rows, ""] if len(rows) > 2 else []
+
+
+def stages() -> str:
+    """Every stage: what it does, its methods, and the file of its kernels."""
+    from warp_ar.stages import STAGES
+
+    rows = ["| stage | what it does | methods, cheapest first |", "| --- | --- | --- |"]
+    for stage in STAGES:
+        methods = ", ".join(f"`{method}`" for method in stage.methods) if len(stage.methods) > 1 else "one"
+        rows.append(f"| `{stage.name}` | {stage.summary} | {methods} |")
+    return "\n".join(rows)
+
+
+PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages}
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the made parts into a page."""
+    return re.sub(r"<!-- made: ([\w-]+) -->", lambda match: PARTS[match[1]](), markdown)

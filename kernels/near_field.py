@@ -1,0 +1,549 @@
+"""What surrounds a virtual object at close range: the receiver that it stands on, other objects, itself.
+
+Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
+
+*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
+picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
+way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
+empty desk.
+
+*Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
+sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
+read the environment as well, and the share is 1. A glossy lobe sends a few, another few from each pixel of a tile. What
+is near hides part of the lobe, and what it hides may be much darker than the rest: at the rim of a window that a
+receiver cuts off, half of the rays meet the receiver and hardly any of the light is gone. So every ray reads the
+environment as well. With the means over the rays
+
+    s  share of the rays that meet something near,      N  their radiance, 0 for the others,
+    B  the environment along all rays,                  M  the environment along those that meet nothing,
+
+the lobe holds N + M. M is noisy where much of the lobe is open, and there L, the environment prefiltered with the
+whole lobe, is known: M = (|M| / |B|) L, as L is B without noise. Where hardly any of it is open the noise of M is a
+small part of the sum, and L may be all that is hidden. Hence
+
+    | N + s M + (1 - s) (|M| / |B|) L |,    |.| the brightness: share = 1 - (1 - s) |M| / |B|.
+
+A ray among n stands for the solid angle 1 / (n pdf). The environment's level of the same width is read, twice as wide
+so that neighbours overlap: for a half vector h, GGX has pdf D = k^2 / pi, k = alpha / (sin^2 + alpha^2 cos^2) of the
+angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has the width alpha / sqrt n. So
+
+    | width = 2 / (k sqrt n) |,    Phong: 2 alpha / sqrt(n cos^e), e its exponent.
+
+With one width for all, the few rays in the long tails of GGX would show lamps as squares of a tile's size.
+
+Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
+does; mirrors are not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import warp as wp
+
+from warp_ar.kernels.color import brightness
+from warp_ar.kernels.emitters import correct_parallax
+from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.materials import Surface, make_surface, reflect
+from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
+from warp_ar.kernels.reflect import (
+    DistantLight,
+    DistantLightConfig,
+    look_up,
+    make_find_in_frame,
+    make_mirrored,
+    make_shade_unoccluded,
+)
+from warp_ar.kernels.sampling import (
+    frame_from_normal,
+    radical_inverse,
+    sample_ggx_visible,
+    sample_phong_lobe,
+)
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, RayScene
+from warp_ar.kernels.visibility import (
+    FAR,
+    Hit,
+    inside_rect,
+    make_primary,
+    make_sample_direction,
+    make_trace,
+    offset_origin,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+SHARP_ALPHA = 0.02
+"""Width of a lobe below which it is a mirror."""
+SHARP = wp.constant(wp.float32(SHARP_ALPHA))
+MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
+"""Brightness, in camera values, below which a lobe's share is 0 over 0."""
+RAY_WIDTH = 2.0
+"""Width of one ray of many, over the width that its share of the lobe has."""
+SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
+"""Cosine of the angle up to which neighbours' normals are those of one surface."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NearFieldConfig:
+    """What is compiled into the kernel."""
+
+    distant: DistantLightConfig
+    """Kinds of shape and forms of light."""
+    count: int
+    """Samples of the environment per pixel, of each set."""
+    lobe_count: int
+    """Rays per pixel into a glossy lobe; 0 if no object has one."""
+    mirror_samples: int
+    """Places within a pixel from which a mirror sends a ray, a square number; 0 if no object is one."""
+    side: int
+    """Pixels along a tile."""
+    ratio: bool
+    """Whether objects shade the receiver."""
+    added: bool
+    """Whether virtual lights light the receiver."""
+
+
+@wp.func
+def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) -> wp.float32:
+    """Width of a surface's lobe; 0 for a mirror."""
+    if model == METALLIC_ROUGHNESS:
+        return roughness * roughness
+    if model == PHONG:
+        return 1.0 / wp.sqrt(wp.max(shininess, 1.0))
+    return 0.0
+
+
+@wp.func
+def ggx_ray_width(cos_theta: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Width of a ray, times the root of their number, whose half vector is this far from the normal."""
+    cos2 = wp.min(cos_theta * cos_theta, 1.0)
+    return (1.0 - cos2) / alpha + alpha * cos2
+
+
+@wp.func
+def phong_ray_width(cos_theta: wp.float32, exponent: wp.float32, alpha: wp.float32) -> wp.float32:
+    """The same for a ray this far from the mirror direction; no wider than the hemisphere."""
+    return wp.min(alpha * wp.exp(-0.5 * exponent * wp.log(wp.max(cos_theta, 1.0e-3))), 1.0)
+
+
+@functools.cache
+def make_look_near(config: NearFieldConfig) -> wp.Function:
+    """``look_near(...) -> vec4``: radiance of what is near along a ray, and 1; zero where only the environment is.
+
+    The receiver's radiance is that of the picture so far: its shadows and its virtual light included.
+    """
+    trace = make_trace(config.distant.trace)
+    closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
+    find_in_frame = make_find_in_frame(config.distant.trace, config.distant.probes)
+    shade_unoccluded = make_shade_unoccluded(config.distant)
+
+    @wp.func(module="unique")
+    def look_near(
+        params: FrameParams,
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        distant: DistantLight,
+        origin: wp.vec3,
+        direction: wp.vec3,
+        t_max: wp.float32,
+    ) -> wp.vec4:
+        other = closest_object(scene, origin, direction, t_max)
+        proxy = closest_proxy(scene, origin, direction, other.t)
+        if proxy.shape >= 0:
+            height = frame.shape[0]
+            width = frame.shape[1]
+            at = find_in_frame(params, height, width, scene, distant.probes, proxy.point, proxy.geometric_normal)
+            if at[0] < 0.0:
+                return wp.vec4(0.0)
+            radiance = look_up(frame, decode_table, at[0], at[1])
+            row = wp.int32(at[1] + 0.5)
+            column = wp.int32(at[0] + 0.5)
+            if wp.static(config.ratio):
+                radiance = wp.cw_mul(radiance, shadow_ratio[row, column])
+            if wp.static(config.added):
+                if inside_rect(row, column, params.light_rect):
+                    radiance += physical_added[row, column]
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        if other.shape >= 0:
+            radiance = shade_unoccluded(scene, distant, other, direction)
+            return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
+        return wp.vec4(0.0)
+
+    return look_near
+
+
+@functools.cache
+def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
+    """``mirror_pixel(...) -> vec4``: mean radiance that a mirror shows within a pixel, and 1; zero if no ray leaves it.
+
+    Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
+    """
+    look_near = make_look_near(config)
+    distant_mirrored = make_mirrored(config.distant)
+    closest_visible = make_primary(config.distant.trace)
+    sample_direction = make_sample_direction(config.mirror_samples)
+
+    @wp.func(module="unique")
+    def mirror_pixel(
+        params: wp.array[FrameParams],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        distant: DistantLight,
+        surface: Surface,
+        shape: wp.int32,
+        ray: wp.vec2,
+    ) -> wp.vec4:
+        total = wp.vec4(0.0)
+        for k in range(wp.static(config.mirror_samples)):
+            direction = wp.normalize(sample_direction(params, ray, k))
+            seen = closest_visible(scene, params[0].camera_position, direction)
+            if seen.shape == shape:
+                geometric = seen.geometric_normal
+                if wp.dot(geometric, direction) > 0.0:
+                    geometric = -geometric
+                outward = reflect(-direction, seen.normal)
+                if wp.dot(outward, geometric) > 0.0:
+                    origin = offset_origin(seen.point, geometric, outward, seen.error)
+                    shown = look_near(
+                        params[0],
+                        frame,
+                        decode_table,
+                        shadow_ratio,
+                        physical_added,
+                        scene,
+                        distant,
+                        origin,
+                        outward,
+                        FAR,
+                    )
+                    if shown[3] <= 0.0:
+                        beyond = distant_mirrored(
+                            distant, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
+                        )
+                        shown = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
+                    total += shown
+        return total / wp.max(total[3], 1.0)
+
+    return mirror_pixel
+
+
+@functools.cache
+def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    look_near = make_look_near(config)
+    surface_at = make_surface(config.distant.models, config.distant.textures)
+    mirror_pixel = make_mirror_pixel(config) if config.mirror_samples > 0 else None
+    side = config.side
+    lobes = config.lobe_count
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def near_field_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        rays: wp.array2d[wp.vec2],
+        frame: wp.array2d[wp.vec3ub],
+        decode_table: wp.array[wp.vec3],
+        shadow_ratio: wp.array2d[wp.vec3],
+        physical_added: wp.array2d[wp.vec3],
+        scene: RayScene,
+        distant: DistantLight,
+        samples: wp.array[EnvironmentSample],
+        stride: wp.int32,
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        # Out:
+        irradiance_out: wp.array2d[wp.vec3],
+        mirrored_out: wp.array2d[wp.vec4],
+        passed_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        if not inside_rect(i, j, params[0].object_rect):
+            return
+        if hit_object[i, j] < 0:
+            return
+        hit = hits[i, j]
+        ray = rays[i, j]
+        direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+        wo = -direction
+        normal = hit.normal
+        geometric = hit.geometric_normal
+        if wp.dot(geometric, wo) < 0.0:
+            normal = -normal
+            geometric = -geometric
+        cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
+        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        set_index = (i % side) * side + j % side
+
+        if wp.static(config.distant.diffuse != "none"):
+            total = wp.vec3(0.0)
+            if surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2] > 0.0:
+                first = set_index * stride
+                # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part
+                # of it is a smaller set.
+                share = wp.float32(stride * side * side) / wp.static(float(config.count))
+                for k in range(wp.static(config.count)):
+                    sample = samples[first + k]
+                    toward = sample_toward(sample, hit.point)
+                    cosine = wp.dot(normal, toward.direction)
+                    if cosine > 0.0:
+                        radiance = sample.radiance
+                        if wp.dot(geometric, toward.direction) <= 0.0:
+                            radiance = wp.vec3(0.0)
+                        else:
+                            origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
+                            near = look_near(
+                                params[0],
+                                frame,
+                                decode_table,
+                                shadow_ratio,
+                                physical_added,
+                                scene,
+                                distant,
+                                origin,
+                                toward.direction,
+                                toward.distance,
+                            )
+                            if near[3] > 0.0:
+                                radiance = wp.vec3(near[0], near[1], near[2])
+                        total += share * cosine * toward.measure * radiance
+            irradiance_out[i, j] = total
+
+        if wp.static(config.distant.specular):
+            mirrored = wp.vec4(0.0)
+            passed = wp.vec4(0.0)
+            leaving = float(0.0)  # rays; those into the surface are part of its reflectance
+            if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
+                alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
+                if wp.static(config.mirror_samples > 0):
+                    if alpha < SHARP:
+                        mirrored = mirror_pixel(
+                            params,
+                            frame,
+                            decode_table,
+                            shadow_ratio,
+                            physical_added,
+                            scene,
+                            distant,
+                            surface,
+                            hit.shape,
+                            ray,
+                        )
+                if wp.static(lobes > 0):
+                    if alpha >= SHARP:
+                        basis = frame_from_normal(normal)
+                        center = reflect(wo, normal)
+                        for k in range(wp.static(lobes)):
+                            index = wp.uint32(set_index * wp.static(lobes) + k)
+                            shift = wp.static(0.5 / (max(lobes, 1) * side * side))
+                            u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
+                            if surface.model == PHONG:
+                                outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+                                width = phong_ray_width(wp.dot(outward, center), surface.shininess, alpha)
+                            else:
+                                half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
+                                outward = reflect(wo, half)
+                                width = ggx_ray_width(wp.dot(half, normal), alpha)
+                            if wp.dot(outward, geometric) > 0.0:
+                                origin = offset_origin(hit.point, geometric, outward, hit.error)
+                                near = look_near(
+                                    params[0],
+                                    frame,
+                                    decode_table,
+                                    shadow_ratio,
+                                    physical_added,
+                                    scene,
+                                    distant,
+                                    origin,
+                                    outward,
+                                    FAR,
+                                )
+                                leaving += 1.0
+                                mirrored += near
+                                level = level_from_alpha(
+                                    wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width,
+                                    distant.level_height,
+                                )
+                                turned = outward
+                                if wp.static(config.distant.lamps):
+                                    turned = correct_parallax(distant.lamps, hit.point, outward)
+                                beyond = sample_levels(distant.levels, turned, level, distant.level_height)
+                                missed = (1.0 - near[3]) * beyond
+                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
+                mirrored = mirrored / wp.max(leaving, 1.0)
+                passed = passed / wp.max(leaving, 1.0)
+            mirrored_out[i, j] = mirrored
+            passed_out[i, j] = passed
+
+    return near_field_kernel
+
+
+@functools.cache
+def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
+    """Kernel of ``filter_near_field``."""
+    side = config.side
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def filter_near_field_kernel(
+        row_start: wp.int32,
+        # In:
+        params: wp.array[FrameParams],
+        scene: RayScene,
+        hit_object: wp.array2d[wp.int32],
+        hits: wp.array2d[Hit],
+        irradiance: wp.array2d[wp.vec3],
+        mirrored: wp.array2d[wp.vec4],
+        passed: wp.array2d[wp.vec4],
+        # Out:
+        irradiance_out: wp.array2d[wp.vec3],
+        mirrored_out: wp.array2d[wp.vec4],
+    ):
+        i, j = wp.tid()
+        i += row_start
+        rect = params[0].object_rect
+        if not inside_rect(i, j, rect):
+            return
+        found = hit_object[i, j]
+        if found < 0:
+            return
+        normal = hits[i, j].normal
+        material = scene.materials[scene.objects[found].material]
+        sharp = lobe_alpha(material.model, material.roughness, material.shininess) < SHARP
+        light = wp.vec3(0.0)
+        glossy = wp.vec4(0.0)
+        weights = float(0.0)
+        distant = wp.vec4(0.0)
+        reach = wp.static(side // 2)
+        for a in range(-reach, reach + 1):
+            for b in range(-reach, reach + 1):
+                if inside_rect(i + a, j + b, rect):
+                    if hit_object[i + a, j + b] == found and wp.dot(hits[i + a, j + b].normal, normal) > SAME_NORMAL:
+                        weight = wp.where(a == reach or a == -reach, 0.5, 1.0)
+                        weight *= wp.where(b == reach or b == -reach, 0.5, 1.0)
+                        weights += weight
+                        if wp.static(config.distant.diffuse != "none"):
+                            light += weight * irradiance[i + a, j + b]
+                        if wp.static(config.distant.specular):
+                            glossy += weight * mirrored[i + a, j + b]
+                            distant += weight * passed[i + a, j + b]
+        if wp.static(config.distant.diffuse != "none"):
+            irradiance_out[i, j] = light / weights
+        if wp.static(config.distant.specular):
+            if sharp:
+                mirrored_out[i, j] = mirrored[i, j]
+                return
+            near = glossy / weights
+            distant = distant / weights
+            missed = brightness(wp.vec3(distant[0], distant[1], distant[2]))
+            # What passes is no more than all; rounding may say otherwise.
+            left = wp.where(distant[3] > MIN_LIGHT, wp.min(missed / distant[3], 1.0), 1.0)
+            left *= 1.0 - near[3]
+            for channel in range(3):
+                near[channel] += near[3] * distant[channel]
+            near[3] = 1.0 - left
+            mirrored_out[i, j] = near
+
+    return filter_near_field_kernel
+
+
+def light_objects(
+    config: NearFieldConfig,
+    params: wp.array[FrameParams],
+    rays: wp.array2d[wp.vec2],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    shadow_ratio: wp.array2d[wp.vec3] | None,
+    physical_added: wp.array2d[wp.vec3] | None,
+    scene: RayScene,
+    distant: DistantLight,
+    samples: wp.array[EnvironmentSample] | None,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    irradiance_out: wp.array2d[wp.vec3] | None,
+    mirrored_out: wp.array2d[wp.vec4] | None,
+    passed_out: wp.array2d[wp.vec4] | None,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Estimate what surrounds the objects, each pixel with one set of samples.
+
+    Args:
+        config: What the scene calls for; what it leaves out may be None.
+        params: (1,) FrameParams: camera, object_rect and light_rect.
+        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
+        frame: (H, W) the camera's frame, RGB.
+        decode_table: (256,) of ``color.decode_table``.
+        shadow_ratio: (H, W) factor on the frame.
+        physical_added: (H, W) virtual light on the receiver.
+        scene: Objects and proxies.
+        distant: The environment.
+        samples: Samples of the environment, set after set.
+        hit_object: (H, W) as ``trace_pixels`` writes.
+        hits: (H, W) likewise.
+        irradiance_out: (H, W) irradiance; written only where an object is seen.
+        mirrored_out: (H, W) premultiplied near radiance and its share of the rays; likewise.
+        passed_out: (H, W) of glossy lobes: the environment along rays that meet nothing near, and its brightness along
+            all of them.
+        rows: Band of rows; None means all.
+    """
+    stride = 0 if samples is None else samples.shape[0] // config.side**2
+    launch_rows(
+        make_near_field_kernel(config),
+        rays.shape,
+        [
+            params,
+            rays,
+            frame,
+            decode_table,
+            shadow_ratio,
+            physical_added,
+            scene,
+            distant,
+            samples,
+            stride,
+            hit_object,
+            hits,
+        ],
+        [irradiance_out, mirrored_out, passed_out],
+        rows=rows,
+        device=rays.device,
+    )
+
+
+def filter_near_field(
+    config: NearFieldConfig,
+    params: wp.array[FrameParams],
+    scene: RayScene,
+    hit_object: wp.array2d[wp.int32],
+    hits: wp.array2d[Hit],
+    irradiance: wp.array2d[wp.vec3] | None,
+    mirrored: wp.array2d[wp.vec4] | None,
+    passed: wp.array2d[wp.vec4] | None,
+    irradiance_out: wp.array2d[wp.vec3] | None,
+    mirrored_out: wp.array2d[wp.vec4] | None,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Average the estimates over tiles, along objects only; arguments as ``light_objects``.
+
+    The last of ``mirrored_out`` is the share of the prefiltered environment that ``shade`` leaves out.
+    """
+    launch_rows(
+        make_filter_kernel(config),
+        hit_object.shape,
+        [params, scene, hit_object, hits, irradiance, mirrored, passed],
+        [irradiance_out, mirrored_out],
+        rows=rows,
+        device=hit_object.device,
+    )

@@ -1,0 +1,469 @@
+"""The mirror ball unwrapped: which light arrives at it from every direction.
+
+The environment is taken to be distant: the light from direction d is the same everywhere on the ball. Seen from the
+ball's centre, with the axis a toward the camera and D = distance / radius, the ball's point with normal n at angle
+theta from a (in the plane of a and d) looks at the camera along v = (D a - n) / |D a - n|, at angle beta = atan2(sin
+theta, D - cos theta) on the other side of the axis, and so reflects light that arrives from the angle
+
+    f(theta) = 2 theta + beta(theta),    f'(theta) = 2 + (D cos theta - 1) / |D a - n|^2,
+
+which is theta + atan2(D sin theta, D cos theta - 1) written without the difference of two nearly equal numbers. On the
+visible cap, 0 <= theta <= acos(1 / D), f rises from 0 to acos(1 / D) + pi / 2 and is concave, so Newton's method finds
+theta for a given d; what lies beyond is the blind cone behind the ball. The iteration turns n by e / f', where e, the
+angle still missing, is the cross product of the reflected direction and d: square roots only, and nothing is divided by
+the sine of an angle that can be zero (light that returns straight to the camera).
+
+The point is then projected through the lens to where the frame shows it. This is done at the texels' corners; within a
+texel, samples are placed by bilinear interpolation between its corners, as many as its footprint is long in pixels, so
+that each pixel of the ball counts.
+
+Confidence is 0 where the ball says nothing (blind, outside the frame, hidden by a proxy or by another ball) and where
+what lies behind the ball could leak in: pixels nearer than ``rim_start`` to the silhouette. It rises over the next
+``rim_width`` pixels, and is scaled by density / (density + ``HALF_DENSITY``), the share that a ball of that many pixels
+per steradian is worth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
+from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
+
+wp.set_module_options({"enable_backward": False})
+
+METHODS = ("bilinear", "area")
+
+RIM_START = 2.5
+"""Pixels from the silhouette at which confidence starts. Along a diagonal a bilinear sample reaches 1.4 pixels and the
+pixel it finds there spreads over another 0.7; the rest is for the tracked outline, which errs by about half a pixel."""
+RIM_WIDTH = 1.5
+"""Pixels over which confidence then rises to its full value."""
+
+MAX_SAMPLES = wp.constant(8)  # per side of a texel
+HALF_DENSITY = wp.constant(wp.float32(4.0))  # pixels per steradian: a ball of 8 pixels across
+NEWTON_STEPS = wp.constant(12)  # 2 to 4 are taken from half a metre; more only where the camera almost touches the ball
+CONVERGED = wp.constant(wp.float32(1.0e-7))  # squared angle: 0.02 degrees, which the step then taken squares once more
+FOLD_TOLERANCE = wp.constant(wp.float32(3.0))  # pixels
+CONTACT = wp.constant(wp.float32(0.02))  # radii: what touches the ball does not hide the point that it touches
+
+
+@wp.func
+def reflecting_normal(distance: wp.float32, cos_psi: wp.float32, sin_psi: wp.float32) -> wp.vec2:
+    """Normal (along the axis, across it) of the ball's point that reflects light from angle psi to the camera.
+
+    Args:
+        distance: From the ball's centre to the camera, in radii; above 1.
+        cos_psi: Cosine of the angle between the light's direction and the axis toward the camera.
+        sin_psi: Its sine, not negative.
+
+    Returns:
+        Unit vector in the plane of both; meaningful only outside the blind cone.
+    """
+    least = 1.0 / distance  # cos theta at the silhouette
+    # Both angles near the axis: theta = psi (D - 1) / (2 D - 1), the exact slope of f there.
+    share = (distance - 1.0) / (2.0 * distance - 1.0)
+    n = wp.normalize(wp.vec2(1.0 - share + share * cos_psi, share * sin_psi))
+    if cos_psi < 0.0:
+        n = wp.normalize(wp.vec2(1.0 + cos_psi, sin_psi))
+    for _step in range(NEWTON_STEPS):
+        if n[0] < least:
+            n = wp.vec2(least, wp.sqrt((1.0 - least) * (1.0 + least)))
+        toward = wp.vec2(distance - n[0], -n[1])
+        length_squared = wp.dot(toward, toward)
+        v = toward / wp.sqrt(length_squared)
+        r = 2.0 * wp.dot(n, v) * n - v
+        missing = r[0] * sin_psi - r[1] * cos_psi
+        if r[0] * cos_psi + r[1] * sin_psi < 0.0:
+            missing = wp.sign(missing)  # more than a right angle
+        turn = missing / (2.0 + (distance * n[0] - 1.0) / length_squared)
+        n = wp.normalize(wp.vec2(n[0] - turn * n[1], wp.max(n[1] + turn * n[0], 0.0)))
+        if missing * missing < CONVERGED:
+            break
+    return n
+
+
+@wp.func
+def any_perpendicular(axis: wp.vec3) -> wp.vec3:
+    """Some unit vector across a unit vector."""
+    other = wp.vec3(1.0, 0.0, 0.0)
+    if wp.abs(axis[0]) > 0.6:
+        other = wp.vec3(0.0, 1.0, 0.0)
+    return wp.normalize(wp.cross(axis, other))
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectConfig:
+    """What can hide a ball."""
+
+    occluders: tuple[int, ...] = ()
+    """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
+
+    def general(self) -> ProjectConfig:
+        """For any scene."""
+        return ProjectConfig(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
+
+
+@functools.cache
+def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
+    """Kernel specialised to ``config``; equal configs share one kernel."""
+    kinds = config.occluders
+
+    @wp.func(name=f"hidden_by_proxies_{'_'.join(map(str, kinds))}", module="unique")
+    def hidden_by_proxies(
+        scene: RayScene, origin: wp.vec3, ray: wp.vec3, t_max: wp.float32, pad: wp.float32
+    ) -> wp.bool:
+        # Proxies grow by `pad` metres, the rim's width: what lies right beside them in the picture may show them.
+        for index in range(scene.proxies.shape[0]):
+            shape = scene.proxies[index]
+            o = to_local_point(shape, origin)
+            d = to_local_vector(shape, ray)
+            half = shape.extent + wp.vec3(1.0, 1.0, 1.0) * (pad / shape.scale)
+            if wp.static(PLANE in kinds):
+                if shape.kind == PLANE:
+                    if intersect_plane(half, o, d, t_max) < FAR:
+                        return True
+            if wp.static(BOX in kinds):
+                if shape.kind == BOX:
+                    if intersect_box(half, o, d, t_max) < FAR:
+                        return True
+            if wp.static(MESH in kinds):
+                if shape.kind == MESH:
+                    if meets_mesh(shape, o, d, t_max):
+                        return True
+                    # A mesh does not grow: four rays around this one look for it instead.
+                    across = any_perpendicular(wp.normalize(d)) * (pad / shape.scale)
+                    up = wp.cross(wp.normalize(d), across)
+                    if meets_mesh(shape, o, d + across, t_max) or meets_mesh(shape, o, d - across, t_max):
+                        return True
+                    if meets_mesh(shape, o, d + up, t_max) or meets_mesh(shape, o, d - up, t_max):
+                        return True
+        return False
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def project_corners_kernel(
+        # In:
+        row_start: wp.int32,
+        params: wp.array[FrameParams],
+        probes: wp.array[Probe],
+        rays: wp.array2d[wp.vec2],
+        scene: RayScene,
+        rim_start: wp.float32,
+        # Out:
+        corners_out: wp.array3d[wp.vec3],
+    ):
+        band_row, column, index = wp.tid()
+        row = row_start + band_row
+        height = corners_out.shape[0] - 1
+        width = corners_out.shape[1] - 1
+        corners_out[row, column, index] = wp.vec3(0.0, 0.0, -1.0)
+
+        camera = params[0]
+        probe = probes[index]
+        to_camera = camera.camera_position - probe.center
+        away = wp.length(to_camera)
+        distance = away / probe.radius
+        if not distance > 1.0001 or not distance < 1.0e6:
+            return  # the camera is inside the ball, or nowhere
+        axis = to_camera / away
+        light = direction_from_latlong(wp.float32(row), wp.float32(column), height, width)
+        cos_psi = wp.dot(light, axis)
+        side = light - cos_psi * axis
+        sin_psi = wp.length(side)
+        least = 1.0 / distance
+        rim_sine = wp.sqrt((1.0 - least) * (1.0 + least))
+        if cos_psi <= -rim_sine:
+            return  # blind cone: psi >= acos(1 / D) + pi / 2
+        if sin_psi <= 1.0e-6:  # straight back: any plane through the axis will do
+            side = any_perpendicular(axis)
+        side = wp.normalize(side)
+
+        n = reflecting_normal(distance, cos_psi, sin_psi)
+        # Relative to the camera from the start: far from the world's origin nothing cancels.
+        point = probe.radius * (n[0] * axis + n[1] * side) - to_camera
+        rim = probe.radius * (least * axis + rim_sine * side) - to_camera
+        seen = project(camera, point)
+        edge = project(camera, rim)
+        if seen[2] < 0.01 * probe.radius or edge[2] < 0.01 * probe.radius:
+            return  # beside or behind the lens
+        margin = wp.length(wp.vec2(edge[0] - seen[0], edge[1] - seen[1]))
+
+        # A polynomial lens model folds over beyond its field of view: there the pixel's own ray is another one.
+        i = wp.int32(wp.round(wp.clamp(seen[1], 0.0, wp.float32(rays.shape[0] - 1))))
+        j = wp.int32(wp.round(wp.clamp(seen[0], 0.0, wp.float32(rays.shape[1] - 1))))
+        if wp.abs(seen[1] - wp.float32(i)) < 1.0 and wp.abs(seen[0] - wp.float32(j)) < 1.0:
+            p = wp.transpose(camera.world_from_camera) * point
+            off = wp.cw_mul(wp.vec2(p[0] / p[2], p[1] / p[2]) - rays[i, j], camera.focal)
+            if wp.length(off) > FOLD_TOLERANCE:
+                return
+
+        reach = wp.length(point)
+        pad = rim_start * reach / wp.min(camera.focal[0], camera.focal[1])
+        t_max = 1.0 - CONTACT * probe.radius / reach
+        for other in range(probes.shape[0]):
+            if other != index:
+                o = camera.camera_position - probes[other].center
+                b = -wp.dot(o, point)
+                nearest = o + wp.clamp(b / (reach * reach), 0.0, t_max) * point
+                if wp.length(nearest) < probes[other].radius + pad:
+                    return
+        if wp.static(len(kinds) > 0):
+            if hidden_by_proxies(scene, camera.camera_position, point, t_max, pad):
+                return
+        corners_out[row, column, index] = wp.vec3(seen[0], seen[1], margin)
+
+    return project_corners_kernel
+
+
+def project_corners(
+    params: wp.array,
+    probes: wp.array,
+    rays: wp.array,
+    scene: RayScene,
+    corners_out: wp.array,
+    *,
+    config: ProjectConfig,
+    rim_start: float = RIM_START,
+    rows: Rows | None = None,
+) -> None:
+    """Find where the frame shows the reflected light of every texel corner's direction.
+
+    Args:
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P).
+        rays: Undistorted normalised coordinates of the frame's pixel centres, ``wp.vec2`` (frame rows, columns).
+        scene: What can hide the balls: its proxies.
+        corners_out: ``wp.vec3`` (h + 1, w + 1, P): pixel column, pixel row, and pixels from there to the ball's
+            silhouette; the last is -1 where the direction is not seen.
+        config: Kinds of proxy.
+        rim_start: Pixels around a proxy's outline that count as hidden as well.
+        rows: Band of corner rows, None for all h + 1.
+    """
+    launch_rows(
+        make_project_corners_kernel(config),
+        corners_out.shape,
+        [params, probes, rays, scene, rim_start],
+        [corners_out],
+        rows=rows,
+        device=corners_out.device,
+    )
+
+
+@wp.func
+def mix(a: wp.vec3, b: wp.vec3, t: wp.float32) -> wp.vec3:
+    """From a to b; exact where both are equal."""
+    return a + t * (b - a)
+
+
+GATHER_LANES = 8
+"""Threads that share a texel's samples on CUDA; on CPU one has them all."""
+FEW_TEXELS = 16384
+"""Texels up to which they do; each of more is small in the frame, and has few samples."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_xor_sync(0xffu << (threadIdx.x & 24), value, reach);
+#else
+    return value;
+#endif
+""")
+def lane_across(value: wp.float32, reach: wp.int32) -> wp.float32:
+    """Value of the lane whose number among the ``GATHER_LANES`` of a texel differs by the bit ``reach``."""
+
+
+@wp.func
+def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
+    """``lane_across`` of a vector."""
+    return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
+
+
+@functools.cache
+def make_gather_probe_kernel(method: str) -> wp.Kernel:
+    """Kernel of one method; raises ValueError for an unknown one."""
+    if method not in METHODS:
+        raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gather_probe_kernel(
+        # In:
+        row_start: wp.int32,
+        lanes: wp.int32,
+        frame: wp.array2d[wp.vec3ub],
+        table: wp.array[wp.vec3],
+        probes: wp.array[Probe],
+        corners: wp.array3d[wp.vec3],
+        rim_start: wp.float32,
+        rim_width: wp.float32,
+        # Out:
+        radiance_out: wp.array2d[wp.vec3],
+        confidence_out: wp.array2d[wp.float32],
+        clipped_out: wp.array2d[wp.vec3],
+    ):
+        band_row, column, lane = wp.tid()
+        row = row_start + band_row
+        height = radiance_out.shape[0]
+        width = radiance_out.shape[1]
+        last_row = wp.float32(frame.shape[0] - 1)
+        last_column = wp.float32(frame.shape[1] - 1)
+
+        radiance = wp.vec3(0.0, 0.0, 0.0)
+        clipped = wp.vec3(0.0, 0.0, 0.0)
+        confidence = wp.float32(0.0)
+        votes = wp.float32(0.0)
+        for index in range(probes.shape[0]):
+            c00 = corners[row, column, index]
+            c01 = corners[row, column + 1, index]
+            c10 = corners[row + 1, column, index]
+            c11 = corners[row + 1, column + 1, index]
+            seen = wp.min(wp.min(c00[2], c01[2]), wp.min(c10[2], c11[2])) >= 0.0
+            closest = wp.max(wp.max(c00[2], c01[2]), wp.max(c10[2], c11[2]))
+            if seen and closest > rim_start:
+                count_y = 1
+                count_x = 1
+                if wp.static(method == "area"):
+                    count_y = footprint_samples(c00, c10, c01, c11)
+                    count_x = footprint_samples(c00, c01, c10, c11)
+                # Running means, m += (x - m) w / W: exact where all x are equal, so a constant frame gives a constant
+                # map.
+                mean = wp.vec3(0.0, 0.0, 0.0)
+                mean_clipped = wp.vec3(0.0, 0.0, 0.0)
+                total = wp.float32(0.0)
+                possible = wp.float32(0.0)
+                line = wp.int32(-1)
+                area = wp.float32(0.0)
+                left = wp.vec3(0.0, 0.0, 0.0)
+                right = wp.vec3(0.0, 0.0, 0.0)
+                for sample in range(lane, count_y * count_x, lanes):
+                    a = sample // count_x
+                    b = sample % count_x
+                    if a != line:
+                        line = a
+                        y = (wp.float32(a) + 0.5) / wp.float32(count_y)
+                        # Solid angle of this part of the texel.
+                        area = wp.sin(PI * (wp.float32(row) + y) / wp.float32(height))
+                        left = mix(c00, c10, y)
+                        right = mix(c01, c11, y)
+                    at = mix(left, right, (wp.float32(b) + 0.5) / wp.float32(count_x))
+                    possible += area
+                    # At the frame's border the same ramp as at the rim.
+                    inside = wp.min(wp.min(at[0], last_column - at[0]), wp.min(at[1], last_row - at[1]))
+                    ramp = wp.clamp(wp.min(at[2] - rim_start, inside) / rim_width, 0.0, 1.0)
+                    if inside >= 0.0 and ramp > 0.0:
+                        weight = area * ramp * ramp * (3.0 - 2.0 * ramp)
+                        i = wp.int32(at[1])
+                        j = wp.int32(at[0])
+                        fy = at[1] - wp.float32(i)
+                        fx = at[0] - wp.float32(j)
+                        i1 = wp.min(i + 1, frame.shape[0] - 1)
+                        j1 = wp.min(j + 1, frame.shape[1] - 1)
+                        p00 = frame[i, j]
+                        p01 = frame[i, j1]
+                        p10 = frame[i1, j]
+                        p11 = frame[i1, j1]
+                        top = mix(decode(table, p00), decode(table, p01), fx)
+                        value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
+                        top = mix(is_clipped(p00), is_clipped(p01), fx)
+                        saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
+                        total += weight
+                        mean = mix(mean, value, weight / total)
+                        mean_clipped = mix(mean_clipped, saturated, weight / total)
+                reach = lanes / 2
+                while reach > 0:
+                    other = lane_across(total, reach)
+                    mean_across = vec_across(mean, reach)
+                    clipped_across = vec_across(mean_clipped, reach)
+                    possible += lane_across(possible, reach)
+                    if total + other > 0.0:
+                        # The lower lane's mean first: all lanes get the same bits.
+                        t = other / (total + other)
+                        if (lane & reach) == 0:
+                            mean = mix(mean, mean_across, t)
+                            mean_clipped = mix(mean_clipped, clipped_across, t)
+                        else:
+                            mean = mix(mean_across, mean, total / (total + other))
+                            mean_clipped = mix(clipped_across, mean_clipped, total / (total + other))
+                    total += other
+                    reach = reach / 2
+                if total > 0.0:
+                    across = c11 - c00
+                    along = c10 - c01
+                    pixels = 0.5 * wp.abs(across[0] * along[1] - across[1] * along[0])
+                    density = pixels / texel_solid_angle(row, height, width)
+                    certainty = total / possible * density / (density + HALF_DENSITY)
+                    # Of several balls the sharper one has the say: a vote per pixel.
+                    vote = certainty * density
+                    votes += vote
+                    if votes > 0.0:
+                        radiance = mix(radiance, wp.cw_div(mean, probes[index].reflectance), vote / votes)
+                        clipped = mix(clipped, mean_clipped, vote / votes)
+                        confidence = wp.max(confidence, certainty)
+        if lane == 0:
+            radiance_out[row, column] = radiance
+            confidence_out[row, column] = confidence
+            clipped_out[row, column] = clipped
+
+    return gather_probe_kernel
+
+
+@wp.func
+def footprint_samples(a0: wp.vec3, a1: wp.vec3, b0: wp.vec3, b1: wp.vec3) -> wp.int32:
+    """Samples along one side of a footprint: one per pixel of the longer of its two edges."""
+    a = wp.vec2(a1[0] - a0[0], a1[1] - a0[1])
+    b = wp.vec2(b1[0] - b0[0], b1[1] - b0[1])
+    longest = wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
+    return wp.int32(wp.clamp(wp.ceil(longest), 1.0, wp.float32(MAX_SAMPLES)))
+
+
+def gather_probe(
+    frame: wp.array,
+    decode_table: wp.array,
+    probes: wp.array,
+    corners: wp.array,
+    radiance_out: wp.array,
+    confidence_out: wp.array,
+    clipped_out: wp.array,
+    *,
+    method: str = "area",
+    rim_start: float = RIM_START,
+    rim_width: float = RIM_WIDTH,
+    rows: Rows | None = None,
+) -> None:
+    """Average the frame over every texel's footprint and undo the ball's reflectance.
+
+    Args:
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
+        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        probes: ``Probe`` (P); reflectances must be positive.
+        corners: From ``project_corners``, (h + 1, w + 1, P).
+        radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
+        confidence_out: ``wp.float32`` (h, w) in 0..1.
+        clipped_out: ``wp.vec3`` (h, w): share of the footprint that is at clipping, per channel.
+        method: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
+            up to 8 x 8.
+        rim_start: Pixels from the silhouette that are not used.
+        rim_width: Pixels over which confidence then rises.
+        rows: Band of texel rows, None for all.
+
+    Raises:
+        ValueError: There is no such method.
+    """
+    # A texel has one sample but at the method that averages. Many texels keep a device busy by themselves.
+    lanes = 1
+    if method == "area" and radiance_out.device.is_cuda:
+        lanes = GATHER_LANES if radiance_out.size <= FEW_TEXELS else 2
+    launch_rows(
+        make_gather_probe_kernel(method),
+        (*radiance_out.shape, lanes),
+        [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
+        [radiance_out, confidence_out, clipped_out],
+        rows=rows,
+        device=radiance_out.device,
+    )

@@ -1,0 +1,191 @@
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.error_model import check_error
+from tests.reference import accumulate as reference
+from warp_ar.kernels import accumulate
+from warp_ar.kernels.structs import FrameParams
+
+# Float32 sums and exponentials, a few roundings each.
+ROUNDING = 2e-6
+# The same accumulated over the levels of a pyramid, or over a hundred frames.
+SUMS = 2e-5
+
+
+class Light:
+    """The accumulation's arrays, and a frame after another into them."""
+
+    def __init__(self, height=16, width=32):
+        self.radiance, self.clipped = (wp.zeros((height, width), dtype=wp.vec3) for _ in range(2))
+        self.confidence = wp.zeros((height, width), dtype=wp.float32)
+        self.change = wp.zeros(accumulate.change_shape(height, width), dtype=wp.vec2)
+        self.shape = (height, width)
+
+    def step(self, radiance, confidence=1.0, clipped=0.0, time_step=1 / 30, reset=0):
+        params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
+        params["time_step"], params["environment_reset"] = time_step, reset
+        h, w = self.shape
+        x = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(radiance), (h, w, 3))), dtype=wp.vec3)
+        c = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(confidence), (h, w))), dtype=wp.float32)
+        s = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(clipped), (h, w, 3))), dtype=wp.vec3)
+        accumulate.measure_change(x, c, self.radiance, self.confidence, self.change)
+        accumulate.accumulate_environment(
+            x, c, s, self.change, wp.array(params, dtype=FrameParams), self.radiance, self.confidence, self.clipped
+        )
+        return self.radiance.numpy()
+
+
+def test_accumulation_matches_twin(device):
+    """Noise, a moving mask, a jump in part of the map, uneven frame times."""
+    rng = np.random.default_rng(1)
+    light, twin = Light(24, 48), reference.Accumulator(24, 48)
+    base = rng.uniform(0.1, 1, (24, 48, 3))
+    for frame in range(60):
+        x = base * rng.normal(1, 0.05, base.shape)
+        x[:, 20:30] *= 1.0 if frame < 30 else 2.5
+        c = rng.uniform(0, 1, (24, 48)) * (rng.random((24, 48)) > 0.3)
+        x, c = np.float32(x), np.float32(c)
+        share, dt = np.float32(rng.random(x.shape)), float(rng.uniform(0.01, 0.1))
+        light.step(x, c, share, dt)
+        twin.step(x.astype(float), c.astype(float), share.astype(float), dt)
+    np.testing.assert_allclose(light.radiance.numpy(), twin.environment, atol=SUMS)
+    np.testing.assert_allclose(light.confidence.numpy(), twin.confidence, atol=SUMS)
+    np.testing.assert_allclose(light.clipped.numpy(), twin.clipped, atol=SUMS)
+    check_error("accumulate", light.radiance.numpy(), twin.environment)
+
+
+def test_first_sight_is_taken_whole(device):
+    light = Light()
+    assert (light.step(0.7, 0.1, time_step=0.0) == np.float32(0.7)).all()
+    assert (light.confidence.numpy() == np.float32(0.1)).all()
+
+
+def test_no_drift_over_ten_thousand_frames(device):
+    """Hard case 7: a constant environment, seen with changing confidence, stays as it is to the bit."""
+    rng = np.random.default_rng(2)
+    light = Light(8, 16)
+    surroundings = np.float32(rng.uniform(1e-4, 3, (8, 16, 3)))
+    masks = np.float32(rng.random((16, 8, 16)) * (rng.random((16, 8, 16)) > 0.2))
+    light.step(surroundings)
+    for frame in range(10_000):
+        light.step(surroundings, masks[frame % 16])
+    assert (light.radiance.numpy() == surroundings).all()
+    assert light.confidence.numpy().min() > 0.3
+
+
+@pytest.mark.parametrize("fps", [12, 30, 120])
+@pytest.mark.parametrize(("old", "new"), [(0.2, 0.9), (0.9, 0.2), (0.5, 0.51), (1.0, 0.0), (0.0, 1.0)])
+def test_follows_the_environment_within_half_a_second(device, fps, old, new):
+    light = Light()
+    for _ in range(5):
+        light.step(old, time_step=1 / fps)
+    for _ in range(int(np.ceil(0.5 * fps))):
+        now = light.step(new, time_step=1 / fps)
+    assert np.abs(now - new).max() <= 0.05 * abs(new - old)
+
+
+def test_small_changes_do_not_depend_on_the_frame_rate(device):
+    """A step of 2 % has its exponential time constant at any rate."""
+    left = []
+    for fps in (10, 25, 100):
+        light = Light()
+        light.step(0.5)
+        for _ in range(int(0.2 * fps)):
+            now = light.step(0.51, time_step=1 / fps)
+        left.append((0.51 - now[0, 0, 0]) / 0.01)
+    np.testing.assert_allclose(left, np.exp(-0.2 / 0.15), rtol=0.02)
+
+
+def test_noise_is_averaged_and_jitter_is_no_change(device):
+    """A sharp edge that jumps a texel to and fro, with sensor noise: steadier by more than half, and right on
+    average."""
+    rng = np.random.default_rng(3)
+    light = Light(32, 64)
+    kept = []
+    for frame in range(200):
+        x = np.full((32, 64, 3), 0.2)
+        x[:, 24 + frame % 2 : 40] = 0.9
+        x += rng.normal(0, 0.02, x.shape)
+        now = light.step(x)
+        if frame >= 50:
+            kept.append(now.copy())
+    kept = np.array(kept)
+    assert kept[:, :, 30].std(0).mean() < 0.01
+    assert kept[:, :, 24].std(0).mean() < 0.3 * 0.35
+    assert kept[:, :, 24].mean() == pytest.approx(0.55, abs=0.02)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_not_a_number_never_enters(device, bad):
+    """Hard cases 6 and 7."""
+    light = Light()
+    light.step(0.5)
+    x = np.full((16, 32, 3), 0.5)
+    x[3, 4, 1] = bad
+    assert (light.step(x) == np.float32(0.5)).all()
+    assert (light.step(0.5, bad) == np.float32(0.5)).all()
+    fresh = Light()
+    fresh.step(x)
+    assert np.isfinite(fresh.radiance.numpy()).all()
+    assert fresh.confidence.numpy()[3, 4] == 0
+
+
+def test_a_spoilt_state_heals(device):
+    """Whatever is in the arrays, one good frame replaces it."""
+    light = Light()
+    light.step(0.5)
+    spoilt = light.radiance.numpy().copy()
+    spoilt[2, 3] = np.nan
+    light.radiance.assign(spoilt)
+    assert (light.step(0.5) == np.float32(0.5)).all()
+
+
+def test_one_corrupt_frame_neither_enters_fast_nor_stays(device):
+    """Hard case 7: white garbage for one frame."""
+    light = Light()
+    for _ in range(10):
+        light.step(0.2)
+    assert np.abs(light.step(1.0) - 0.2).max() < 0.25 * 0.8  # 1 - exp(-1/30 / 0.15) = 0.2
+    for _ in range(15):
+        now = light.step(0.2)
+    assert np.abs(now - 0.2).max() < 0.01 * 0.8
+
+
+def test_what_is_out_of_sight_is_remembered_less_and_less(device):
+    light = Light()
+    light.step(0.4)
+    for _ in range(300):
+        now = light.step(0.9, 0.0)
+    assert (now == np.float32(0.4)).all()
+    np.testing.assert_allclose(light.confidence.numpy(), np.exp(-10 / 20), rtol=1e-4)
+
+
+def test_the_better_view_has_the_say(device):
+    """A glimpse of low confidence moves a well-known texel less, and a good view moves a poorly known one more."""
+    poor, good = Light(), Light()
+    poor.step(0.50, 1.0)
+    good.step(0.50, 0.1)
+    moved_poor = poor.step(0.51, 0.1)[0, 0, 0] - 0.5
+    moved_good = good.step(0.51, 1.0)[0, 0, 0] - 0.5
+    alike = 0.01 * (1 - np.exp(-1 / 30 / 0.15))
+    assert moved_poor < 0.5 * alike < 2 * alike < moved_good
+
+
+def test_reset_forgets(device):
+    light = Light()
+    light.step(0.4)
+    now = light.step(0.9, np.where(np.arange(32) < 16, 1.0, 0.0)[None], reset=1)
+    assert (now[:, :16] == np.float32(0.9)).all()
+    assert (now[:, 16:] == 0).all()
+    assert (light.confidence.numpy()[:, 16:] == 0).all()
+
+
+@pytest.mark.parametrize("time_step", [np.nan, -1.0, 0.0, 1e9, np.inf])
+def test_odd_clocks(device, time_step):
+    light = Light()
+    light.step(0.4)
+    now = light.step(0.9, time_step=time_step)
+    assert np.isfinite(now).all()
+    assert np.isfinite(light.confidence.numpy()).all()
+    assert (now == np.float32(0.9 if time_step > 1 else 0.4)).all()

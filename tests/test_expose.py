@@ -1,0 +1,231 @@
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.error_model import check_error
+from tests.reference import color as reference_color
+from tests.reference import composite as reference_composite
+from tests.reference import expose as reference
+from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params, tables
+from warp_ar.kernels import color, expose, summed_area
+
+# How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
+BIN = 2.0**0.125
+SCALES = [0.0, 0.01, 0.25, 0.5, 0.9, np.nextafter(np.float32(1), np.float32(0)), 1.0, 1.5, 4.0]
+
+
+def run(
+    frame, scale, method="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, mirrored=None, transfer="srgb"
+):
+    frame_array = wp.array(frame, dtype=wp.vec3ub)
+    shape = frame.shape[:2]
+    height, width = shape
+    params = make_params(*4 * [(0, height, 0, width)], scale)
+    decode, encode = tables(transfer)
+    table, scale_array = wp.zeros(shape, wp.uint32), wp.zeros(1, wp.float32)
+    codes, image = wp.zeros(256, wp.vec3ub), wp.zeros(shape, wp.vec3ub)
+    summed_area.sum_area(frame_array, table)
+    expose.read_scale(params, scale_array)
+    expose.expose_codes(decode, encode, scale_array, codes)
+    over = make_arrays(virtual, added, ratio, mirrored)
+    config = expose.ExposeConfig(method, layers)
+    expose.expose(
+        config,
+        params,
+        frame_array,
+        decode,
+        encode,
+        over,
+        table,
+        scale_array,
+        codes,
+        image,
+        declipped=wp.array(declipped(frame, transfer), dtype=wp.vec3),
+    )
+    return image.numpy()
+
+
+def declipped(frame, transfer="srgb"):
+    """An estimate to expose: three times clipping wherever a channel clips, in that channel."""
+    return np.where(frame >= 254, 3.0, linear(frame, transfer))
+
+
+def linear(frame, transfer="srgb"):
+    return reference_color.decode(color.decode_table(transfer), frame)
+
+
+def disc(size=96, radius=20):
+    """A white disc on dark grey."""
+    y, x = np.mgrid[:size, :size] - size // 2
+    return np.repeat(np.where(x * x + y * y <= radius * radius, 255, 40).astype(np.uint8)[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
+@pytest.mark.parametrize("method", expose.METHODS)
+def test_scale_one_is_the_identity(device, method, transfer):
+    frame = make_layers()[0]
+    np.testing.assert_array_equal(run(frame, 1.0, method, transfer=transfer), frame)
+
+
+@pytest.mark.parametrize("method", expose.METHODS)
+@pytest.mark.parametrize("frame", [disc(), np.full((20, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
+def test_scale_zero_is_black(device, frame, method):
+    np.testing.assert_array_equal(run(frame, 0.0, method), 0)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_plain_scales_linear_light(device, scale):
+    frame = make_layers(1)[0]
+    exact = reference_color.encoded_srgb(np.clip(linear(frame) * np.float64(scale), 0.0, 1.0))
+    check_error("expose", run(frame, scale, "plain"), exact)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_box_matches_twin(device, scale):
+    frame = np.concatenate([disc(48, 10), make_layers(2)[0][:, :40].repeat(2, 0)], axis=1)
+    gains = reference.gains(frame, scale, expose.largest_box(frame.shape[0]))
+    exact = reference_color.encoded_srgb(np.clip(linear(frame) * gains[..., None] * np.float64(scale), 0.0, 1.0))
+    check_error("expose", run(frame, scale), exact)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])
+def test_layers_are_composed_before_they_are_exposed(device, scale):
+    frame, *layers = make_layers(3)
+    gains = reference.gains(frame, scale, expose.largest_box(H))
+    total = reference_composite.compose(linear(frame) * gains[..., None], *layers)
+    exact = reference_color.encoded_srgb(np.clip(scale * total, 0.0, 1.0))
+    check_error("expose", run(frame, scale, "box", CONFIGS[15], *layers), exact)
+
+
+def test_centre_stays_bright_and_edge_fades(device):
+    """Figure 7 of the paper: at half the exposure the middle of a large disc is white, its rim grey."""
+    frame = disc(96, 30)
+    box, plain = run(frame, 0.5)[..., 0].astype(int), run(frame, 0.5, "plain")[..., 0].astype(int)
+    assert box[48, 48] == 255
+    assert plain[48, 48] == 188
+    profile = box[48, 48:79]
+    assert (np.diff(profile) <= 0).all()
+    assert profile[-1] < 220
+    unclipped = frame[..., 0] < 255
+    np.testing.assert_array_equal(box[unclipped], plain[unclipped])
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_declipped_pixels_show_their_estimate(device, scale):
+    frame = make_layers(4)[0]
+    frame[::3, ::2, 0] = 255
+    frame[::5, ::5] = 255
+    radiance = declipped(frame) if scale < 1.0 else linear(frame)  # only a shorter exposure shows it
+    exact = reference_color.encoded_srgb(np.clip(radiance * np.float64(scale), 0.0, 1.0))
+    check_error("expose", run(frame, scale, "declipped"), exact)
+
+
+def test_pixel_with_a_hue_is_not_lifted(device):
+    """Orange that clips in red alone fades with its surroundings, however large it is."""
+    frame = np.full((64, 64, 3), (255, 230, 120), np.uint8)
+    np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
+
+
+def test_extreme_darkening_takes_a_small_region_like_the_rest(device):
+    """A disc smaller than half the largest box."""
+    frame = disc(400, 12)
+    np.testing.assert_array_equal(run(frame, 0.05), run(frame, 0.05, "plain"))
+
+
+@pytest.mark.parametrize("frame", [disc(96, 30), np.full((30, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
+def test_brightness_never_falls_as_the_scale_rises(device, frame):
+    """No pixel may flash while the exposure is turned down; also continuous at 1."""
+    before = run(frame, 0.0).astype(int)
+    for scale in np.linspace(0.05, 1.0, 20):
+        now = run(frame, scale).astype(int)
+        assert (now >= before).all()
+        before = now
+    almost = run(frame, np.nextafter(np.float32(1), np.float32(0))).astype(int)
+    assert np.abs(almost - frame).max() <= 0
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_all_black_stays_black(device, scale):
+    np.testing.assert_array_equal(run(np.zeros((20, 30, 3), np.uint8), scale), 0)
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 0.9])
+def test_all_saturated_darkens_by_the_bound(device, scale):
+    expected = reference_color.encode(np.array(min(1.0, 2.0 * scale)), reference_color.encoded_srgb)
+    np.testing.assert_array_equal(run(np.full((64, 64, 3), 255, np.uint8), scale), expected)
+
+
+def test_one_saturated_pixel_fades_with_the_rest(device):
+    frame = np.full((80, 80, 3), 60, np.uint8)
+    frame[40, 40] = 255
+    np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
+
+
+@pytest.mark.parametrize("scale", [-1.0, np.nan])
+def test_impossible_scale_is_black(device, scale):
+    np.testing.assert_array_equal(run(disc(), scale), 0)
+
+
+def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None, mirrored=None):
+    frame = np.zeros((*added.shape[:2], 3), np.uint8) if frame is None else frame
+    height, width = frame.shape[:2]
+    params = make_params(*4 * [(0, height, 0, width)], time_step=time_step)
+    levels = wp.zeros((-(-height // expose.AUTO_STRIDE), expose.LEVELS), wp.int32)
+    scale = wp.array([start], dtype=wp.float32)
+    frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
+    layers = expose.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
+    for _ in range(frames):
+        over = make_arrays(virtual, added, None, mirrored)
+        expose.count_levels(layers, params, frame, decode, over, levels)
+        expose.adapt_scale(params, levels, scale)
+    return float(scale.numpy()[0])
+
+
+def spot(level, height=64, width=80):
+    added = np.zeros((height, width, 3), np.float32)
+    added[10:50, 20:70] = level
+    return added
+
+
+@pytest.mark.parametrize("level", [1.1, 2.0, 5.3, 12.0])
+def test_auto_keeps_highlights_below_clipping(device, level):
+    scale = auto(spot(level))
+    assert 1.0 / (level * BIN) <= scale <= 1.0 / level
+
+
+@pytest.mark.parametrize("level", [0.0, 0.2, 0.99])
+def test_auto_does_nothing_without_need(device, level):
+    assert auto(spot(level)) == 1.0
+
+
+def test_auto_is_bounded_and_finite(device):
+    for level in (1e6, np.inf, np.nan):
+        assert auto(spot(level)) in (1.0, expose.MIN_AUTO_SCALE)
+
+
+def test_auto_ignores_what_darkening_cannot_help(device):
+    assert auto(spot(3.0), frame=np.full((64, 80, 3), 255, np.uint8)) == 1.0
+    hidden = np.zeros((64, 80, 4), np.float32)
+    hidden[..., 3] = 1.0
+    assert auto(spot(3.0), virtual=hidden) == 1.0
+
+
+def test_auto_sees_the_desk_as_it_is_composed(device):
+    """What a ball beside the lit desk shows is no reason to darken it; what is taken from lit pixels counts."""
+    bright = np.where(spot(1.0) > 0, 0.0, 50.0).astype(np.float32)
+    assert auto(spot(0.9), mirrored=bright) == 1.0
+    assert auto(spot(4.0), mirrored=-3.5 * (spot(1.0) > 0).astype(np.float32)) == 1.0
+
+
+def test_auto_allows_a_few_glints(device):
+    added = np.full((400, 400, 3), 0.5, np.float32)
+    added[::100, ::100] = 50.0  # 16 of 10,000 sampled pixels
+    assert auto(added) == 1.0
+
+
+def test_auto_follows_smoothly_and_settles(device):
+    steps = [auto(spot(4.0), frames=n, start=1.0) for n in (1, 2, 5, 60)]
+    assert steps == sorted(steps, reverse=True)
+    assert steps[0] > 0.85
+    assert steps[-1] == pytest.approx(auto(spot(4.0)), abs=1.5e-3)  # after 2 s, e^-6.7 of the way is left
+    assert auto(spot(4.0), time_step=0.0, start=0.7) == pytest.approx(0.7)

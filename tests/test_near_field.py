@@ -1,0 +1,363 @@
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.error_model import check_error
+from tests.reference import near_field as reference
+from tests.test_composite import tables
+from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
+from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
+from warp_ar.engine.graph import make_plan
+from warp_ar.kernels import near_field, shade
+from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
+from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+from warp_ar.scene import load_scene
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
+
+# Sampling error of one set of 64 for a cosine lobe of any direction.
+FURNACE_ERROR = 0.15
+BALL = (0.0, 0.0, 0.06)
+RADIUS = 0.05
+LEVEL_HEIGHT = 8
+
+
+def run(
+    objects,
+    materials,
+    code=255,
+    filtered=True,
+    ratio=None,
+    added=None,
+    rows=None,
+    environment=None,
+    samples=1,
+    environment_shows=1.0,
+):
+    models = tuple(sorted({m["model"] for m in materials}))
+    forms = DistantLightConfig(
+        TraceConfig((SPHERE,), (DESK["kind"],)),
+        models,
+        False,
+        "sh" if set(models) - {MIRROR} else "none",
+        bool(set(models) - {LAMBERT}),
+        False,
+    )
+    # As the stage has it: what no material needs is not compiled.
+    lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
+    config = near_field.NearFieldConfig(forms, COUNT, lobes, samples, SIDE, ratio is not None, added is not None)
+    params = records(
+        FrameParams,
+        {
+            "camera_position": CAMERA,
+            "world_from_camera": LOOK_DOWN,
+            "focal": (60, 60),
+            "principal": ((W - 1) / 2, (H - 1) / 2),
+            "object_rect": (0, H, 0, W),
+            "light_rect": (0, H, 0, W),
+        },
+    )
+    scene = RayScene()
+    scene.objects = records(Shape, *[{**item, "material": k} for k, item in enumerate(objects)])
+    scene.proxies = records(Shape, DESK)
+    scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **m} for m in materials])
+    surroundings = DistantLight()
+    environment = sky() if environment is None else environment
+    surroundings.environment = wp.array(environment, dtype=wp.vec3)
+    coefficients = np.zeros((9, 3), np.float32)
+    coefficients[0] = np.pi / 0.28209479
+    surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
+    surroundings.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(*3 * [environment_shows]), dtype=wp.vec3)
+    surroundings.level_height = LEVEL_HEIGHT
+    rays = wp.array(RAYS, dtype=wp.vec2)
+    hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
+    trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
+    drawn = draw(environment)
+    frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
+    irradiance, mirrored, passed = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4), wp.zeros((H, W), wp.vec4)
+    layers = [None if layer is None else wp.array(layer, dtype=wp.vec3) for layer in (ratio, added)]
+    near_field.light_objects(
+        config,
+        params,
+        rays,
+        frame,
+        tables()[0],
+        *layers,
+        scene,
+        surroundings,
+        drawn[2],
+        hit_object,
+        hits,
+        irradiance,
+        mirrored,
+        passed,
+        rows=rows,
+    )
+    if filtered:
+        raw = irradiance, mirrored, passed
+        irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
+        near_field.filter_near_field(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
+    return irradiance.numpy(), mirrored.numpy(), hit_object.numpy(), hits.numpy(), drawn
+
+
+CHALK = {"model": LAMBERT, "base_color": (1, 1, 1)}
+CHROME = {"model": MIRROR, "base_color": (1, 1, 1)}
+
+
+def test_white_furnace(device):
+    irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK])
+    inside = irradiance[found >= 0]
+    assert len(inside) > 50
+    np.testing.assert_allclose(inside.mean(0), np.pi, rtol=0.02)
+    np.testing.assert_allclose(inside, np.pi, rtol=FURNACE_ERROR)
+
+
+@pytest.mark.parametrize("code", [0, 255])
+def test_matches_the_twin(device, code):
+    irradiance, _, found, hits, drawn = run([sphere(BALL, RADIUS)], [CHALK], code=code, filtered=False)
+    directions, flux = drawn[0].numpy().astype(np.float64), drawn[1].numpy()[:, 0].astype(np.float64)
+    reach_x, reach_y = CAMERA[2] * RAYS[..., 0].max(), CAMERA[2] * RAYS[..., 1].max()
+
+    def seen(x, y):
+        return (np.abs(x) < reach_x) & (np.abs(y) < reach_y)
+
+    found_here, expected_here = [], []
+    for row, column in np.argwhere(found >= 0)[::7]:
+        first = ((row % SIDE) * SIDE + column % SIDE) * COUNT
+        part = slice(first, first + COUNT)
+        hit = hits[row, column]
+        expected = reference.irradiance_over_plane(
+            hit["point"], hit["normal"], directions[part], SIDE * SIDE * flux[part], seen, code / 255
+        )
+        found_here.append(irradiance[row, column, 0])
+        expected_here.append(expected)
+    assert len(found_here) > 10
+    check_error("near_field", found_here, expected_here)
+
+
+def test_dark_desk_darkens_the_flanks_not_the_top(device):
+    irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0)
+    up = hits["normal"][..., 2]
+    assert irradiance[(found >= 0) & (up > 0.97)].mean() > 0.95 * np.pi
+    flank = irradiance[(found >= 0) & (up < 0.4)]
+    assert len(flank) > 5
+    assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
+
+
+def test_mirror_shows_the_picture_of_the_desk(device):
+    # A mirror ball next to a chalk ball: rays that go down see the desk, others a black environment or the other ball.
+    items = [sphere(BALL, RADIUS), sphere((0.14, 0.0, 0.06), RADIUS)]
+    ratio = np.full((H, W, 3), 0.5, np.float32)
+    added = np.full((H, W, 3), 0.25, np.float32)
+    _, plain, found, hits, _ = run(items, [CHROME, CHALK], environment_shows=0.0)
+    _, layered, _, _, _ = run(items, [CHROME, CHALK], ratio=ratio, added=added, environment_shows=0.0)
+    ball = found == 0
+    assert (plain[ball, 3] == 1).all(), "nothing is left to the prefiltered environment"
+    near = plain[..., 0]
+    np.testing.assert_allclose(near[ball & (near > 0)], 1, atol=1e-5)
+    changed = ball & (near > 0) & (np.abs(layered[..., 0] - 1) > 1e-6)
+    np.testing.assert_allclose(layered[changed, :3], 0.75, atol=1e-5)
+    # Reflected straight up from the top; to the desk beyond 45 degrees of tilt.
+    up = hits["normal"][..., 2]
+    assert (near[ball & (up > 0.95)] == 0).all()
+    assert changed.sum() > 5
+    # What stays 1 in spite of the layers is the chalk ball, unoccluded under a sky of 1.
+    chalk = ball & (near > 0) & ~changed
+    assert chalk.sum() >= 1
+    assert POINTS[chalk][:, 0].mean() > 0
+
+
+def shown_by_a_mirror(offset):
+    """What a mirror ball in a black environment shows of a white desk from one place of each pixel; NaN beside the
+    ball."""
+    rays = np.stack([*(RAYS + np.array(offset) / 60).transpose(2, 0, 1), np.ones((H, W))], -1) @ LOOK_DOWN.T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    to_ball = CAMERA - np.array(BALL)
+    along = rays @ to_ball
+    within = along**2 - to_ball @ to_ball + RADIUS**2
+    points = CAMERA - (along + np.sqrt(np.maximum(within, 0)))[..., None] * rays
+    normals = (points - np.array(BALL)) / RADIUS
+    mirrored = rays - 2 * (rays * normals).sum(-1, keepdims=True) * normals
+    with np.errstate(divide="ignore", invalid="ignore"):
+        desk = points + (-points[..., 2] / mirrored[..., 2])[..., None] * mirrored
+    reach = CAMERA[2] * np.array([RAYS[..., 0].max(), RAYS[..., 1].max()])
+    # From above, the ball hides no desk that it mirrors: objects are not in the picture.
+    seen = (mirrored[..., 2] < 0) & (np.abs(desk[..., :2]) < reach).all(-1)
+    return np.where(within > 0, seen, np.nan)
+
+
+def test_mirror_is_the_mean_over_its_pixel(device):
+    """A hundred places of each pixel, the ball's own only: near its rim neighbouring pixels have nothing in common."""
+    places = (np.arange(10) + 0.5) / 10 - 0.5
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        expected = np.nanmean([shown_by_a_mirror((x, y)) for x in places for y in places], axis=0)
+    errors = {}
+    for samples in (1, 16):
+        _, mirrored, found, _, _ = run([sphere(BALL, RADIUS)], [CHROME], samples=samples, environment_shows=0.0)
+        errors[samples] = np.abs(mirrored[..., 0] - expected)[found == 0]
+    assert len(errors[1]) > 50
+    # A place of sixteen or two on the wrong side of the desk's picture.
+    assert errors[16].max() < 0.2
+    assert errors[16].mean() < 0.25 * errors[1].mean()
+
+
+def test_glossy_share_is_between(device):
+    glossy = {"model": PHONG, "base_color": (0, 0, 0), "specular": (1, 1, 1), "shininess": 20.0}
+    _, mirrored, found, hits, _ = run([sphere(BALL, RADIUS)], [glossy])
+    share = mirrored[..., 3]
+    assert share.min() >= 0
+    assert share.max() <= 1 + 1e-6
+    ring = (found >= 0) & (np.abs(hits["normal"][..., 2] - np.cos(np.pi / 4)) < 0.1)
+    assert 0.1 < share[ring].mean() < 0.9
+    np.testing.assert_allclose(mirrored[found >= 0][:, :3], share[found >= 0][:, None].repeat(3, 1), atol=1e-5)
+
+
+def test_width_of_a_ray_is_the_root_of_its_solid_angle(device):
+    """1 / pdf, over what it is at the peak, where the width is alpha: GGX by its own formula, Phong by the cosine."""
+    cosine = np.cos(np.linspace(0, 1.5, 40))
+    for alpha in (0.02, 0.1, 0.6):
+        density = alpha**2 / (np.pi * (cosine**2 * (alpha**2 - 1) + 1) ** 2)
+        exponent = 1 / alpha**2
+        out = wp.zeros((2, cosine.size), wp.float32)
+        angles = wp.array(cosine.astype(np.float32), dtype=wp.float32)
+        wp.launch(_width_kernel, dim=cosine.size, inputs=[angles, alpha, exponent], outputs=[out])
+        ggx, phong = out.numpy()
+        # Near the peak a cosine of float32 is known to 6e-8, of sin^2 over alpha^2 = 4e-4.
+        np.testing.assert_allclose(ggx, alpha * np.sqrt(1 / (np.pi * alpha**2) / density), rtol=5e-4)
+        # exp and log of float32, times exponents up to 2500, where the width is below 1.
+        np.testing.assert_allclose(
+            phong, np.exp(np.minimum(np.log(alpha) - exponent / 2 * np.log(cosine), 0)), rtol=1e-3
+        )
+
+
+@wp.kernel(enable_backward=False)
+def _width_kernel(cosine: wp.array[wp.float32], alpha: wp.float32, exponent: wp.float32, out: wp.array2d[wp.float32]):
+    i = wp.tid()
+    out[0, i] = near_field.ggx_ray_width(cosine[i], alpha)
+    out[1, i] = near_field.phong_ray_width(cosine[i], exponent, alpha)
+
+
+def test_share_follows_the_light(device):
+    """Half of the rays meet something near; the other half carries nine tenths of the light, or none is known."""
+    found = np.zeros((16, 16), int)
+    mirrored = np.broadcast_to(np.array([0.2, 0.2, 0.2, 0.5]), (16, 16, 4))
+    for missed, light, left in ((0.9, 1.0, 0.5 * 0.9), (0.0, 1.0, 0.0), (0.0, 0.0, 0.5)):
+        passed = np.broadcast_to(np.array([missed, missed, missed, light]), (16, 16, 4))
+        _, out = average(found, (0, 0, 1), np.zeros((16, 16, 3)), mirrored, (PHONG,), passed=passed)
+        np.testing.assert_allclose(out[..., :3], 0.2 + 0.5 * missed, rtol=1e-6)
+        np.testing.assert_allclose(out[..., 3], 1 - left, rtol=1e-6)
+
+
+def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rect=None, passed=None):
+    """Filter estimates as given, (h, w); object k has material k."""
+    height, width = found.shape
+    forms = DistantLightConfig(
+        TraceConfig((SPHERE,), (DESK["kind"],)), tuple(sorted(set(models))), False, "sh", True, False
+    )
+    config = near_field.NearFieldConfig(forms, COUNT, 4, 1, SIDE, False, False)
+    scene = RayScene()
+    scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
+    scene.materials = records(Material, *[{"model": model, "base_texture": -1} for model in models])
+    hits = np.zeros(found.shape, np.dtype(Hit.numpy_dtype()))
+    hits["normal"] = normals
+    outputs = wp.zeros((height, width), wp.vec3), wp.zeros((height, width), wp.vec4)
+    near_field.filter_near_field(
+        config,
+        records(FrameParams, {"object_rect": rect or (0, height, 0, width)}),
+        scene,
+        wp.array(found.astype(np.int32), dtype=wp.int32),
+        wp.array(hits, dtype=Hit),
+        wp.array(irradiance.astype(np.float32), dtype=wp.vec3),
+        wp.array(mirrored.astype(np.float32), dtype=wp.vec4),
+        wp.array(np.zeros_like(mirrored, np.float32) if passed is None else passed.astype(np.float32), dtype=wp.vec4),
+        *outputs,
+    )
+    return tuple(output.numpy() for output in outputs)
+
+
+def test_averages_stop_at_the_edges_of_objects(device):
+    """Neither another object nor what stands where nothing is seen (here: NaN) gets in, at any edge."""
+    found = np.full((17, 23), -1)
+    found[2:15, 3:11], found[2:15, 11:20] = 0, 1
+    found[6, 3] = found[14, 15] = -1  # notches
+    found[0, 0] = 0  # one pixel alone
+    light = np.where(found == 0, 1.0, np.where(found == 1, 5.0, np.nan))
+    irradiance, mirrored = average(found, (0, 0, 1), light[..., None].repeat(3, -1), light[..., None].repeat(4, -1))
+    for out in (irradiance, mirrored):
+        for item, value in ((0, 1.0), (1, 5.0)):
+            np.testing.assert_allclose(out[found == item], value, rtol=1e-6)
+        assert (out[found < 0] == 0).all(), "what is no object is left alone"
+
+
+def test_averages_stop_at_creases_and_at_the_rectangle(device):
+    found = np.zeros((16, 16), int)
+    normals = np.where((np.arange(16) < 8)[None, :, None], (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)) * np.ones((16, 1, 1))
+    light = np.where(np.arange(16) < 8, 1.0, 5.0) * np.ones((16, 1))
+    light[:, 0] = np.nan  # beyond the rectangle
+    out, _ = average(found, normals, light[..., None].repeat(3, -1), np.ones((16, 16, 4)), rect=(0, 16, 1, 16))
+    np.testing.assert_allclose(out[:, 1:8], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(out[:, 8:], 5.0, rtol=1e-6)
+
+
+def test_a_tile_of_estimates_averages_to_their_mean(device):
+    """Away from edges every residue of a tile counts alike; a mirror's pixel stays its own."""
+    rng = np.random.default_rng(4)
+    tile = rng.uniform(0, 1, (SIDE, SIDE))
+    light = np.tile(tile, (4, 4))[..., None]
+    for model, expected in ((PHONG, np.full((16, 16), tile.mean())), (MIRROR, light[..., 0])):
+        _, mirrored = average(np.zeros((16, 16), int), (0, 0, 1), light.repeat(3, -1), light.repeat(4, -1), (model,))
+        inner = np.s_[SIDE:-SIDE, SIDE:-SIDE]
+        np.testing.assert_allclose(mirrored[..., 0][inner], expected[inner], rtol=1e-5)
+
+
+def test_garbage_in_the_environment_stays_finite(device):
+    environment = sky()
+    environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
+    irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
+    assert np.isfinite(irradiance).all()
+    assert (irradiance >= 0).all()
+
+
+def test_bands_agree_with_the_whole(device):
+    whole = run([sphere(BALL, RADIUS)], [CHALK], filtered=False)[0]
+    part = run([sphere(BALL, RADIUS)], [CHALK], filtered=False, rows=(5, 25))[0]
+    np.testing.assert_array_equal(part[5:25], whole[5:25])
+    assert not part[25:].any()
+
+
+def test_a_sample_of_an_edge_takes_the_light_of_the_pixel_most_like_it(device):
+    """Of its object: first by the normal, then by nearness; none where no pixel around sees it."""
+    found = np.array([[-1, 3, -1], [3, 3, -1], [-1, 5, 5]], np.int32)
+    hits = np.zeros((3, 3), np.dtype(Hit.numpy_dtype()))
+    hits["normal"] = (0, 0, 1)
+    hits["normal"][0, 1], hits["normal"][1, 0] = (0.6, 0, 0.8), (0, 1, 0)
+    asked = np.zeros(5, hits.dtype)
+    asked["shape"] = 3, 3, 3, 5, 7
+    asked["normal"] = (0, 0, 1), (0.8, 0, 0.6), (0, 0.8, 0.6), (1, 0, 0), (0, 0, 1)
+    out = wp.zeros(len(asked), wp.vec2i)
+    inputs = [wp.array(found), wp.array(hits, dtype=Hit), wp.array(asked, dtype=Hit)]
+    wp.launch(_alike_kernel, dim=len(asked), inputs=inputs, outputs=[out])
+    assert out.numpy().tolist() == [[1, 1], [0, 1], [1, 0], [2, 1], [-1, -1]]
+
+
+@wp.kernel(enable_backward=False)
+def _alike_kernel(found: wp.array2d[wp.int32], hits: wp.array2d[Hit], asked: wp.array[Hit], out: wp.array[wp.vec2i]):
+    k = wp.tid()
+    out[k] = shade.most_alike(found, hits, 1, 1, asked[k])
+
+
+def test_stage_follows_the_method_of_shade():
+    scene = load_scene("mirror")
+    for method, expected in (("environment", False), ("one_bounce", True)):
+        quality = PRESETS["medium"].with_methods(shade=method)
+        plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
+        assert ("near_field" in {stage.name for stage, _ in plan.stages}) == expected
+    bare = dataclasses.replace(scene, objects=())
+    plan = make_plan(Request(bare, quality, (scene.camera.width, scene.camera.height)))
+    assert "no virtual object" in dict(plan.left_out)["near_field"]

@@ -1,0 +1,80 @@
+"""The reference of scene files: every key that the reader knows is listed, and every example is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+
+import pytest
+
+from warp_ar.errors import SceneError
+from warp_ar.scene import loads_scene
+from warp_ar.scene.reference import SECTIONS, as_markdown, example_scene, keys
+
+KEYS = list(keys())
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """The files that examples name."""
+    (tmp_path / "frames").mkdir()
+    triangle = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    triangle += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    (tmp_path / "table.ply").write_text(triangle)
+    matrix = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [640, 0, 319.5, 0, 640, 239.5, 0, 0, 1]\n"
+    calibration = f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: {matrix}"
+    (tmp_path / "camera.yml").write_text(calibration)
+    return tmp_path
+
+
+@pytest.mark.parametrize("key", KEYS, ids=lambda key: f"{key.section}.{key.name}")
+def test_example_is_read(key, folder):
+    text = example_scene(key)
+    scene = loads_scene(text, folder / "scene.toml")
+    value = tomllib.loads(f"v = {key.example}")["v"]
+    value = tuple(value) if isinstance(value, list) else value
+    part = scene
+    for name in filter(None, key.section.split(".")):
+        plural = {"probe": "probes", "proxy": "proxies", "object": "objects", "light": "lights"}.get(name, name)
+        part = getattr(part, plural)
+        part = part[0] if isinstance(part, tuple) else part
+    found = getattr(part, key.name, None)
+    if isinstance(value, str) and not isinstance(found, str):
+        # A path is resolved, a board parsed, a model and a calibration become objects.
+        assert found is None or str(found).endswith(value) or value in str(found)
+    elif not isinstance(value, dict):
+        assert found == value
+
+
+def test_reader_knows_no_other_keys(folder):
+    """The reader lists its keys in the message about an unknown one; all of them are in the reference."""
+    for section in SECTIONS:
+        key = next(key for key in KEYS if key.section == section.name)
+        text = example_scene(
+            dataclasses.replace(key, name="nonsense", beside=key.beside + f"\n{key.name} = {key.example}")
+        )
+        with pytest.raises(SceneError, match="unknown key"):
+            loads_scene(text, folder / "scene.toml")
+    fields = {
+        (section.name, field.name)
+        for section in SECTIONS
+        for kind in section.kinds
+        for field in dataclasses.fields(kind)
+    }
+    assert fields - {(key.section, key.name) for key in KEYS} == set()
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if key.section], ids=lambda key: f"{key.section}.{key.name}")
+def test_required_keys_are_required(key, folder):
+    """Without it the reader complains exactly where the reference says "required"."""
+    text = example_scene(key).replace(f"\n{key.name} = {key.example}\n", "\n")
+    if key.default == "required" and key.section != "object.material":
+        with pytest.raises(SceneError):
+            loads_scene(text, folder / "scene.toml")
+
+
+def test_page_has_a_row_for_every_key():
+    page = as_markdown()
+    assert len(re.findall(r"^\| `", page, flags=re.M)) == len(KEYS)
+    assert all(key.meaning and key.unit and key.default for key in KEYS)

@@ -1,0 +1,147 @@
+"""Going from one pipeline to another while frames run."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
+from warp_ar.engine import switcher as module
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.switcher import PipelineSwitcher, Target, let_go
+from warp_ar.errors import UsageError
+from warp_ar.scene import Light
+from warp_ar.stages.quality import PRESETS
+
+SIZE = (320, 240)
+LOW, PAPER = PRESETS["low"], PRESETS["paper"]
+
+
+def target(quality: Any = LOW, **changes: Any) -> Target:
+    return Target(make_scene(**changes), quality, SIZE)
+
+
+def settle(switcher: PipelineSwitcher) -> None:
+    """Wait for what is being built."""
+    if switcher._building is not None:
+        switcher._building.exception()
+
+
+def test_numbers_are_changed_in_place_and_all_else_is_built_beside() -> None:
+    switcher = PipelineSwitcher(device="cpu")
+    first = switcher.open(target())
+    assert switcher.follow(target(lights=(Light("point", 5.0, at=(0.1, -0.1, 0.2)),))) is first
+    assert not switcher.busy
+    switcher.follow(target(PAPER))
+    assert switcher.pipeline is first, "frames go on with the one before"
+    settle(switcher)
+    second = switcher.take()
+    assert second is not first
+    assert second is not None
+    assert second.quality == PAPER
+    assert switcher.swaps == 2
+    switcher.close()
+
+
+def test_the_light_and_the_clock_go_along(frames: Frames) -> None:
+    switcher = PipelineSwitcher(device="cpu")
+    before = switcher.open(target())
+    before(frames[0], time_seconds=0.0)
+    light = before.arrays["environment_radiance"].numpy().copy()
+    after = switcher.follow(target(PAPER), wait=True)
+    assert after is not None
+    np.testing.assert_array_equal(after.arrays["environment_radiance"].numpy(), light)
+    assert after(frames[0], time_seconds=0.1).pose is not None
+    switcher.close()
+
+
+def test_what_is_wanted_while_something_is_built_comes_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    switcher = PipelineSwitcher(device="cpu")
+    switcher.open(target())
+    switcher.want(target(PAPER), lambda _: go_on.wait(60.0))
+    last = target(PRESETS["low"].with_methods(relight="flat"))
+    switcher.want(last)
+    assert switcher.take().quality == LOW  # type: ignore[union-attr]
+    go_on.set()
+    while not switcher.shows(last):
+        settle(switcher)
+        switcher.take()
+        assert switcher.pipeline is not None
+        assert switcher.pipeline.quality != PAPER, "nobody wants it any more"
+    switcher.close()
+
+
+def test_a_pipeline_that_is_not_admitted_never_lights_a_frame() -> None:
+    switcher = PipelineSwitcher(device="cpu")
+    first = switcher.open(target())
+    asked: list[Any] = []
+    wanted = target(PAPER)
+    assert not switcher.want(wanted, lambda _: 12.5)
+    settle(switcher)
+
+    def refuse(pipeline: Pipeline, prepared: Any) -> bool:
+        asked.append((pipeline.quality, prepared))
+        return False
+
+    assert switcher.take(refuse) is first
+    assert asked == [(PAPER, 12.5)]
+    switcher.want(wanted)
+    assert not switcher.busy, "it is built again and again"
+    switcher.close()
+
+
+def test_what_cannot_be_built_is_told_once_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(pipeline: Pipeline) -> None:
+        raise RuntimeError("Failed to allocate 12 bytes on device 'cuda:0'\nmore of it")
+
+    switcher = PipelineSwitcher(device="cpu")
+    first = switcher.open(target())
+    wanted = target(PAPER)
+    switcher.want(wanted, fail)
+    settle(switcher)
+    with pytest.raises(
+        UsageError, match=r"quality 'paper' cannot run here: Failed to allocate 12 bytes .* cheaper one$"
+    ):
+        switcher.take()
+    for _ in range(3):
+        assert switcher.follow(wanted) is first
+        assert not switcher.busy
+    switcher.close()
+
+
+def test_pipelines_that_are_kept_come_back_at_once() -> None:
+    switcher = PipelineSwitcher(device="cpu", keep=1)
+    first = switcher.open(target())
+    second = switcher.follow(target(PAPER), wait=True)
+    assert switcher.want(target(LOW)), "it is there"
+    assert switcher.take() is first
+    assert switcher.want(target(PAPER))
+    assert switcher.take() is second
+    switcher.close()
+
+
+def test_a_pipeline_that_goes_frees_its_arrays_at_once(frames: Frames, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the garbage collector; what a result refers to stays."""
+    trimmed: list[None] = []
+    monkeypatch.setattr(module, "release_memory", lambda: trimmed.append(None))
+    gc.collect()
+    gc.disable()
+    try:
+        pipeline = Pipeline(make_scene(), device="cpu", quality="low", size=SIZE)
+        result = pipeline(frames[0])
+        held = weakref.ref(pipeline.arrays["frame"])
+        image = result.image_array
+        let_go(pipeline)
+        del pipeline
+        assert held() is None, "it waits for the garbage collector"
+        assert trimmed
+        assert image.numpy().any()
+        np.testing.assert_array_equal(result.image, image.numpy())
+    finally:
+        gc.enable()

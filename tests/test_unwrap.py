@@ -1,0 +1,606 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.error_model import check_error
+from tests.reference import latlong as latlong_reference
+from tests.reference import unwrap as reference
+from warp_ar.kernels import fill, key_lights, unwrap
+from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.structs import (
+    BOX,
+    MESH,
+    PLANE,
+    FrameParams,
+    KeyLight,
+    Material,
+    Probe,
+    RayScene,
+    Shape,
+    Texture,
+)
+
+# Float32 directions and unit vectors: a few roundings of 6e-8 each.
+NORMAL = 2e-6
+# A pixel coordinate of up to 400, computed from those: 400 * a few roundings.
+PIXEL = 1e-3
+# What a shift of PIXEL does to a bilinear sample of a picture of noise (slope 1 per pixel at most), divided by the
+# reflectance.
+SAMPLE = 2 * PIXEL
+
+CENTER, RADIUS, REFLECTANCE = (0.1, -0.05, 0.035), 0.035, (0.85, 0.8, 0.9)
+HEIGHT = 32
+
+
+def look(distance=0.5, **more):
+    return reference.View((0.1 + 0.3 * distance, -0.05 - 0.8 * distance, 0.035 + 0.5196 * distance), CENTER, **more)
+
+
+def make_params(view):
+    value = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
+    value["camera_position"], value["world_from_camera"] = view.position, view.rotation
+    value["focal"], value["principal"], value["distortion"] = view.focal, view.principal, view.distortion
+    return wp.array(value, dtype=FrameParams)
+
+
+def make_probes(balls):
+    value = np.zeros(len(balls), np.dtype(Probe.numpy_dtype()))
+    for item, (center, radius, reflectance) in zip(value, balls, strict=True):
+        item["center"], item["radius"], item["reflectance"] = center, radius, reflectance
+    return wp.array(value, dtype=Probe)
+
+
+def make_scene(shapes=()):
+    value = np.zeros(len(shapes), np.dtype(Shape.numpy_dtype()))
+    for item, shape in zip(value, shapes, strict=True):
+        item["rotation"], item["scale"] = np.eye(3), 1.0
+        for key, content in shape.items():
+            item[key] = content
+    scene = RayScene()
+    scene.proxies = wp.array(value, dtype=Shape) if len(shapes) else wp.zeros(0, dtype=Shape)
+    scene.objects = wp.zeros(0, dtype=Shape)
+    scene.materials, scene.textures = wp.zeros(0, dtype=Material), wp.zeros(0, dtype=Texture)
+    scene.texels, scene.vertex_normals = wp.zeros(0, dtype=wp.vec3), wp.zeros(0, dtype=wp.vec3)
+    scene.vertex_uvs = wp.zeros(0, dtype=wp.vec2)
+    return scene
+
+
+BALL = (CENTER, RADIUS, REFLECTANCE)
+
+
+def project(view, balls=(BALL,), shapes=(), kinds=None, height=HEIGHT):
+    kinds = tuple(sorted({shape["kind"] for shape in shapes})) if kinds is None else kinds
+    corners = wp.zeros((height + 1, 2 * height + 1, len(balls)), dtype=wp.vec3)
+    rays = wp.array(view.rays().astype(np.float32), dtype=wp.vec2)
+    config = unwrap.ProjectConfig(kinds)
+    unwrap.project_corners(make_params(view), make_probes(balls), rays, make_scene(shapes), corners, config=config)
+    return corners
+
+
+def unwrapped(
+    view, frame, balls=(BALL,), *, method="area", shapes=(), height=HEIGHT, transfer="srgb", kinds=None, rows=None
+):
+    corners = project(view, balls, shapes, kinds, height)
+    radiance = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
+    confidence = wp.full((height, 2 * height), -1.0, dtype=wp.float32)
+    clipped = wp.full((height, 2 * height), wp.vec3(-1.0), dtype=wp.vec3)
+    table = wp.array(decode_table(transfer), dtype=wp.vec3)
+    frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
+    for band in rows or [None]:
+        unwrap.gather_probe(
+            frame, table, make_probes(balls), corners, radiance, confidence, clipped, method=method, rows=band
+        )
+    return radiance.numpy(), confidence.numpy(), clipped.numpy()
+
+
+def encode(linear):
+    """Codes of the linear transfer."""
+    return np.rint(np.clip(linear, 0, 1) * 255).astype(np.uint8)
+
+
+def constant_frame(view, code):
+    return np.full((view.height, view.width, 3), code, np.uint8)
+
+
+def smooth_light(d):
+    """Every channel its own ramp; the same on both sides of the seam, different at the poles."""
+    return 0.45 + 0.35 * d
+
+
+@wp.kernel(enable_backward=False)
+def normal_kernel(distance: wp.array[wp.float32], psi: wp.array[wp.vec2], normal_out: wp.array[wp.vec2]):
+    i = wp.tid()
+    normal_out[i] = unwrap.reflecting_normal(distance[i], psi[i][0], psi[i][1])
+
+
+# ---- closed form ----
+
+
+@pytest.mark.parametrize("method", unwrap.METHODS)
+@pytest.mark.parametrize("code", [1, 90, 255])
+def test_furnace_to_the_bit(device, method, code):
+    """A constant frame is a constant environment, exactly, whatever was seen how well."""
+    view = look(0.4)
+    radiance, confidence, _ = unwrapped(view, constant_frame(view, code), method=method)
+    expected = decode_table("srgb")[code] / np.float32(REFLECTANCE)
+    seen = confidence > 0
+    assert (confidence[seen] < 0.5).any()
+    assert (confidence[seen] > 0.9).any()
+    assert (radiance[seen] == expected).all()
+    assert (radiance[~seen] == 0).all()
+
+
+@pytest.mark.parametrize("distance", [1.01, 1.2, 2.0, 5.7, 20.0, 1e3, 1e5])
+def test_normals_reflect_every_direction_to_the_camera(device, distance):
+    """From straight back (psi = 0) to the edge of the blind cone."""
+    psi = np.concatenate([np.linspace(0, 1, 2001) ** 2, [1e-7, 1e-4]]) * reference.blind_angle(distance) * (1 - 1e-6)
+    given = np.stack([np.cos(psi), np.sin(psi)], -1).astype(np.float32)
+    out = wp.zeros(len(psi), dtype=wp.vec2)
+    inputs = [wp.full(len(psi), distance, dtype=wp.float32), wp.array(given, dtype=wp.vec2)]
+    wp.launch(normal_kernel, len(psi), inputs, [out])
+    n = out.numpy().astype(np.float64)
+    # Compared as what they reflect: at D = 1.01 that turns 102 times faster than the normal, so its error is what
+    # counts there.
+    slope = 2 + 1 / (distance - 1)
+    got = reference.reflected_angle(np.arctan2(n[:, 1], n[:, 0]), np.float64(np.float32(distance)))
+    np.testing.assert_allclose(got, np.arctan2(given[:, 1], given[:, 0]), atol=NORMAL * slope)
+
+
+def test_straight_back_and_blind(device):
+    """Hard case 1: R = -view has no division by zero; the cone behind the ball has no value and no confidence."""
+    view = reference.View((0.5, 0.0, 0.0), (0.0, 0.0, 0.0))  # texel corner (h / 2, h) is exactly toward the camera
+    ball = ((0.0, 0.0, 0.0), 0.035, (1.0, 1.0, 1.0))
+    corners = project(view, [ball]).numpy()[:, :, 0]
+    np.testing.assert_allclose(corners[HEIGHT // 2, HEIGHT, :2], view.principal, atol=PIXEL)
+    d = latlong_reference.directions(HEIGHT, 2 * HEIGHT)
+    angle = np.arccos(np.clip(d @ [1.0, 0.0, 0.0], -1, 1))
+    _, confidence, _ = unwrapped(view, constant_frame(view, 100), [ball])
+    blind = angle > reference.blind_angle(0.5 / 0.035)
+    assert blind.sum() > 0
+    assert (confidence[blind] == 0).all()
+    assert (confidence[angle < 1.8] > 0.9).all()
+    # A texel further from the axis is never trusted more than one nearer to it, along the row through the axis.
+    row = confidence[HEIGHT // 2, HEIGHT:]
+    assert (np.diff(row) <= 1e-3).all()
+
+
+# ---- twin ----
+
+
+@pytest.mark.parametrize("distortion", [(0.0,) * 8, (0.12, -0.2, 0.003, -0.002, 0.05, 0.01, 0.02, 0.0)])
+def test_corners_match_twin(device, distortion):
+    view = look(0.3, distortion=distortion)
+    got = project(view).numpy()[:, :, 0].astype(np.float64)
+    expected = reference.corners(view, CENTER, RADIUS, HEIGHT)
+    blind = np.isnan(expected[..., 2])
+    assert blind.any()
+    assert (got[blind, 2] == -1).all()
+    assert (got[~blind, 2] >= 0).all()
+    np.testing.assert_allclose(got[~blind], expected[~blind], atol=PIXEL)
+    check_error("unwrap", got[~blind], expected[~blind])
+
+
+@pytest.mark.parametrize("method", unwrap.METHODS)
+def test_gather_matches_twin(device, method):
+    """On noise, which forgives no wrong pixel. A sample exactly between two pixels may go to either in ``nearest``."""
+    view = look(0.35, size=(200, 150), focal=280.0)
+    frame = np.random.default_rng(6).integers(0, 256, (150, 200, 3)).astype(np.uint8)
+    got = unwrapped(view, frame, method=method, height=16, transfer="linear")
+    expected = reference.gather(
+        frame,
+        decode_table("linear"),
+        REFLECTANCE,
+        reference.corners(view, CENTER, RADIUS, 16),
+        method,
+        unwrap.RIM_START,
+        unwrap.RIM_WIDTH,
+    )
+    agree = np.abs(got[0] - expected[0]).max(-1) < SAMPLE
+    assert agree.mean() > 0.999
+    if method == "bilinear":
+        assert agree.all()
+    check_error("unwrap", got[0][agree], expected[0][agree])
+    np.testing.assert_allclose(got[1], expected[1], atol=SAMPLE)
+    assert (np.abs(got[2] - expected[2]).max(-1) < SAMPLE).mean() > 0.995
+
+
+def test_bands_equal_the_whole(device):
+    view = look(0.35)
+    frame = np.random.default_rng(7).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    whole = unwrapped(view, frame)
+    bands = unwrapped(view, frame, rows=[(0, 5), (5, 6), (6, HEIGHT)])
+    assert all((a == b).all() for a, b in zip(whole, bands, strict=True))
+
+
+def test_specialised_equals_general(device):
+    view = look(0.4)
+    box = {"kind": BOX, "position": (0.12, -0.2, 0.1), "extent": (0.02, 0.02, 0.02)}
+    special = project(view, shapes=[box]).numpy()
+    general = project(view, shapes=[box], kinds=(PLANE, BOX, MESH)).numpy()
+    assert (special == general).all()
+    assert (special[..., 2] < 0).sum() > (project(view).numpy()[..., 2] < 0).sum()
+
+
+# ---- rendered balls ----
+
+
+@pytest.mark.parametrize("distance", [0.15, 0.5, 2.0])
+@pytest.mark.parametrize("method", unwrap.METHODS)
+def test_ramp_is_where_it_belongs(device, method, distance):
+    """Hard cases 2 and 4: seam, poles and perspective. One texel of shift would be 0.035, an orthographic map 0.06 at
+    0.15 m."""
+    view = look(distance, focal=min(0.8 * 110 * distance / RADIUS, 900.0), size=(400, 400))
+    frame = encode(reference.render(view, [BALL], smooth_light, lambda d: np.ones_like(d)))
+    radiance, confidence, _ = unwrapped(view, frame, method=method, transfer="linear")
+    expected = smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT))
+    sure = confidence > 0.5
+    assert sure.mean() > 0.6
+    error = np.abs(radiance - expected)[sure]
+    # Half a code over the reflectance; the picture's own pixels near the rim.
+    assert error.mean() < 0.003
+    assert error.max() < 0.02
+    # Nothing leans to one side.
+    assert np.abs((radiance - expected)[sure].mean(0)).max() < 0.0015
+
+
+def test_orthographic_unwrapping_would_fail_here(device):
+    """The test above can tell: at 0.2 m the orthographic map of a 35 mm ball is wrong by up to 10 degrees."""
+    distance = 0.2 / 0.035
+    psi = np.linspace(0, 0.9 * reference.blind_angle(distance), 100)
+    wrong = reference.reflected_angle(psi / 2, distance) - psi
+    assert 7 < np.degrees(wrong[np.isfinite(wrong)]).max() < 25
+
+
+@pytest.mark.parametrize("distance", [0.25, 0.6])
+@pytest.mark.parametrize("background", [0.0, 1.0])
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.35, -0.35)])
+def test_nothing_of_the_background_bleeds_in(device, distance, background, shift):
+    """Hard case 1: a grey ball before black or white, its outline known to half a pixel: grey to the bit wherever
+    trusted."""
+    true = look(distance, focal=500.0)
+    frame = encode(
+        reference.render(
+            true, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, background)
+        )
+    )
+    center = true.principal
+    tracked = look(distance, focal=500.0, principal=(center[0] + shift[0], center[1] + shift[1]))
+    for method in unwrap.METHODS:
+        radiance, confidence, _ = unwrapped(tracked, frame, method=method, transfer="linear")
+        seen = confidence > 0
+        assert seen.mean() > 0.7
+        assert np.ptp(radiance[seen], axis=0).max() == 0.0
+
+
+def test_light_is_a_mean_over_the_footprint(device):
+    """A checker of single pixels has mean one half: area sees it where texels cover many pixels, one sample does
+    not."""
+    view = look(0.2, focal=700.0, size=(400, 400))
+    checker = (np.indices((400, 400)).sum(0) % 2 * 255).astype(np.uint8)
+    frame = np.repeat(checker[..., None], 3, -1)
+    ball = (CENTER, RADIUS, (1.0, 1.0, 1.0))
+    spread = {}
+    for method in unwrap.METHODS:
+        radiance, confidence, clipped = unwrapped(view, frame, [ball], method=method, transfer="linear", height=16)
+        sure = (confidence > 0.9) & (np.abs(np.arange(16) - 7.5) < 6)[:, None]
+        spread[method] = radiance[sure].std()
+        assert clipped[sure].mean() == pytest.approx(0.5, abs=0.06)
+        assert radiance[sure].mean() == pytest.approx(0.5, abs=0.06)
+    # Between four pixels of a checker at random: 1/2 (1 - 2x)(1 - 2y), of standard deviation 1/6.
+    assert spread["bilinear"] > 0.12
+    assert spread["area"] < 0.05
+
+
+# ---- what is not seen ----
+
+
+def test_partly_outside_the_frame(device):
+    """Hard case 3: what the frame does not show has no confidence, the rest is as it was."""
+    view = look(0.4)
+    centre, _ = view.project([CENTER])
+    cut = reference.View(view.position, CENTER, principal=(float(view.principal[0] - centre[0, 0]), view.principal[1]))
+    frame = encode(reference.render(cut, [BALL], smooth_light, lambda d: np.ones_like(d)))
+    radiance, confidence, _ = unwrapped(cut, frame, transfer="linear")
+    whole = unwrapped(view, encode(reference.render(view, [BALL], smooth_light, np.ones_like)), transfer="linear")[1]
+    assert 0.35 < (confidence > 0.5).sum() / (whole > 0.5).sum() < 0.55
+    error = np.abs(radiance - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[confidence > 0.5]
+    assert error.max() < 0.03
+
+
+@pytest.mark.parametrize(
+    "position",
+    [(0.1, -0.05, 0.05), (0.1, -0.05, 0.07), (0.1, -0.05, 0.035), (np.nan, 0.0, 0.0), (1e9, 0.0, 0.0)],
+)
+def test_camera_where_it_cannot_see_a_ball(device, position):
+    """Hard case 3: inside the ball, touching it, in its centre, nowhere, far beyond sight: finite, and no
+    confidence."""
+    view = look(0.4)
+    view.position = np.array(position)
+    radiance, confidence, clipped = unwrapped(view, constant_frame(view, 200))
+    assert np.isfinite(radiance).all()
+    assert np.isfinite(clipped).all()
+    assert (confidence == 0).all()
+
+
+def test_ball_behind_the_camera(device):
+    view = look(0.4)
+    view.rotation = view.rotation * [1, -1, -1]
+    _, confidence, _ = unwrapped(view, constant_frame(view, 200))
+    assert (confidence == 0).all()
+
+
+def test_near_plane(device):
+    """Hard case 3: a camera one millimetre off the ball sees a small cap of it, and says so in finite numbers."""
+    view = reference.View((0.036, 0.0, 0.0), (0.0, 0.0, 0.0))
+    radiance, confidence, _ = unwrapped(view, constant_frame(view, 90), [((0.0, 0.0, 0.0), 0.035, (1.0, 1.0, 1.0))])
+    assert np.isfinite(radiance).all()
+    assert (radiance[confidence > 0] == decode_table("srgb")[90]).all()
+    assert (confidence > 0.9).any()
+
+
+def test_a_ball_eight_pixels_across(device):
+    """Hard case 3: little is known, and what is known is right."""
+    view = look(2.0, focal=4.0 * 2.0 / RADIUS)
+    frame = encode(reference.render(view, [BALL], smooth_light, np.ones_like, samples=8))
+    radiance, confidence, _ = unwrapped(view, frame, transfer="linear")
+    seen = confidence > 0
+    assert 0.05 < seen.mean() < 0.4
+    assert confidence.max() < 0.7
+    # A pixel of this ball is 15 to 30 degrees wide: its mean differs from the light in its middle.
+    error = np.abs(radiance - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[seen]
+    assert error.mean() < 0.03
+    assert error.max() < 0.1
+
+
+BLOCKERS = {
+    "box": {"kind": BOX, "position": (0.14, -0.21, 0.13), "extent": (0.02, 0.004, 0.02)},
+    "plane": {
+        "kind": PLANE,
+        "position": (0.14, -0.21, 0.13),
+        "extent": (0.02, 0.02, 0.0),
+        "rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    },
+}
+
+
+@pytest.mark.parametrize("kind", ["box", "plane", "mesh"])
+def test_hidden_by_a_proxy(device, kind):
+    """A white object before the ball hides part of it, and none of its white gets in, not even along its edges."""
+    view = look(0.4, focal=500.0)
+    shape = dict(BLOCKERS["box" if kind == "mesh" else kind])
+    half, at, turn = np.array(shape["extent"]), np.array(shape["position"]), np.array(shape.get("rotation", np.eye(3)))
+    mesh = None
+    if kind == "mesh":
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        faces = [
+            0,
+            1,
+            3,
+            0,
+            3,
+            2,
+            4,
+            6,
+            7,
+            4,
+            7,
+            5,
+            0,
+            4,
+            5,
+            0,
+            5,
+            1,
+            2,
+            3,
+            7,
+            2,
+            7,
+            6,
+            0,
+            2,
+            6,
+            0,
+            6,
+            4,
+            1,
+            5,
+            7,
+            1,
+            7,
+            3,
+        ]
+        mesh = wp.Mesh(wp.array((signs * half).astype(np.float32), dtype=wp.vec3), wp.array(faces, dtype=wp.int32))
+        shape |= {"kind": MESH, "mesh": mesh.id}
+    frame = encode(
+        reference.render(view, [BALL], lambda d: np.full_like(d, 0.5) / REFLECTANCE, lambda d: np.full_like(d, 0.5))
+    )
+    # Painted over the ball: the hull of its corners.
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half @ turn.T + at
+    pixels, _ = view.project(corners)
+    hull = cv2.convexHull(np.rint(pixels * 16).astype(np.int32))
+    frame = cv2.fillConvexPoly(frame.copy(), hull, (255, 255, 255), cv2.LINE_AA, 4)
+    free = unwrapped(view, frame, transfer="linear")
+    radiance, confidence, _ = unwrapped(view, frame, shapes=[shape], transfer="linear")
+    seen = confidence > 0
+    grey = free[0][(free[1] > 0.9)].min(0)
+    assert free[0][free[1] > 0].max() > 1.0  # it does stand in the way
+    assert 0.2 < seen.sum() / (free[1] > 0).sum() < 0.95
+    assert np.abs(radiance[seen] - grey).max() < 1e-6
+    assert (confidence[seen] == free[1][seen]).all()
+
+
+def test_what_stands_behind_or_carries_the_ball_hides_nothing(device):
+    view = look(0.4)
+    table = {"kind": PLANE, "position": (0.0, 0.0, 0.0), "extent": (1.0, 1.0, 0.0)}
+    behind = {"kind": BOX, "position": (0.1, 0.1, 0.05), "extent": (0.1, 0.02, 0.05)}
+    frame = constant_frame(view, 100)
+    assert (unwrapped(view, frame, shapes=[table, behind])[1] == unwrapped(view, frame)[1]).all()
+
+
+def test_of_several_balls_the_one_that_sees_speaks(device):
+    """The nearer ball hides part of the other; together they know more than either, and agree with the light."""
+    other = ((0.16, -0.16, 0.035), 0.02, (0.5, 0.6, 0.7))
+    view = look(0.4, focal=500.0)
+    frame = encode(reference.render(view, [BALL, other], smooth_light, np.ones_like))
+    both = unwrapped(view, frame, [BALL, other], transfer="linear")
+    single = [unwrapped(view, frame, [ball], transfer="linear") for ball in (BALL, other)]
+    assert (both[1] <= np.maximum(single[0][1], single[1][1]) + 1e-6).all()
+    sure = both[1] > 0.5
+    error = np.abs(both[0] - smooth_light(latlong_reference.directions(HEIGHT, 2 * HEIGHT)))[sure]
+    assert error.max() < 0.04
+    order = unwrapped(view, frame, [other, BALL], transfer="linear")
+    np.testing.assert_allclose(order[0], both[0], atol=1e-6)
+
+
+def test_hidden_ball_leaves_the_word_to_the_other(device):
+    far, near = ((0.0, 0.3, 0.0), 0.03, (0.5, 0.5, 0.5)), ((0.0, 0.0, 0.0), 0.05, (1.0, 1.0, 1.0))
+    view = reference.View((0.0, -0.5, 0.0), (0.0, 0.0, 0.0))
+    frame = constant_frame(view, 128)
+    assert (unwrapped(view, frame, [far])[1] > 0).any()
+    radiance, confidence, _ = unwrapped(view, frame, [far, near])
+    assert (radiance[confidence > 0] == decode_table("srgb")[128]).all()
+
+
+def test_balls_vote_by_their_pixels(device):
+    """Of two balls that disagree, the one with 16 times the pixels has 16 votes to 1, whatever their order."""
+    large, small = ((0.0, -0.1, 0.0), 0.06, (1.0, 1.0, 1.0)), ((0.0, 0.1, 0.0), 0.015, (1.0, 1.0, 1.0))
+    view = reference.View((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), focal=900.0)
+    frame = constant_frame(view, 0)
+    frame[:, : view.width // 2] = 255 if view.project([large[0]])[0][0, 0] < view.width / 2 else 0
+    frame[:, view.width // 2 :] = 255 - frame[:, :1]
+    for balls in ([large, small], [small, large]):
+        radiance, confidence, _ = unwrapped(view, frame, balls, transfer="linear")
+        sure = confidence > 0.98
+        both = sure & (unwrapped(view, frame, [small], transfer="linear")[1] > 0.9)
+        assert both.sum() > 200
+        # The balls are seen 12 degrees apart: their densities differ by a few percent more.
+        assert np.median(radiance[both]) == pytest.approx(16 / 17, abs=0.01)
+
+
+@pytest.mark.parametrize(("code", "share"), [(255, 1.0), (254, 1.0), (253, 0.0)])
+def test_clipped_share(device, code, share):
+    view = look(0.4)
+    frame = constant_frame(view, 10)
+    frame[..., 1] = code
+    _, confidence, clipped = unwrapped(view, frame)
+    assert (clipped[confidence > 0] == [0.0, share, 0.0]).all()
+
+
+@pytest.mark.parametrize(("codes", "shares"), [((255, 248, 247), (1.0, 1.0, 0.0)), ((253, 250, 248), (0.0, 0.0, 0.0))])
+def test_a_channel_that_chroma_lowered_counts_beside_one_that_clips(device, codes, shares):
+    view = look(0.4)
+    frame = constant_frame(view, 10)
+    frame[:] = codes
+    _, confidence, clipped = unwrapped(view, frame)
+    assert (clipped[confidence > 0] == shares).all()
+
+
+def test_a_lens_that_folds_over_shows_nothing_twice(device):
+    """Barrel distortion of k1 = -0.5 turns back at 55 degrees; a ball beyond that is not in the frame, whatever the
+    formula says."""
+    lens = (-0.5, 0, 0, 0, 0, 0, 0, 0)
+    view = reference.View((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), distortion=lens, focal=150.0)
+    beyond = np.radians(54.0)
+    ball = ((0.4 * np.cos(beyond), 0.4 * np.sin(beyond), 0.0), 0.035, (1.0, 1.0, 1.0))
+    pixels, _ = view.project([ball[0]])
+    assert 0 <= pixels[0, 0] < view.width  # the formula alone would find it
+    assert (unwrapped(view, constant_frame(view, 50), [ball])[1] == 0).all()
+
+
+def test_far_from_the_origin(device):
+    """Hard case 14: one kilometre away, coordinates are known to 60 micrometres; nothing else gets worse."""
+    offset = np.array([1000.0, 1000.0, 0.0])
+    view = look(0.4)
+    center = np.float32(np.array(CENTER) + offset).astype(float)
+    moved = reference.View(np.float32(view.position + offset), center)
+    got = project(moved, [(center, RADIUS, REFLECTANCE)]).numpy()[:, :, 0]
+    expected = reference.corners(moved, center, RADIUS, HEIGHT)
+    seen = got[..., 2] >= 0
+    np.testing.assert_allclose(got[seen], expected[seen], atol=PIXEL)
+
+
+def test_unknown_method(device):
+    view = look(0.4)
+    with pytest.raises(ValueError, match="expected bilinear, area"):
+        unwrapped(view, constant_frame(view, 0), method="cubic")
+
+
+# ---- real and path-traced pictures ----
+
+
+def filled(radiance, confidence):
+    height, width = confidence.shape
+    levels = wp.zeros(fill.fill_level_offsets(height, width)[-1], dtype=wp.vec4)
+    out = wp.zeros((height, width), dtype=wp.vec3)
+    fill.seed_fill(wp.array(radiance, dtype=wp.vec3), wp.array(confidence, dtype=wp.float32), levels)
+    fill.push_pull(levels, height, width)
+    fill.finish_fill(levels, out)
+    return out
+
+
+@pytest.mark.parametrize("number", range(1, 13))
+def test_light_directions_of_real_photographs(device, shared, number):
+    """The key light of a photographed chrome ball is within one degree of the published direction of its lamp."""
+    folder = shared / "real" / "chrome_balls" / "LightProbe-1"
+    x, y, radius = map(float, (folder / "circle_data.txt").read_text().split())
+    expected = np.loadtxt(folder / "light_directions.txt")[:, number - 1]
+    image = cv2.cvtColor(cv2.imread(str(folder / f"Image_{number:02d}.JPG")), cv2.COLOR_BGR2RGB)
+    # Photographed from so far that it is orthographic: 1000 radii. World: x right, y up, z toward the camera. Their
+    # origin is the picture's corner, half a pixel from the centre of its first pixel.
+    distance = 1000.0
+    rows, columns = image.shape[:2]
+    focal = radius * np.sqrt(distance**2 - 1.0)
+    view = reference.View((0, 0, distance), (0, 0, 0), (columns, rows), focal, principal=(x - 0.5, rows - 0.5 - y))
+    view.rotation = np.diag([1.0, -1.0, -1.0])
+    radiance, confidence, _ = unwrapped(view, image, [((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))], height=64)
+    lights = wp.zeros(1, dtype=KeyLight)
+    cells = wp.zeros(key_lights.SECTOR_SUMS, dtype=wp.vec4)
+    key_lights.find_key_lights(filled(radiance, confidence), wp.zeros(64, dtype=wp.vec4), cells, lights)
+    light = lights.numpy()[0]
+    cosine = light["direction"] @ expected / np.linalg.norm(expected)
+    assert np.degrees(np.arccos(min(cosine, 1.0))) < 1.0
+    assert light["directionality"] > 0.5
+
+
+TRUTH = {
+    # Mean |error| over mean radiance, above the horizon (below it the desk is near: not a distant environment), where
+    # nothing clips.
+    "gold_torus_interior": 0.035,
+    "mirror_and_chalk_studio": 0.20,  # black walls with hair-thin edges, and a pixel is two texels wide
+    "night_desk_lamp": 0.015,
+    "overexposed_desk": 0.006,
+    "plastic_bunny_sunset": 0.015,
+}
+
+
+@pytest.mark.parametrize("case", TRUTH)
+@pytest.mark.parametrize("index", [0, 6, 11])
+def test_light_of_path_traced_desks(device, shared, case, index):
+    folder = shared / "truth" / case
+    meta = json.loads((folder / "case.json").read_text())
+    image = cv2.cvtColor(cv2.imread(str(folder / "camera" / f"{index:04d}.png")), cv2.COLOR_BGR2RGB)
+    camera, ball, pose = meta["camera"], meta["probe"], meta["poses"][index]
+    rotation = np.array(pose["R"])
+    view = reference.View((1, 0, 0), (0, 0, 0), (camera["width"], camera["height"]), camera["fx"])
+    view.position, view.rotation = -rotation.T @ pose["t"], rotation.T
+    view.principal = (camera["cx"], camera["cy"])
+    height = 64
+    radiance, confidence, clipped = unwrapped(
+        view, image, [(ball["center"], ball["radius"], ball["reflectance"])], height=height
+    )
+    true = np.load(folder / "env" / f"{index:04d}.npy").astype(np.float32)
+    bright = cv2.resize((true.max(-1) > 0.98).astype(np.float32), (2 * height, height), interpolation=cv2.INTER_AREA)
+    true = cv2.resize(true, (2 * height, height), interpolation=cv2.INTER_AREA)
+    clipping = cv2.dilate(((clipped.max(-1) > 0) | (bright > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    use = (confidence > 0.9) & ~clipping & (np.arange(height)[:, None] < 28)
+    weight = latlong_reference.solid_angles(height, 2 * height)[use][:, None]
+    error = (np.abs(radiance - true)[use] * weight).sum() / (true[use] * weight).sum()
+    bias = np.abs(((radiance - true)[use] * weight).sum(0) / (true[use] * weight).sum(0))
+    assert use.sum() > 500
+    assert error < TRUTH[case]
+    # Of the whole light, per channel: quantisation, the renderer's noise, and the desk's clutter.
+    assert bias.max() < 0.025

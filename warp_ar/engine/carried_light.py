@@ -1,0 +1,63 @@
+"""The environment that is remembered from frame to frame, and from one pipeline to the next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.stages.base import Arrays
+
+LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
+"""What is remembered of the environment."""
+
+
+class CarriedLight:
+    """Whether a pipeline has seen any light yet, and what it keeps of it."""
+
+    def __init__(self, arrays: Arrays, *, wanted: bool) -> None:
+        """``wanted``: the environment is one of the outputs."""
+        self._arrays, self._wanted = arrays, wanted
+        self.known = False
+        """Whether the arrays hold light; else the next frame starts anew."""
+
+    @property
+    def environment(self) -> Any:
+        """The environment as an output: None where it was not asked for or not seen yet."""
+        return self._arrays["environment"] if self.known and self._wanted else None
+
+    def take_over(self, other: CarriedLight) -> None:
+        """Go on from what another pipeline remembers, at the size of this one's arrays."""
+        mine, theirs = self._arrays, other._arrays
+        kept = [name for name in LIGHT_ARRAYS if name in mine and name in theirs]
+        if not other.known or not kept:
+            return
+        if mine[kept[0]].shape == theirs[kept[0]].shape:
+            for name in kept:
+                wp.copy(mine[name], theirs[name])
+        else:
+            radiance, confidence, clipped = (theirs[name].numpy() for name in LIGHT_ARRAYS)
+            light = resample_light(radiance, confidence, clipped, mine[kept[0]].shape)
+            for name, values in zip(LIGHT_ARRAYS, light, strict=True):
+                mine[name].assign(values)
+        self.known = True
+
+
+def resample_light(
+    radiance: npt.NDArray[np.float32],
+    confidence: npt.NDArray[np.float32],
+    clipped: npt.NDArray[np.float32],
+    shape: tuple[int, int],
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """The remembered light at another size, (rows, columns): means weighted by confidence."""
+
+    def resize(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        way = cv2.INTER_AREA if shape[0] < values.shape[0] else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(values, (shape[1], shape[0]), interpolation=way), np.float32)
+
+    known = resize(confidence)
+    weight = np.where(known > 0.0, known, 1.0)[..., None]
+    return resize(radiance * confidence[..., None]) / weight, known, resize(clipped * confidence[..., None]) / weight

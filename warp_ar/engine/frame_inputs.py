@@ -1,0 +1,204 @@
+"""What the pipeline itself provides for every frame: the picture, the camera, virtual lights and objects, the clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.device import exclusive
+from warp_ar.engine.frame_block import FrameBlock
+from warp_ar.engine.graph import INPUTS
+from warp_ar.engine.scheduler import StageTiming
+from warp_ar.engine.transfer import Slot, Transfers
+from warp_ar.kernels.color import decode_table, encode_table
+from warp_ar.kernels.structs import Probe
+from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.scene.ray_scene import HostScene
+from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
+from warp_ar.stages.base import Arrays, Rows
+
+RECTS = ("object", "light", "shadow", "ball")
+"""Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SeenFrame:
+    """A frame that has been looked at, not rendered."""
+
+    image: Any
+    """As it was given, or a copy of one's own."""
+    slot: Slot | None
+    """Its way to the device, where that has begun."""
+    pose: Pose | None
+    lost: bool
+    index: int
+    time: float
+    """Seconds, by the caller's clock."""
+    seconds: float
+    """Since the first frame."""
+    step: float
+    """Seconds since the frame before that was lit."""
+    timings: dict[str, StageTiming]
+
+
+class FrameInputs:
+    """Owns the inputs of stages and writes them before a frame is rendered; says which of them changed."""
+
+    def __init__(self, scene: Scene, camera: Camera, arrays: Arrays, device: Any) -> None:
+        """Allocate, and add to ``arrays`` what stages read.
+
+        Args:
+            scene: What to show.
+            camera: Of the frames.
+            arrays: Of the pipeline, empty.
+            device: Warp device, the current one.
+        """
+        shape = (camera.height, camera.width)
+        self._camera, self._arrays = camera, arrays
+        self.host_scene = HostScene(scene, device)
+        self.block = FrameBlock(device, len(scene.lights), len(scene.objects))
+        self.host_scene.ray_scene.objects = self.block.device_array("objects")
+        self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
+        """The picture that stages read."""
+        self.transfers = None if device.is_cpu else Transfers(shape, device)
+        self.decode = decode_table(camera.transfer)
+        """Linear value of each code, (256, 3)."""
+        self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
+        # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
+        values = self.block.host("params")
+        self._params = {name: values[name] for name in values.dtype.names}
+        self._add(scene, device)
+        self._params["focal"][0] = (camera.fx, camera.fy)
+        self._params["principal"][0] = (camera.cx, camera.cy)
+        self._params["distortion"][0] = np.resize(np.asarray([*camera.distortion, *([0.0] * 8)], np.float32), 8)
+        self.write_exposure(scene)
+
+    def _add(self, scene: Scene, device: Any) -> None:
+        """Name the arrays, those that stand for an input and those that all stages share."""
+        add, params = self._arrays.add, self._params
+        for name in INPUTS:
+            add(name, self.frame if name == "frame" else None)
+        add("params", self.block.device_array("params"))
+        add("light_array", self.block.device_array("lights"))
+        add("ray_scene", self.host_scene.ray_scene)
+        add("probes", wp.array(_probe_values(scene), dtype=Probe, device=device))
+        add("decode", wp.array(self.decode, dtype=wp.vec3, device=device))
+        add("encode", wp.array(encode_table(self._camera.transfer), dtype=wp.vec3, device=device))
+        add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
+        for name in RECTS:
+            add(f"{name}_rows", functools.partial(self._rows, name))
+        add("seconds", lambda: float(params["time"][0]))
+
+    def close(self) -> None:
+        """Stop the copying threads."""
+        if self.transfers is not None:
+            self.transfers.close()
+
+    def update(self, scene: Scene, *, placed: bool, exposed: bool) -> None:
+        """Take the numbers of another scene from the next frame on.
+
+        Args:
+            scene: With the same skeleton.
+            placed: Whether objects or lights differ.
+            exposed: Whether the exposure does.
+        """
+        if exposed:
+            self.write_exposure(scene)
+        if placed:
+            with exclusive(self.frame.device):
+                self.host_scene.update(scene)
+            self._arrays.touch("objects")
+
+    def write_exposure(self, scene: Scene) -> None:
+        """Write the scale of the exposure; ``auto`` finds its own."""
+        scale = scene.exposure.scale
+        self._params["exposure_scale"][0] = 1.0 if isinstance(scale, str) else scale
+        self._arrays.touch("exposure")
+
+    def write(self, frame: SeenFrame, *, reset: bool) -> None:
+        """Make ``frame`` the one that stages read: its values, then its picture.
+
+        Args:
+            frame: A frame whose marker is not lost.
+            reset: Whether what was accumulated of the environment is to be forgotten.
+        """
+        touched = ["clock", *self._place(frame)]
+        params = self._params
+        if (frame.pose is not None and self._move(frame.pose)) or self._arrays.version("pose") == 0:
+            touched.append("pose")
+        params["time"][0] = frame.seconds
+        params["time_step"][0] = frame.step
+        params["frame_index"][0] = frame.index
+        params["environment_reset"][0] = reset
+        self.block.upload()
+        if self._take_picture(frame):
+            touched.append("frame")
+        for name in touched:
+            self._arrays.touch(name)
+
+    def _place(self, frame: SeenFrame) -> Iterable[str]:
+        """Move lights and objects to where they are now; gives the inputs that changed."""
+        lights = self.host_scene.write_lights(self.block.host("lights"), frame.seconds)
+        objects = self.host_scene.write_objects(self.block.host("objects"), frame.seconds)
+        if lights or frame.index == 0:
+            yield "lights"
+        if objects or frame.index == 0:
+            yield "objects"
+
+    def _move(self, pose: Pose) -> bool:
+        """Put the camera at ``pose`` and find what of the screen virtual things can reach; whether it moved."""
+        params = self._params
+        position, rotation = params["camera_position"], params["world_from_camera"]
+        before = position.tobytes(), rotation.tobytes()
+        inverse = pose.inverse()
+        position[0], rotation[0] = inverse.translation, inverse.rotation
+        outlines = self._outlines()
+        rects = dict(zip(outlines, screen_rects(list(outlines.values()), pose, self._camera), strict=True))
+        rects.setdefault("light", rects["direct"])
+        self.rects.update(rects)
+        for name, rect in rects.items():
+            params[f"{name}_rect"][0] = rect
+        return before != (position.tobytes(), rotation.tobytes())
+
+    def _outlines(self) -> dict[str, Outline]:
+        """What of the screen a frame asks about; ``light`` only where it is more than what is lit directly."""
+        scene, arrays = self.host_scene, self._arrays
+        outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
+        if "relight_bounced" in arrays:
+            outlines["light"] = scene.light_outline(bounced=True)
+        if "mirrored" in arrays:
+            outlines["ball"] = scene.ball_outline()
+        if "shadow_ratio" in arrays:
+            outlines["shadow"] = scene.shadow_outline()
+        return outlines
+
+    def _rows(self, name: str) -> Rows:
+        """Rows of one of ``RECTS`` in this frame."""
+        return self.rects[name][:2]
+
+    def _take_picture(self, frame: SeenFrame) -> bool:
+        """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""
+        if frame.slot is not None and self.transfers is not None:
+            self.transfers.receive(frame.slot, self.frame)
+        elif isinstance(frame.image, wp.array):
+            wp.copy(self.frame, frame.image)
+        else:
+            target = self.frame.numpy()
+            if frame.index and np.array_equal(target, frame.image):
+                return False
+            np.copyto(target, frame.image)
+        return True
+
+
+def _probe_values(scene: Scene) -> npt.NDArray[Any]:
+    values = np.zeros(len(scene.probes), dtype=np.dtype(Probe.numpy_dtype()))
+    for value, probe in zip(values, scene.probes, strict=True):
+        value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
+    return values

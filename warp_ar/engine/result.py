@@ -1,0 +1,105 @@
+"""What a frame became."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.device import exclusive
+from warp_ar.engine.scheduler import StageTiming
+from warp_ar.engine.transfer import Image, Picture
+from warp_ar.input.tracking import TrackState
+from warp_ar.scene import Pose
+
+TRACK = "track"
+"""Name of the host's own stage in reports: the marker's pose."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendered:
+    """What the stages made of one frame."""
+
+    image_array: Any
+    environment_array: Any
+    stages: Mapping[str, StageTiming]
+    render_ms: float = 0.0
+    """Of the host: running the stages on CPU, launching them on CUDA."""
+    image: Picture | Image | None = None
+    """The picture, or that it is on its way to the host, where it was sent ahead."""
+    environment: npt.NDArray[np.float32] | None = None
+    """The environment where it was kept."""
+
+    def at_once(self) -> Future[Rendered]:
+        """The same as something that nobody needs to wait for."""
+        future: Future[Rendered] = Future()
+        future.set_result(self)
+        return future
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What one frame became; of a frame that was submitted, all but the pose waits until it has been rendered."""
+
+    pose: Pose | None
+    """From marker to camera; None while the marker is lost or when nothing needed it."""
+    state: TrackState | None
+    """Tracked, held or lost; None when nothing needed the pose."""
+    _rendered: Future[Rendered]
+    shown: bool = True
+    """False: the frame has another exposure than the shown ones; it only told of the light, the picture is the last."""
+
+    @property
+    def image_array(self) -> Any:
+        """The lit frame, (height, width) of 8-bit RGB, on the pipeline's device; valid until the next call."""
+        return self._rendered.result().image_array
+
+    @property
+    def environment_array(self) -> Any:
+        """The environment, latlong linear RGB (rows, columns), or None if it was not asked for or not seen yet."""
+        return self._rendered.result().environment_array
+
+    @property
+    def stages(self) -> Mapping[str, StageTiming]:
+        """Milliseconds of every stage of the plan, and whether it was skipped."""
+        return self._rendered.result().stages
+
+    @property
+    def steps(self) -> Mapping[str, float]:
+        """Milliseconds of the steps of the frame's way, which overlap those of other frames.
+
+        ``track`` and ``render`` (on CUDA: launching) on the host; of a frame that was submitted on CUDA also
+        ``upload``, ``kernels`` and ``download``, on the device.
+        """
+        rendered = self._rendered.result()
+        tracking = rendered.stages.get(TRACK)
+        steps = {TRACK: tracking.milliseconds} if tracking is not None else {}
+        steps["render"] = rendered.render_ms
+        return steps | rendered.image.steps() if isinstance(rendered.image, Picture) else steps
+
+    @functools.cached_property
+    def image(self) -> Image:
+        """The lit frame as a NumPy array of its own, uint8 RGB (height, width, 3)."""
+        rendered = self._rendered.result()
+        if rendered.image is not None:
+            return rendered.image.result() if isinstance(rendered.image, Picture) else rendered.image
+        lit = rendered.image_array
+        if not isinstance(lit, wp.array):
+            return np.array(lit)
+        with exclusive(lit.device):
+            return np.array(lit.numpy())
+
+    @functools.cached_property
+    def environment(self) -> npt.NDArray[np.float32] | None:
+        """The environment as a NumPy array of its own, float32 RGB (rows, columns, 3)."""
+        rendered = self._rendered.result()
+        if rendered.environment is not None or rendered.environment_array is None:
+            return rendered.environment
+        with exclusive(rendered.environment_array.device):
+            return np.array(rendered.environment_array.numpy())

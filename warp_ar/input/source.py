@@ -1,0 +1,213 @@
+"""What every source of frames is: a `Frame` in 8-bit RGB at a time, recorded ones decoded ahead.
+
+A recorded source (folder, video, generated) loses no frame and is decoded a few frames ahead on one thread. What names
+a place that is not there, or an impossible rate, is complained about here too.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+import difflib
+import functools
+import math
+import pathlib
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SourceError, UsageError, reason
+from warp_ar.files import kind_of
+
+Image = npt.NDArray[np.uint8]
+
+DEFAULT_FPS = 30.0
+"""Rate of a folder of frames, or of a device that does not tell, in frames per second."""
+
+FRAMES_AHEAD = 4
+"""How many frames a recorded source decodes before they are asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """One picture of a source."""
+
+    index: int
+    """Number of the frame, counted from 0 without gaps; goes on counting where a looped source starts again."""
+
+    time: float
+    """Seconds since the source's first frame."""
+
+    image: Image
+    """Encoded colour, uint8 RGB, (height, width, 3), C-contiguous."""
+
+    exposure_time: float | None = None
+    """Exposure in seconds, None where the source does not tell."""
+
+
+class Source(ABC):
+    """Where frames come from: a context manager, and iterable."""
+
+    size: tuple[int, int]
+    """(width, height) of every frame, in pixels."""
+
+    fps: float
+    """Nominal rate in frames per second."""
+
+    length: int | None
+    """Number of frames in one pass where it is known; a video's is what its header says, or its duration tells."""
+
+    live: bool
+    """Whether frames are lost when nobody takes them in time."""
+
+    description: str
+    """One line for people."""
+
+    exposures: tuple[float, ...] = ()
+    """All exposure times of its frames in seconds, longest first; empty where it does not tell."""
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were skipped because a newer one had come; 0 unless live."""
+        return 0
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames in order; a recorded source starts from its first frame at every call."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop every thread and release files and devices; a second call does nothing."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class RecordedSource(Source):
+    """A source that can be read again from the start: decoded ahead on a thread, looped if asked, no frame lost."""
+
+    live = False
+
+    def __init__(self, *, loop: bool, exposures: Sequence[float] = ()) -> None:
+        check_exposures(exposures)
+        self._cycle = tuple(map(float, exposures))
+        self.exposures = distinct(self._cycle)
+        self._loop = loop
+        self._closed = False
+        self._running: weakref.WeakSet[Generator[Frame, None, None]] = weakref.WeakSet()
+
+    @abstractmethod
+    def _decode(self) -> Generator[Frame, None, None]:
+        """One pass over the frames, index and time from 0."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        if self._closed:
+            raise SourceError(f"{self.description} is closed; open it again to read from it")
+        frames = _ahead(self._passes())
+        self._running.add(frames)
+        return frames
+
+    def close(self) -> None:
+        """End every iteration and its thread."""
+        self._closed = True
+        for frames in list(self._running):
+            frames.close()
+
+    def _passes(self) -> Generator[Frame, None, None]:
+        index, start, last = 0, 0.0, 0.0
+        while True:
+            with contextlib.closing(self._decode()) as frames:
+                for frame in frames:
+                    last = start + frame.time
+                    exposure = self._cycle[frame.index % len(self._cycle)] if self._cycle else frame.exposure_time
+                    yield dataclasses.replace(frame, index=index, time=last, exposure_time=exposure)
+                    index += 1
+            if not self._loop:
+                return
+            start = last + 1.0 / self.fps
+
+
+def _ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
+    """Yield what ``frames`` yields, computed up to FRAMES_AHEAD frames early; errors keep their place in the order."""
+    pending: collections.deque[Future[Frame | None]] = collections.deque()
+    take = functools.partial(next, frames, None)
+    with contextlib.closing(frames), ThreadPoolExecutor(1, thread_name_prefix="warp-ar-source") as executor:
+        try:
+            while True:
+                while len(pending) <= FRAMES_AHEAD:
+                    pending.append(executor.submit(take))
+                frame = pending.popleft().result()
+                if frame is None:
+                    return
+                yield frame
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+
+
+def check_size(image: Image, size: tuple[int, int], name: str, index: int | None) -> None:
+    """Raise SourceError if a picture is not of the (width, height) of those before it."""
+    height, width = image.shape[:2]
+    if (width, height) != size:
+        which = name if index is None else f"{name}: frame {index}"
+        raise SourceError(f"{which} is {width}x{height}, not {size[0]}x{size[1]} like those before it")
+
+
+def check_fps(fps: float | None) -> None:
+    """Raise UsageError if ``fps`` is given and no rate."""
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
+
+
+def check_exposures(exposures: Sequence[float]) -> None:
+    """Raise UsageError if one of ``exposures`` is no time."""
+    if not all(math.isfinite(seconds) and seconds > 0 for seconds in exposures):
+        raise UsageError(f"exposures {', '.join(map(str, exposures))}: expected positive numbers of seconds")
+
+
+def distinct(exposures: Iterable[float]) -> tuple[float, ...]:
+    """Every exposure once, longest first."""
+    return tuple(sorted(set(map(float, exposures)), reverse=True))
+
+
+def existing_path(path: pathlib.Path) -> pathlib.Path:
+    """``path`` if it exists, else an error that names the nearest object that does."""
+    try:
+        if (kind := kind_of(path)) != "nothing":
+            if kind in ("file", "folder"):
+                return path
+            raise SourceError(f"{path} is {kind}; frames are read from folders, files and capture devices")
+        # The first part that is missing is the one that was mistyped.
+        missing = path
+        while kind_of(missing.parent) == "nothing":
+            missing = missing.parent
+    except OSError as error:
+        raise SourceError(f"{path} cannot be read: {reason(error)}") from error
+    folder = missing.parent
+    hint = nearest_name(missing.name, names_in(folder)) if folder.is_dir() else None
+    advice = f"did you mean {folder / hint}?" if hint else f"nothing in {folder} has a name like it"
+    raise SourceError(f"there is no {path}; {advice}")
+
+
+def names_in(folder: pathlib.Path) -> list[str]:
+    """Names of all that a folder holds, sorted."""
+    try:
+        return sorted(entry.name for entry in folder.iterdir())
+    except OSError as error:
+        raise SourceError(f"{folder} cannot be read: {reason(error)}") from error
+
+
+def nearest_name(name: str, names: Iterable[str]) -> str | None:
+    """The one of ``names`` that ``name`` may have meant; None if none is near."""
+    return next(iter(difflib.get_close_matches(name, list(names), 1)), None)

@@ -1,0 +1,169 @@
+"""A video file as frames, upright and in the colours that its stream names."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import pathlib
+from collections.abc import Generator, Sequence
+from typing import Any
+
+import av
+import numpy as np
+import numpy.typing as npt
+from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+
+from warp_ar.errors import SourceError, reason
+from warp_ar.files import limits, too_much
+from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
+
+Image = npt.NDArray[np.uint8]
+
+HD_HEIGHT = 720
+"""Rows from which a video that names no colour matrix is BT.709; below, BT.601: what players do, and encoders
+expect."""
+
+# Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
+_FORMATS = (
+    "mov,mp4,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,flv,live_flv,asf,ogg,mxf,dv,nut,"
+    "mjpeg,mjpeg_2000,gif,apng,yuv4mpegpipe,wtv,rm,vc1,vc1test,swf,r3d,bink,roq,nsv,smk,gxf,wav"
+)
+_OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
+
+# Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
+_TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+
+
+class VideoFile(RecordedSource):
+    """A video file, its first video stream, turned upright as its metadata says.
+
+    Colour is converted with the stream's own matrix and range; one that names none is taken as BT.709 from 720 rows up,
+    else BT.601. Frame times are the file's own (a variable rate is kept), counted from the first frame.
+
+    Args:
+        path: The file.
+        fps: Show frame n at n / fps instead of at its own time.
+        loop: Start again at the end.
+        exposures: Exposure times in seconds that frames have in turn.
+
+    Raises:
+        SourceError: The file does not exist, is no video, or its first frame cannot be decoded.
+    """
+
+    def __init__(
+        self,
+        path: str | pathlib.Path,
+        *,
+        fps: float | None = None,
+        loop: bool = False,
+        exposures: Sequence[float] = (),
+    ) -> None:
+        super().__init__(loop=loop, exposures=exposures)
+        check_fps(fps)
+        self._path = existing_path(pathlib.Path(path))
+        self._retimed = fps is not None
+        if self._path.is_dir():
+            raise SourceError(f"{self._path} is a folder, not a video file")
+        if self._path.stat().st_size == 0:
+            raise SourceError(f"{self._path} is empty (0 bytes); a video file is needed")
+        with self._open() as container:
+            stream = container.streams.video[0]
+            rate = float(stream.average_rate or stream.guessed_rate or DEFAULT_FPS)
+            seconds = float(container.duration or 0) / av.time_base
+            self.fps = fps or rate
+            self.length = int(stream.frames) or round(seconds * rate) or None
+            codec = stream.codec_context.name
+            first = next(self._pictures(container), None)
+        if first is None:
+            raise SourceError(f"{self._path}: frame 0 cannot be decoded: the video stream holds no picture")
+        height, width, _ = first[0].shape
+        self.size = (width, height)
+        self.description = f"{self._path} ({codec}, {width}x{height}, {self.fps:g} fps)"
+
+    def _open(self) -> Any:
+        try:
+            container = av.open(str(self._path), options=_OPTIONS)
+        except (av.FFmpegError, OSError, ValueError) as error:
+            raise SourceError(
+                f"{self._path} cannot be read as a video ({reason(error)}): damaged, cut off, or no video file"
+            ) from error
+        try:
+            self._check_stream(container)
+        except BaseException:
+            container.close()
+            raise
+        return container
+
+    def _check_stream(self, container: Any) -> None:
+        if not container.streams.video:
+            kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
+            raise SourceError(f"{self._path} has no video stream, only {kinds}; choose a file with pictures")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise SourceError(f"{self._path} has a video stream of no known codec; choose another encoding")
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if width * height > limits().picture_pixels:
+            label = f"{self._path} is {width}x{height}: a frame of it"
+            raise SourceError(too_much(label, width * height, "pixels", "picture_pixels"))
+        # The size may change on the way.
+        stream.codec_context.options = {"max_pixels": str(limits().picture_pixels)}
+
+    def _decode(self) -> Generator[Frame, None, None]:
+        with self._open() as container:
+            first, previous = None, -math.inf
+            for index, (image, stamp) in enumerate(self._pictures(container)):
+                check_size(image, self.size, str(self._path), index)
+                if self._retimed or stamp is None:
+                    seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
+                else:
+                    first = stamp if first is None else first
+                    # Time never stands still or runs back, whatever a broken recorder wrote.
+                    seconds = stamp - first if stamp - first > previous else previous + 1.0 / self.fps
+                previous = seconds
+                yield Frame(index, seconds, image)
+
+    def _pictures(self, container: Any) -> Generator[tuple[Image, float | None], None, None]:
+        """Every picture with its time stamp in seconds; whatever precedes damage comes before the error."""
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        to_rgb = functools.partial(_rgb_from_video, VideoReformatter())
+        count, packets, damage = 0, 0, ""
+        demuxer = container.demux(stream)
+        while not damage:
+            pictures = []
+            try:
+                packet = next(demuxer, None)
+                if packet is None:
+                    break
+                # A transport stream marks every gap so, and is made to go on after it.
+                if packet.is_corrupt and container.format.name != "mpegts":
+                    damage = "the file is cut off or damaged there"
+                    break
+                packets += packet.size > 0
+                pictures = packet.decode()
+            except (av.FFmpegError, OSError, ValueError) as error:
+                damage = reason(error)
+            for picture in pictures:
+                yield to_rgb(picture), picture.time
+                count += 1
+        # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
+        if not damage and "mp4" in container.format.name and packets < stream.frames:
+            damage = f"the file is cut off: its header promises {stream.frames} frames"
+        if damage:
+            # Threads and reordering hold frames back; those before the damage are still good.
+            with contextlib.suppress(av.FFmpegError):
+                for picture in stream.decode(None):
+                    yield to_rgb(picture), picture.time
+                    count += 1
+            raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
+
+
+def _rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
+    """Upright 8-bit RGB of a decoded picture, with the picture's own colour matrix and range."""
+    matrix = None
+    if picture.colorspace not in {int(known) for known in Colorspace}:
+        matrix = Colorspace.ITU709 if picture.height >= HD_HEIGHT else Colorspace.ITU601
+    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=_TO_RGB, threads=1)
+    # Both count the angle counterclockwise.
+    return np.ascontiguousarray(np.rot90(rgb.to_ndarray(), round(picture.rotation / 90)))

@@ -1,0 +1,144 @@
+"""Numbers of the recovery of clipped light: what is assumed, tried and tolerated, each with its unit."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+
+class Kind(enum.IntEnum):
+    """What a surface point lies on."""
+
+    CARD = 0
+    """White paper: its reflectance is known."""
+    INK = 1
+    """The marker's black cells."""
+    PLANE = 2
+    """A plane proxy, textured as tables are."""
+    FACE = 3
+    """One face of a box proxy."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceConfig:
+    """What surfaces are sampled at, and what is known of them beforehand; tuples are by ``Kind``."""
+
+    grid: float = 0.06
+    """Metres between points on planes."""
+    noise: tuple[float, ...] = (0.02, 0.04, 0.12, 0.04)
+    """Relative standard deviation of one equation, by kind, where points scatter so much or are too few to tell."""
+    least_noise: float = 0.015
+    """The same of the most even surface: transport that the model leaves out."""
+    scatter_points: int = 12
+    """Points of a surface that tell how much they scatter."""
+    scatter_iterations: int = 5
+    """Of reweighting by which shadows and stains are left out of that."""
+    shared: tuple[float, ...] = (4.0, 8.0, 2.0, 3.0)
+    """Equations that share one error of transport that the model leaves out, by kind, however far apart."""
+    texture: tuple[float, ...] = (0.0, 0.0, 0.03, 0.03)
+    """Metres within which texture varies little, by kind: points that are closer share its error as well."""
+    reflectance: tuple[float, ...] = (0.85, 0.04, 0.35, 0.35)
+    """Expected reflectance, by kind; the scene knows the card's."""
+    reflectance_spread: tuple[float, ...] = (0.005, 0.4, 0.6, 0.6)
+    """Standard deviation of its logarithm."""
+    hue_spread: tuple[float, ...] = (0.005, 0.1, 0.4, 0.4)
+    """Standard deviation of its logarithm about that in another channel: paper is white and ink grey."""
+    tie: float = 0.06
+    """Relative standard deviation between the reflectances of one box's faces."""
+    mirror_trust: float = 0.5
+    """Relative standard deviation of light that comes by way of a ball: dents, scratches and dust scatter it."""
+    dark: float = 0.005
+    """pi times radiance below which a point says nothing: quantisation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PriorConfig:
+    """What is expected of light that clips, where surfaces do not say."""
+
+    region: float = 0.12
+    """Steradians: a region wider than this (22 degrees across) is split."""
+    exponent: float = -0.5
+    """Of the solid angle, in the radiance that a component is expected to have."""
+    spread: float = 0.8
+    """Relative standard deviation of components about the common mean."""
+    inside: float = 0.7
+    """Relative standard deviation of regions about their component's mean."""
+    hue: float = 0.5
+    """Relative standard deviation of one channel's distribution about that of all."""
+    least: float = 0.3
+    """Radiance below which relative deviations are no longer relative."""
+    surface_excess: float = 0.5
+    """Radiance above clipping (standard deviation) of modelled surfaces."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchConfig:
+    """How emitters are looked for."""
+
+    evidence: float = 7.0
+    """Fall of the cost (twice a log likelihood) that a peak must be worth."""
+    better: float = 0.1
+    """Fall of the cost for which a peak that is being added goes to a neighbouring place."""
+    worth_moving: float = 1.0
+    """The same for a peak that was known before: lamps stand still, and what differs from view to view is noise.
+
+    With ``better``, a lamp of ``torus`` wanders to where another comes on, a quarter of a metre from the ball.
+    """
+    most: int = 4
+    """Most peaks at a time."""
+    every: int = 2
+    """Estimates between searches for one more peak; the first searches for all."""
+    later_every: int = 6
+    """The same once as many estimates as ``settled`` were made."""
+    first: int = 5
+    """Estimates in which searches try as many directions as they ever do."""
+    candidates: int = 160
+    """Directions that are tried for a peak at first."""
+    later_candidates: int = 40
+    """Directions that are tried in a later search, others each time."""
+    distances: tuple[float, ...] = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35)
+    """Metres from the ball that are tried for a lamp, beside infinity."""
+    nearest: float = 0.25
+    """Metres from the ball within which no lamp is looked for: it would stand in the picture, in front of the desk."""
+    angle: float = 0.12
+    """Radians around a peak's direction that share its light."""
+    radius_share: float = 0.06
+    """Radius of a lamp as a share of its distance: of a disc as wide as a cell."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SolverConfig:
+    """When a solution is good enough, and when none is asked for."""
+
+    iterations: int = 6
+    """Of reweighting, from a start that is far off."""
+    warm_iterations: int = 3
+    """The same from a solution of nearly the same problem."""
+    converged: float = 1.0e-3
+    """Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
+    settled: int = 10
+    """Estimates, from several views, after which lamps are taken for found, and light that stays as it is for known."""
+    still: float = 0.02
+    """Relative change, of surfaces or of the environment, below which the light is the same."""
+    rest: int = 4
+    """Most estimates in a row that are left out while the light is the same: a moving camera shows more."""
+    sudden: float = 0.25
+    """Relative change that is solved for at once; what changes less may wait for one more estimate."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RecoveryConfig:
+    """All numbers of the recovery."""
+
+    surfaces: SurfaceConfig = SurfaceConfig()
+    """Of surfaces."""
+    priors: PriorConfig = PriorConfig()
+    """Of what clips."""
+    search: SearchConfig = SearchConfig()
+    """Of emitters."""
+    solver: SolverConfig = SolverConfig()
+    """Of the solution."""
+
+
+CONFIG = RecoveryConfig()
+"""As the program runs."""

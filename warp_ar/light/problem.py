@@ -1,0 +1,259 @@
+"""The equations of one frame: which light each surface point receives from what is known and what is not."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.kernels.recover import LOST
+from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.noise import measured_noise, shared_errors
+from warp_ar.light.regions import connected_regions, split_regions
+from warp_ar.light.surfaces import Surfaces
+
+Array = NDArray[np.float64]
+
+Trace = Callable[[NDArray[np.float32]], Array]
+"""Irradiance at every surface point per unit intensity of lamps (q, 4: position, radius), (n, q)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Peak:
+    """A candidate for an emitter."""
+
+    cell: int
+    """In whose direction it stands."""
+    distance: float
+    """Metres from where the ball mirrors it; infinite: distant."""
+
+
+def mirroring_points(directions: Array, center: Array, radius: float, camera: Array | None) -> Array:
+    """Where on a ball a camera far away sees what lies in each direction, (m, 3).
+
+    Args:
+        directions: Unit, (m, 3).
+        center: Of the ball, metres, (3,).
+        radius: Of the ball, metres.
+        camera: Where it stands, metres, (3,); None: the centre for all.
+    """
+    if camera is None:
+        return np.broadcast_to(center, directions.shape)
+    view = (camera - center) / np.linalg.norm(camera - center)
+    halfway = directions + view
+    return np.asarray(center + radius * halfway / np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-3))
+
+
+class Problem:
+    """The equations of one frame."""
+
+    def __init__(
+        self,
+        cells: NDArray[Any],
+        transfer: NDArray[Any],
+        mirrored: NDArray[Any],
+        observations: NDArray[Any],
+        surfaces: Surfaces,
+        white: float,
+        trace: Trace | None,
+        origin: Array,
+    ) -> None:
+        """Set up both sides.
+
+        Args:
+            cells: Records of ``kernels.recover.Cell``, (rows, columns).
+            transfer: From ``trace_transfer``, straight, (n, rows * columns).
+            mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
+            observations: Records of ``Observation``, (n,).
+            surfaces: The points.
+            white: Reflectance of the card's paper.
+            trace: Traces lamps at finite distances; None: all light is distant.
+            origin: From ``mirroring_points``, (rows * columns, 3).
+        """
+        self.shape = cells.shape
+        self.trace, self.origin = trace, origin
+        self._traced: dict[Peak, Array] = {}
+        self.peaks: list[Peak] = []
+        clipped = self._read_cells(cells)
+        self._group_cells(clipped)
+        self._read_points(observations, surfaces, white)
+        through_balls = self._aim_transfer(cells, transfer, mirrored, surfaces, clipped)
+        self._sum_light(through_balls)
+        self.peak_columns = np.zeros((3, len(self.index), 0))
+        self.ties = [
+            (a, b)
+            for a in range(len(self.kinds))
+            for b in range(a)
+            if self.kinds[a] == Kind.FACE and self.kinds[b] == Kind.FACE and self.groups[a] == self.groups[b]
+        ]
+
+    def _read_cells(self, cells: NDArray[Any]) -> Array:
+        """The map's side; returns the share of each cell that clips in any channel, (m,)."""
+        self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
+        self.lost = cells["clipped"].reshape(-1, 3).astype(float)
+        self.lacking = cells["lacking"].reshape(-1, 3).astype(float)
+        self.direction = cells["direction"].reshape(-1, 3).astype(float)
+        self.solid_angle = cells["solid_angle"].ravel().astype(float)
+        self.modelled = cells["modelled"].ravel() > 0.5
+        self.may_hold_peak = (self.lost.max(axis=1) > 0.1) & ~self.modelled
+        return np.asarray(self.lost.max(axis=1) - cells["hidden"].ravel(), np.float64)
+
+    def _group_cells(self, clipped: Array) -> None:
+        """Regions, their components, and the radiance that those are expected to have."""
+        # What clips on modelled surfaces is not joined to what clips beyond.
+        beyond = connected_regions(((clipped > LOST) & ~self.modelled).reshape(self.shape)).ravel()
+        lit = connected_regions(((clipped > LOST) & self.modelled).reshape(self.shape)).ravel()
+        component = np.where(lit >= 0, lit + beyond.max(initial=-1) + 1, beyond)
+        self.part, self.parts = split_regions(component, self.direction, self.solid_angle)
+        self.components = int(component.max(initial=-1)) + 1
+        first = np.unique(self.part, return_index=True)[1][int((self.part < 0).any()) :]
+        self.component = component[first]
+        inside = component >= 0
+        weights = (self.solid_angle * clipped)[inside]
+        area = np.bincount(component[inside], weights, minlength=self.components)
+        is_surface = np.bincount(component[inside], self.modelled[inside], minlength=self.components) > 0
+        self.expected = np.where(is_surface, 0.0, (area + 0.01) ** CONFIG.priors.exponent)
+        self.is_surface = is_surface[self.component]
+        self.member = np.zeros((len(component), self.parts))
+        self.member[np.flatnonzero(inside), self.part[inside]] = 1.0
+
+    def _read_points(self, observations: NDArray[Any], surfaces: Surfaces, white: float) -> None:
+        """The frame's side: what points show, and how far that can be relied on."""
+        seen = observations["visible"] > 0.8
+        self.index = np.flatnonzero(seen)
+        shown = observations[seen]
+        self.surface = surfaces.surface[seen]
+        self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
+        self.kind = self.kinds[self.surface]
+        self.shared = shared_errors(surfaces.overlap, surfaces.kinds[surfaces.surface], seen)
+        self.light = np.pi * shown["radiance"].astype(float)
+        # Patches on a clutter's edge, or half in a sharp shadow, say nothing.
+        even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
+        self.exact = (self.light > CONFIG.surfaces.dark) & even & (shown["clipped"] < 0.01)
+        self.bound = shown["clipped"] > 0.5
+        self.noise = measured_noise(surfaces.points[seen], self.surface, self.kinds, self.light, self.exact)
+
+    def _aim_transfer(
+        self,
+        cells: NDArray[Any],
+        transfer: NDArray[Any],
+        mirrored: NDArray[Any],
+        surfaces: Surfaces,
+        clipped: Array,
+    ) -> NDArray[Any]:
+        """Transfer from where cells clip; returns that part of it which comes by way of balls."""
+        through_balls = mirrored[self.index]
+        self.transfer = transfer[self.index]
+        # What clips in a cell lies off its middle, for which transfer was traced.
+        lamps = np.flatnonzero((clipped > LOST) & ~self.modelled)
+        normals = surfaces.points["normal"][self.index]
+        cosine = normals @ cells["middle"].reshape(-1, 3)[lamps].T
+        turned = np.clip(normals @ cells["direction"].reshape(-1, 3)[lamps].T, 0.0, 2.0 * np.maximum(cosine, 0.0))
+        self.transfer[:, lamps] *= np.where(cosine > 0.0, turned / np.maximum(cosine, 1e-6), 1.0)
+        self.transfer += through_balls
+        return through_balls
+
+    def _sum_light(self, through_balls: NDArray[Any]) -> None:
+        """Irradiance as captured, the share of it that comes by way of balls, and that of each part per radiance."""
+        # With what clips taken to be some ten times as bright: only the order of magnitude matters.
+        bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
+        sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
+        self.captured = sums[:, :3]
+        mirrored_sums = through_balls @ bright.astype(np.float32)
+        self.mirrored_share = mirrored_sums / np.maximum(sums[:, 3], 1e-9)
+        order = np.argsort(self.part, kind="stable")[np.count_nonzero(self.part < 0) :]
+        starts = np.unique(self.part[order], return_index=True)[1]
+        columns = [np.zeros((len(self.index), 0))] * 3
+        if self.parts:
+            sent = self.transfer[:, order]
+            columns = [np.add.reduceat(sent * self.lacking[order, c], starts, axis=1) for c in range(3)]
+        self.columns = np.stack(columns)
+
+    def card_means(self) -> tuple[Array, tuple[bool, bool, bool]]:
+        """Common mean per channel that makes the card right, and whether that is a lower bound only."""
+        means, bounds = np.zeros(3), [False] * 3
+        expected = self.expected[self.component]
+        card = self.kind == Kind.CARD
+        for c in range(3):
+            use = card & self.exact[:, c]
+            if use.sum() < max(3.0, 0.3 * card.sum()):
+                bounds[c] = True
+                use = card & (self.exact[:, c] | self.bound[:, c])
+            gain = self.columns[c][use] @ expected
+            if not gain.any():
+                continue
+            irradiance = self.light[use, c] / self.white
+            missing = irradiance - self.captured[use, c]
+            mean = max(0.0, float(np.median(missing) / np.median(gain))) if np.median(gain) > 0 else 0.0
+            for _ in range(10):
+                weights = 1.0 / (1.0 + ((missing - gain * mean) / (0.03 * irradiance)) ** 2) / irradiance**2
+                mean = max(0.0, float((weights * gain * missing).sum() / (weights * gain**2).sum()))
+            means[c] = mean
+        return means, (bounds[0], bounds[1], bounds[2])
+
+    # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of each surface.
+
+    @property
+    def first_mean(self) -> int:
+        """Place of the first component's mean."""
+        return self.parts + len(self.peaks)
+
+    @property
+    def first_surface(self) -> int:
+        """Place of the first surface's 1 / reflectance."""
+        return self.first_mean + self.components + 1
+
+    def start(self, mean: float) -> Array:
+        """Unknowns as the card alone has them; surfaces are left open (0)."""
+        z = np.zeros(self.first_surface + len(self.kinds))
+        z[: self.parts] = mean * self.expected[self.component]
+        z[self.first_mean : self.first_surface - 1] = mean * self.expected
+        z[self.first_surface - 1] = mean
+        return z
+
+    def with_peak(self, z: Array) -> Array:
+        """Unknowns of a problem with one peak less, and that peak at zero."""
+        return np.insert(z, self.first_mean - 1, 0.0)
+
+    def power_columns(self, peaks: Sequence[Peak]) -> Array:
+        """Irradiance per unit power of peaks, (points, q)."""
+        cells = np.array([peak.cell for peak in peaks])
+        distances = np.array([peak.distance for peak in peaks])
+        columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
+        near = [k for k, peak in enumerate(peaks) if np.isfinite(peak.distance)]
+        if self.trace is not None and near:
+            new = [k for k in near if peaks[k] not in self._traced]
+            if new:
+                at = self.origin[cells[new]] + distances[new, None] * self.direction[cells[new]]
+                lamps = np.column_stack([at, CONFIG.search.radius_share * distances[new]]).astype(np.float32)
+                traced = self.trace(lamps)[self.index] * distances[new] ** 2
+                self._traced.update((peaks[k], column) for k, column in zip(new, traced.T, strict=True))
+            columns[:, near] = np.stack([self._traced[peaks[k]] for k in near], -1)
+        return columns
+
+    def patch(self, cell: int) -> Array:
+        """Radiance that a unit of a peak's power is, spread over the cells around it that lack light, (m, 3)."""
+        near = (self.direction @ self.direction[cell] > np.cos(CONFIG.search.angle)) & self.may_hold_peak
+        near[cell] = True
+        total = self.solid_angle[near] @ self.lacking[near]
+        return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
+
+    def push(self, peak: Peak) -> None:
+        """Add a peak to the unknowns."""
+        patch = self.patch(peak.cell)
+        if np.isfinite(peak.distance):
+            column = self.power_columns([peak])[:, 0]
+            near = patch[:, 0] > 0.0
+            block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
+        else:
+            block = np.stack([self.transfer @ (patch[:, c] * self.lacking[:, c]) for c in range(3)])
+        self.peaks.append(peak)
+        self.peak_columns = np.concatenate([self.peak_columns, block[:, :, None]], axis=2)
+
+    def pop(self) -> None:
+        """Take the last peak away."""
+        self.peaks.pop()
+        self.peak_columns = self.peak_columns[:, :, :-1]

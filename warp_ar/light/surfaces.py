@@ -1,0 +1,146 @@
+"""Points on what the scene models, where the frame shows how much light falls."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.input.marker_pattern import printed_cells
+from warp_ar.kernels.recover import SurfacePoint
+from warp_ar.light.config import CONFIG, Kind
+from warp_ar.scene import Scene
+from warp_ar.scene.geometry import rotation_matrix
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Surfaces:
+    """Surface points of a scene, all in the world's frame."""
+
+    points: NDArray[Any]
+    """Records of ``SurfacePoint``, (n,)."""
+    surface: NDArray[np.int64]
+    """Surface of each point, (n,)."""
+    kinds: NDArray[np.int64]
+    """``Kind`` of each surface, (surfaces,)."""
+    groups: NDArray[np.int64]
+    """Number of the object that a surface belongs to, (surfaces,): faces of one box share it."""
+    overlap: NDArray[np.float32]
+    """How far points share their surface's texture, 0 to 1, (n, n)."""
+
+
+class _Collector:
+    def __init__(self) -> None:
+        self.rows: list[tuple[Array, Array, Array, float]] = []
+        self.surface: list[int] = []
+        self.kinds: list[int] = []
+        self.groups: list[int] = []
+
+    def add(
+        self, positions: Sequence[Array], normal: Array, tangent: Array, half: float, kind: Kind, group: int
+    ) -> None:
+        self.rows += [(position, normal, tangent, half) for position in positions]
+        self.surface += [len(self.kinds)] * len(positions)
+        self.kinds.append(kind)
+        self.groups.append(group)
+
+    def result(self) -> Surfaces:
+        points = np.zeros(len(self.rows), np.dtype(SurfacePoint.numpy_dtype()))
+        for column, name in enumerate(("position", "normal", "tangent", "half")):
+            points[name] = [row[column] for row in self.rows]
+        surface, kinds = np.array(self.surface), np.array(self.kinds)
+        overlap = texture_overlap(points["position"], surface, kinds[surface])
+        return Surfaces(points, surface, kinds, np.array(self.groups), overlap)
+
+
+def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
+    """Points on everything physical that the scene models: the printed card, planes and boxes.
+
+    On the card: the centres of all cells, and its quiet zone. On planes: rings around each ball, where its shadow and
+    reflection fall, and a grid around the origin; not on the card (whose size beyond the quiet zone is not known) and
+    not under boxes. On boxes: 5 x 5 per face.
+
+    Args:
+        scene: What is modelled.
+        card_only: Leave out all but the card's paper.
+    """
+    found = _Collector()
+    cells, white, side, outline = printed_cells(scene.marker)
+    z, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
+    along = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
+    corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array(
+        [[-1, 1], [1, 1], [1, -1], [-1, -1]]
+    )
+    ring = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    paper = [*cells[white], *np.column_stack([ring, np.zeros(len(ring))])]
+    found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
+    if card_only:
+        return found.result()
+    found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
+    margin = 0.3 * float((high - low).max())
+    for number, proxy in enumerate(scene.proxies):
+        rotation, at = rotation_matrix(proxy.rotate), np.array(proxy.at)
+        if proxy.shape == "plane":
+            half = 0.5 * np.array(proxy.size)
+            places = [np.stack(np.meshgrid(*2 * [np.arange(-0.45, 0.451, CONFIG.surfaces.grid)]), -1).reshape(-1, 2)]
+            turn = np.arange(24) * np.pi / 12
+            for probe in scene.probes:
+                middle = (rotation.T @ (np.array(probe.center) - at))[:2]
+                radii = probe.radius * np.geomspace(0.6, 7.0, 11)
+                rings = radii[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+                places.append(middle + rings.reshape(-1, 2))
+            local = np.concatenate(places)
+            local = local[(np.abs(local) < half).all(axis=1)]
+            points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
+            flat = np.abs(points[:, 2]) < 0.02
+            card = flat & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
+            points = points[~card & ~_in_boxes(scene, points)]
+            found.add(list(points), rotation[:, 2], rotation[:, 0], 0.004, Kind.PLANE, 2 + number)
+        elif proxy.shape == "box":
+            half = 0.5 * np.array(proxy.size)
+            steps = (np.arange(5) + 0.5) / 2.5 - 1.0
+            for axis in range(3):
+                u, v = (axis + 1) % 3, (axis + 2) % 3
+                for sign in (-1.0, 1.0):
+                    face = np.zeros((25, 3))
+                    face[:, axis] = sign * half[axis]
+                    face[:, u], face[:, v] = np.repeat(steps, 5) * half[u], np.tile(steps, 5) * half[v]
+                    size = 0.12 * float(min(half[u], half[v]))
+                    face_points = list(at + face @ rotation.T)
+                    found.add(face_points, sign * rotation[:, axis], rotation[:, u], size, Kind.FACE, 2 + number)
+    return found.result()
+
+
+def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
+    inside = np.zeros(len(points), bool)
+    for proxy in scene.proxies:
+        if proxy.shape == "box":
+            local = (points - np.array(proxy.at)) @ rotation_matrix(proxy.rotate)
+            inside |= (np.abs(local) < 0.5 * np.array(proxy.size) + 0.005).all(axis=1)
+    return inside
+
+
+def texture_overlap(
+    positions: NDArray[Any], surface: NDArray[np.int64], kind: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """How far points share their surface's texture, 0 to 1, (n, n); 0 where its kind has none.
+
+    Args:
+        positions: Of the points, metres, (n, 3).
+        surface: That each lies on, (n,).
+        kind: ``Kind`` of that surface, (n,).
+    """
+    overlap = np.zeros((len(surface), len(surface)), np.float32)
+    for number in np.unique(surface):
+        own = np.flatnonzero(surface == number)
+        reach = CONFIG.surfaces.texture[kind[own[0]]]
+        if reach > 0.0:
+            at = positions[own].astype(float)
+            overlap[np.ix_(own, own)] = np.exp(-np.linalg.norm(at[:, None] - at, axis=2) / reach)
+    return overlap

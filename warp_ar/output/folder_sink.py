@@ -1,0 +1,78 @@
+"""Frames as numbered PNGs."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+import cv2
+import numpy.typing as npt
+
+from warp_ar.errors import SinkError, reason
+from warp_ar.files import kind_of, write_whole
+from warp_ar.output.places import earlier_frames, sign_png
+from warp_ar.output.sink import ThreadedSink, make_folder
+from warp_ar.output.video_sink import VIDEO_SUFFIXES
+
+FOLDER_THREADS = 2
+"""Threads that compress the frames of a folder."""
+
+# Camera frames hardly repeat, so looking for repetitions costs time and saves no byte; neighbours are alike.
+PNG_OPTIONS = (
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+)
+
+
+class FolderSink(ThreadedSink):
+    """A folder of ``NNNN.png``, numbered from 0; other files in it are left alone.
+
+    A frame appears under its name only when it is whole. Numbered frames that stood there go with the first new one, so
+    that what the folder holds is of one run.
+
+    Args:
+        path: The folder.
+        overwrite: Whether numbered frames that this program did not write may go.
+
+    Raises:
+        SinkError: The folder cannot be made or written to, or holds frames that may not go.
+    """
+
+    _suffix = ".png"
+
+    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
+        self._path = pathlib.Path(path)
+        try:
+            kind = kind_of(self._path)
+        except OSError as error:
+            raise SinkError(f"{self._path} cannot be written to: {reason(error)}") from error
+        if kind not in ("folder", "nothing"):
+            what = "a file" if kind == "file" else kind
+            raise SinkError(f"{self._path} is {what}; name a folder, or a video ending in {', '.join(VIDEO_SUFFIXES)}")
+        make_folder(self._path)
+        self._earlier = earlier_frames(self._path, self._suffix, overwrite=overwrite)
+        if self._earlier:
+            self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
+        self.description = f"{self._path} (numbered frames)"
+        super().__init__(FOLDER_THREADS)
+
+    def write(self, image: npt.NDArray[Any]) -> None:
+        """Take the next frame; the first one clears away those of an earlier run."""
+        self._check(image)
+        earlier, self._earlier = self._earlier, []
+        for path in earlier:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise SinkError(f"{path} cannot be replaced: {reason(error)}") from error
+        super().write(image)
+
+    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        path = self._path / f"{index:04d}.png"
+        ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
+        if not ok:
+            raise SinkError(f"{path} cannot be encoded as PNG")
+        try:
+            write_whole(path, sign_png(data.tobytes()))
+        except OSError as error:
+            raise SinkError(f"{path} cannot be written: {reason(error)}") from error

@@ -1,0 +1,145 @@
+"""Where output may go: never onto what is read, and onto a file of somebody else's only where that is allowed.
+
+What this program writes says so: a PNG in its text, an OpenEXR in its header, a video in its comment, a report in its
+first key. Such a file is replaced, and the sink says that it was; any other is left alone unless overwriting is asked
+for.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+
+from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import is_same_file, kind_of
+
+PROGRAM = "warp_ar"
+"""How this program signs what it writes."""
+
+_HEAD = 4096
+"""Bytes at the start of a file in which its signature stands, but for videos."""
+_NUMBERED = re.compile(r"[0-9]{4,}\.(png|exr)")
+
+
+def sign_png(data: bytes) -> bytes:
+    """A PNG with the signature as its ``Software``, behind the header, which takes 33 bytes."""
+    body = b"tEXtSoftware\0" + PROGRAM.encode()
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return data[:33] + chunk + data[33:]
+
+
+def is_signed(path: str | os.PathLike[str]) -> bool:
+    """Whether this program wrote a file; what cannot be read, it did not."""
+    try:
+        if kind_of(path) != "file":
+            return False
+        with open(path, "rb") as stream:
+            head = stream.read(_HEAD)
+    except OSError:
+        return False
+    name = PROGRAM.encode()
+    if head.startswith(b"\x89PNG"):
+        return b"tEXtSoftware\0" + name in head
+    if head.startswith(b"\x76\x2f\x31\x01"):
+        return b"software\0string\0" + struct.pack("<I", len(name)) + name in head
+    if head[4:8] == b"ftyp" or head.startswith(b"\x1a\x45\xdf\xa3"):
+        try:
+            options = {"format_whitelist": "mov,mp4,matroska,webm", "protocol_whitelist": "file"}
+            with av.open(str(path), options=options) as container:
+                return str(container.metadata.get("comment", container.metadata.get("COMMENT", ""))) == PROGRAM
+        except (av.FFmpegError, OSError, ValueError):
+            return False
+    return re.match(rb'\s*\{\s*"program":\s*"%s"' % name, head) is not None
+
+
+def check_replaceable(path: Path, *, overwrite: bool) -> str:
+    """Find out whether a file may be written.
+
+    Args:
+        path: The file.
+        overwrite: Whether a file that this program did not write may be replaced.
+
+    Returns:
+        What is lost, in words; empty where that is nothing.
+
+    Raises:
+        SinkError: It may not be, or is no regular file.
+    """
+    try:
+        kind = kind_of(path)
+        if kind == "nothing":
+            return ""
+        if kind != "file":
+            raise SinkError(f"{path} is {'a folder' if kind == 'folder' else kind}; name a file")
+        if os.stat(path).st_size == 0:
+            return ""
+    except OSError as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    if is_signed(path):
+        return f"{path} is replaced: this program wrote it before"
+    if overwrite:
+        return f"{path} is replaced, as --overwrite says"
+    raise SinkError(f"{path} is there, and this program did not write it; name another, or replace it with --overwrite")
+
+
+def earlier_frames(folder: Path, suffix: str, *, overwrite: bool) -> list[Path]:
+    """Numbered frames that an earlier run left in a folder, and that a new one must not stand beside.
+
+    Raises:
+        SinkError: This program did not write one of them, and ``overwrite`` is not asked for.
+    """
+    try:
+        names = sorted(entry.name for entry in os.scandir(folder) if entry.is_file())
+    except OSError as error:
+        raise SinkError(f"{folder} cannot be read: {reason(error)}") from error
+    numbered = (_NUMBERED.fullmatch(name) for name in names)
+    frames = [folder / match.string for match in numbered if match is not None and match[1] == suffix.removeprefix(".")]
+    foreign = [] if overwrite else [path for path in frames if not is_signed(path)]
+    if foreign:
+        raise SinkError(
+            f"{folder} holds {len(foreign)} numbered frames that this program did not write, such as "
+            f"{foreign[0].name}; name another folder, or replace them with --overwrite"
+        )
+    return frames
+
+
+def check_places(reads: Mapping[str, Sequence[Path]], writes: Mapping[str, Path]) -> None:
+    """See to it that nothing is written over what is read, or twice.
+
+    Args:
+        reads: Files and folders that are read, by what they are ("--source").
+        writes: Files and folders that are to be written, by what asks for them ("--output").
+
+    Raises:
+        UsageError: Two are one, by whatever links, or a numbered frame would be one of the others.
+    """
+    entries = [(role, path) for role, paths in reads.items() for path in paths]
+    for written, place in writes.items():
+        for role, path in entries:
+            if is_same_file(place, path):
+                raise UsageError(f"{written} {place} is the same as {role} {path}; name another place")
+            inside = _NUMBERED.fullmatch(path.name) is not None and is_same_file(place, path.parent)
+            outside = _NUMBERED.fullmatch(place.name) is not None and is_same_file(path, place.parent)
+            if inside or outside:
+                raise UsageError(f"{written} {place} would number frames beside {role} {path}; name another")
+        entries.append((written, place))
+
+
+def files_of(value: Any) -> Iterator[Path]:
+    """Every path that a scene, or a part of one, names."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from files_of(item)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from files_of(getattr(value, field.name))

@@ -1,0 +1,189 @@
+"""What every sink of frames is, and how those that encode do so on threads of their own.
+
+A sink encodes while the next frame is being made, a few frames deep at most. What fails there is raised by the next
+`write`, or by `close`. Whether a place can be written at all is found out when it is opened.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import pathlib
+import tempfile
+import threading
+from abc import ABC, abstractmethod
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SinkError, reason
+from warp_ar.files import kind_of
+
+Image = npt.NDArray[np.uint8]
+
+FRAMES_WAITING = 4
+"""How many frames may wait to be encoded before `Sink.write` waits."""
+
+
+class Sink(ABC):
+    """Where frames go: a context manager."""
+
+    description: str
+    """One line for people, with a note where the frames are changed."""
+
+    written: int = 0
+    """Frames that are stored; of a sink that failed, those that are whole."""
+
+    replaced: str = ""
+    """What is lost by its first frame, in words; empty where that is nothing."""
+
+    @abstractmethod
+    def write(self, image: Image) -> None:
+        """Take the next frame; the array may be reused at once.
+
+        Args:
+            image: Encoded colour, uint8 RGB, (height, width, 3).
+
+        Raises:
+            SinkError: The image is of another size or kind than can be written, or an earlier frame could not be
+                written.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what waits, finish the file and end every thread; a second call does nothing.
+
+        Raises:
+            SinkError: A frame could not be written, and no `write` has said so yet.
+        """
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class ThreadedSink(Sink):
+    """Stores frames on threads, at most FRAMES_WAITING of them behind."""
+
+    def __init__(self, threads: int) -> None:
+        self._executor = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink")
+        self._pending: collections.deque[Future[None]] = collections.deque()
+        self._error: BaseException | None = None
+        self._closed = False
+        self._shape: tuple[int, ...] | None = None
+        self._count = 0
+        self._counting = threading.Lock()
+
+    def _check(self, image: npt.NDArray[Any]) -> None:
+        """Raise SinkError if the array is of a kind that cannot be written."""
+        check_image(image)
+
+    @abstractmethod
+    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        """Encode and write one frame; runs on a thread, and raises SinkError."""
+
+    def write(self, image: npt.NDArray[Any]) -> None:
+        """Take the next frame; it is copied and stored on a thread."""
+        if self._closed:
+            raise SinkError(f"{self.description} is closed; open another one to write to")
+        self._check(image)
+        self._shape = self._shape or image.shape
+        if image.shape != self._shape:
+            had, got = (f"{shape[1]}x{shape[0]}" for shape in (self._shape, image.shape))
+            raise SinkError(f"{self.description}: frame {self._count} is {got}, not {had} like those before it")
+        self._settle(FRAMES_WAITING - 1)
+        if self._error is not None:
+            raise self._error
+        self._pending.append(self._executor.submit(self._keep, self._count, image.copy()))
+        self._count += 1
+
+    def _keep(self, index: int, image: npt.NDArray[Any]) -> None:
+        self._store(index, image)
+        with self._counting:
+            self.written += 1
+
+    def _settle(self, waiting: int) -> None:
+        """Wait until at most ``waiting`` frames are left, and raise what went wrong first."""
+        while self._pending and (self._pending[0].done() or len(self._pending) > waiting):
+            # If this wait is interrupted, the frame is still in line.
+            error = self._pending[0].exception()
+            self._pending.popleft()
+            if error is not None and self._error is None:
+                self._error = error
+                raise error
+
+    def close(self) -> None:
+        """Store what waits and end the threads."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._settle(0)
+        finally:
+            self._executor.shutdown(wait=True)
+            self._finish()
+
+    def _finish(self) -> None:
+        """Close what is open, after the last frame has been stored."""
+
+
+class NullSink(Sink):
+    """Takes frames and forgets them; ``count`` tells how many there were."""
+
+    description = "nowhere"
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def write(self, image: Image) -> None:
+        """Count the frame."""
+        check_image(image)
+        self.count += 1
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class TeeSink(Sink):
+    """Gives each frame to several sinks, and closes them all even if one fails."""
+
+    def __init__(self, *sinks: Sink) -> None:
+        self._sinks = sinks
+        self.description = " and ".join(sink.description for sink in sinks) or NullSink.description
+        self.replaced = "; ".join(sink.replaced for sink in sinks if sink.replaced)
+
+    def write(self, image: Image) -> None:
+        """Give the frame to every sink, in order."""
+        for sink in self._sinks:
+            sink.write(image)
+
+    def close(self) -> None:
+        """Close every sink, in order; of several errors the last is raised, the others in its context."""
+        with contextlib.ExitStack() as stack:
+            for sink in reversed(self._sinks):
+                stack.callback(sink.close)
+
+
+def check_image(image: npt.NDArray[Any]) -> None:
+    """Raise SinkError if an array is no frame."""
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise SinkError(f"a frame is uint8 RGB (height, width, 3), not {image.dtype} {image.shape}")
+
+
+def make_folder(path: pathlib.Path) -> None:
+    """Make the folder and its parents, and find out whether files can be made in it."""
+    try:
+        if (kind := kind_of(path)) not in ("folder", "nothing"):
+            raise SinkError(f"{path} is {'a file' if kind == 'file' else kind}, not a folder to write to")
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise SinkError(f"{path} cannot be written to: {reason(error)}; name a folder that you may write to") from error

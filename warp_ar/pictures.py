@@ -1,0 +1,181 @@
+"""Pictures of anyone's making: their size is read from the header, and limited, before anything is decoded."""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import WarpArError, reason
+from warp_ar.files import limits, read_bytes, too_much
+
+FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
+"""What is read: the formats whose headers are known here."""
+
+Size = tuple[int, int]
+
+
+def picture_size(data: bytes) -> Size | None:
+    """(width, height) in pixels that a picture's header promises; None if it is of no known format or cut off.
+
+    Of a TIFF the larger of the picture and its tiles, which is what its reader makes room for.
+    """
+    for start, read in _READERS:
+        if data.startswith(start):
+            try:
+                return read(data)
+            except (struct.error, IndexError, ValueError):
+                return None
+    return None
+
+
+def read_picture(
+    path: str | os.PathLike[str], flags: int, error: type[WarpArError], label: str | None = None
+) -> npt.NDArray[Any]:
+    """Decode a picture file; arguments and errors as `decode_picture`."""
+    label = str(path) if label is None else label
+    return decode_picture(read_bytes(path, "picture_bytes", error, label), flags, error, label)
+
+
+def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str) -> npt.NDArray[Any]:
+    """Decode a picture.
+
+    Args:
+        data: The whole file.
+        flags: OpenCV's for ``imdecode``.
+        error: What to raise.
+        label: What messages call the picture.
+
+    Returns:
+        OpenCV's array: (height, width) or (height, width, channels).
+
+    Raises:
+        WarpArError: As ``error``: it is empty, cut off, damaged, of another format or too large.
+    """
+    check_picture(data, error, label)
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError) as problem:
+        raise error(f"{label} cannot be decoded: {reason(problem)}") from problem
+    if picture is None:
+        raise error(f"{label} cannot be decoded: damaged, cut off, or no image")
+    return np.asarray(picture)
+
+
+def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
+    """Raise ``error`` if a picture must not be decoded: by its header it is none, too large, or cut off."""
+    if not data:
+        raise error(f"{label} is empty (0 bytes); an image is needed")
+    # libpng would refuse a file without its last chunk too, but writes to stderr when it does.
+    if data.startswith(b"\x89PNG") and b"IEND\xaeB`\x82" not in data:
+        raise error(f"{label} is cut off after {len(data)} bytes; copy the whole file")
+    size = picture_size(data)
+    if size is None:
+        raise error(f"{label} cannot be decoded: damaged, cut off, or no image; use {FORMATS}")
+    width, height = size
+    if width < 1 or height < 1:
+        raise error(f"{label} cannot be decoded: its header promises {width}x{height} pixels")
+    if width * height > limits().picture_pixels:
+        raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
+
+
+def _png(data: bytes) -> Size:
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def _jpeg(data: bytes) -> Size | None:
+    at = 2
+    while at + 9 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker == 0xFF:  # filling
+            at += 1
+        elif marker == 0x01 or 0xD0 <= marker <= 0xD8:  # without a length
+            at += 2
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        elif marker in (0xD9, 0xDA):  # the end, or pixels before a header
+            return None
+        else:
+            at += 2 + struct.unpack_from(">H", data, at + 2)[0]
+    return None
+
+
+def _bmp(data: bytes) -> Size:
+    if struct.unpack_from("<I", data, 14)[0] == 12:
+        width, height = struct.unpack_from("<HH", data, 18)
+    else:
+        width, height = struct.unpack_from("<ii", data, 18)
+    return abs(width), abs(height)
+
+
+def _tiff(data: bytes) -> Size | None:
+    order = "<" if data[:2] == b"II" else ">"
+    big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    start = struct.unpack_from(order + ("Q" if big else "I"), data, 8 if big else 4)[0]
+    count = struct.unpack_from(order + ("Q" if big else "H"), data, start)[0]
+    size, at = {}, start + (8 if big else 2)
+    for _ in range(min(count, 4096)):
+        tag, kind = struct.unpack_from(order + "HH", data, at)
+        if tag in (256, 257, 322, 323):  # width and height of the picture, and of its tiles
+            form = {1: "B", 3: "H", 4: "I", 16: "Q"}.get(kind)
+            if form is None:
+                return None
+            size[tag] = struct.unpack_from(order + form, data, at + (12 if big else 8))[0]
+        at += 20 if big else 12
+    if 256 not in size or 257 not in size:
+        return None
+    return max(size[256], size.get(322, 0)), max(size[257], size.get(323, 0))
+
+
+def _webp(data: bytes) -> Size | None:
+    if data[8:12] != b"WEBP":
+        return None
+    kind = data[12:16]
+    if kind == b"VP8X":
+        return (
+            1 + int.from_bytes(data[24:27], "little"),
+            1 + int.from_bytes(data[27:30], "little"),
+        )
+    if kind == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return width & 0x3FFF, height & 0x3FFF
+
+
+def _gif(data: bytes) -> Size:
+    width, height = struct.unpack_from("<HH", data, 6)
+    return width, height
+
+
+def _pnm(data: bytes) -> Size | None:
+    words: list[bytes] = []
+    for line in data[2:4096].split(b"\n"):
+        words += line.split(b"#")[0].split()
+        if len(words) >= 2:
+            break
+    if len(words) < 2 or not all(word.isdigit() and len(word) < 10 for word in words[:2]):
+        return None
+    return int(words[0]), int(words[1])
+
+
+_READERS = (
+    (b"\x89PNG\r\n\x1a\n", _png),
+    (b"\xff\xd8", _jpeg),
+    (b"BM", _bmp),
+    (b"II*\0", _tiff),
+    (b"MM\0*", _tiff),
+    (b"II+\0", _tiff),
+    (b"MM\0+", _tiff),
+    (b"RIFF", _webp),
+    (b"GIF8", _gif),
+    *((f"P{digit}".encode(), _pnm) for digit in range(1, 7)),
+)

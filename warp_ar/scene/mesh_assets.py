@@ -1,0 +1,209 @@
+"""What mesh files name or hold beside their triangles, looked at before a mesh is read.
+
+A material library, a buffer or a texture may be a pipe that never ends, a picture whose header promises more pixels
+than fit into memory, or missing: trimesh would wait, or leave a texture out without a word.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+import struct
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from warp_ar.errors import SceneError
+from warp_ar.files import is_file, limits, parse_json, read_bytes, too_much
+from warp_ar.pictures import check_picture
+
+_GLB_JSON: Final = 0x4E4F534A
+_GLB_BINARY: Final = 0x004E4942
+_HEADER: Final = 1 << 16
+"""Bytes of a text header that are looked at."""
+
+
+class Assets:
+    """Finds the files that a mesh file names, as trimesh's resolvers do: beside it, or relative to it.
+
+    What is wrong with one is kept in ``problem``, for trimesh goes on without it.
+    """
+
+    def __init__(self, path: Path, *, library_first: bool) -> None:
+        """Read nothing yet.
+
+        Args:
+            path: The mesh file.
+            library_first: Whether the first file asked for is a material library (OBJ), which may be missing; all
+                others are textures.
+        """
+        self.file_name = path.name
+        self._path, self._library_due, self._pictures_follow = path, library_first, library_first
+        self._known: dict[str, bytes] = {}
+        self.problem: SceneError | None = None
+
+    def get(self, name: str) -> bytes:
+        """Bytes of a file by the name that the mesh file has for it.
+
+        Raises:
+            SceneError: It is missing, too large or no regular file.
+        """
+        library, self._library_due = self._library_due, False
+        try:
+            return self._read(name, library)
+        except SceneError as error:
+            missing = library and self._found(name) is None and not (self._path.parent / name.strip()).exists()
+            self.problem = self.problem if self.problem or missing else error
+            raise
+
+    __getitem__ = get
+
+    def _found(self, name: str) -> Path | None:
+        candidates = (name.strip(), name.strip().lstrip("/"), re.split(r"[/\\]", name)[-1])
+        return next((path for text in candidates if is_file(path := self._path.parent / text)), None)
+
+    def _read(self, name: str, library: bool) -> bytes:
+        if name not in self._known:
+            limit = "text_bytes" if library else "picture_bytes" if self._pictures_follow else "mesh_bytes"
+            path = self._found(name) or self._path.parent / name.strip()
+            label = f"{self._path}: {path}, which it names,"
+            data = read_bytes(path, limit, SceneError, label)
+            if self._pictures_follow and not library:
+                check_picture(data, SceneError, label)
+            self._known[name] = data
+        return self._known[name]
+
+
+def check_counts(path: Path, data: bytes) -> None:
+    """Raise SceneError if the header of a PLY, OFF or STL file promises more than may be read, or than it can hold."""
+    suffix = path.suffix.lower()
+    head = data[:_HEADER]
+    counts: list[int] = []
+    if suffix == ".ply":
+        header = head.split(b"end_header")[0]
+        counts = [int(digits[:18]) for digits in re.findall(rb"element\s+\S+\s+(\d+)", header)]
+    elif suffix == ".off":
+        words = re.sub(rb"#[^\n]*", b"", head[:4096]).replace(b"OFF", b" ", 1).split()
+        counts = [int(word[:18]) for word in words[:2] if word.isdigit()]
+    elif suffix == ".stl" and len(data) >= 84 and not head.lstrip().startswith(b"solid"):
+        counts = [struct.unpack_from("<I", data, 80)[0]]
+    for count in counts:
+        _check_count(path, count)
+        if count > len(data):  # every element takes a byte or more
+            raise SceneError(f"{path}: its header promises {count:,} elements, and the file has {len(data):,} bytes")
+
+
+def _check_count(path: Path, count: int) -> None:
+    if count > limits().mesh_elements:
+        raise SceneError(too_much(f"{path}", count, "vertices or faces", "mesh_elements"))
+
+
+def check_gltf(path: Path, data: bytes, assets: Assets) -> None:
+    """Look through a glTF or GLB file: sizes of accessors, buffers, and the textures that colour it.
+
+    Raises:
+        SceneError: Something is missing, too large or no picture.
+    """
+    tree, binary = _split_glb(path, data) if path.suffix.lower() == ".glb" else (data, b"")
+    label = str(path)
+    if len(tree) > limits().text_bytes and path.suffix.lower() == ".glb":
+        raise SceneError(too_much(f"{label}: its header", len(tree), "bytes", "text_bytes"))
+    try:
+        text = tree.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SceneError(
+            f"{label}: the mesh cannot be read; is the file whole? (byte {error.start} is no UTF-8)"
+        ) from error
+    header = parse_json(text, f"{label}: its header", SceneError)
+    if not isinstance(header, dict):
+        _fail(path, "its header is no JSON object")
+    for accessor in _list(path, header, "accessors"):
+        count = accessor.get("count", 0)
+        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+            _fail(path, f"an accessor has the count {str(count)[:40]!r}, which is no whole number")
+        _check_count(path, count)
+    buffers = [
+        _uri_bytes(path, item["uri"], assets) if "uri" in item else binary for item in _list(path, header, "buffers")
+    ]
+    for index in sorted(_coloring(path, header)):
+        images = _list(path, header, "images")
+        if not 0 <= index < len(images):
+            _fail(path, f"a texture names image {index}; there are {len(images)}, counted from 0")
+        check_picture(
+            _image_bytes(path, header, images[index], buffers, assets), SceneError, f"{path}: its image {index}"
+        )
+
+
+def _fail(path: Path, what: str) -> NoReturn:
+    raise SceneError(f"{path}: the mesh cannot be read: {what}")
+
+
+def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """JSON and binary chunk."""
+    if len(data) < 20 or data[:4] != b"glTF":
+        _fail(path, "no GLB file, or cut off")
+    parts: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        if at + 8 + length > len(data):
+            _fail(path, f"cut off: a part of {length:,} bytes starts at byte {at:,} of {len(data):,}")
+        parts.setdefault(kind, data[at + 8 : at + 8 + length])
+        at += 8 + length
+    if _GLB_JSON not in parts:
+        _fail(path, "it holds no header")
+    return parts[_GLB_JSON], parts.get(_GLB_BINARY, b"")
+
+
+def _list(path: Path, header: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    """A list of objects of the header; empty where there is none."""
+    value = header.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        _fail(path, f"{key} is no list of objects")
+    return value
+
+
+def _uri_bytes(path: Path, uri: object, assets: Assets) -> bytes:
+    if not isinstance(uri, str):
+        _fail(path, f"a URI is {str(uri)[:40]!r}, no text")
+    if "base64," not in uri:
+        return assets.get(uri)
+    try:
+        return base64.b64decode(uri.partition("base64,")[2])
+    except binascii.Error as error:
+        raise SceneError(f"{path}: the mesh cannot be read: a URI holds no base64 ({error})") from error
+
+
+def _image_bytes(
+    path: Path, header: dict[str, Any], image: dict[str, Any], buffers: list[bytes], assets: Assets
+) -> bytes:
+    if "bufferView" not in image:
+        return _uri_bytes(path, image.get("uri"), assets)
+    views = _list(path, header, "bufferViews")
+    index = image["bufferView"]
+    view = views[index] if isinstance(index, int) and 0 <= index < len(views) else {}
+    number, start, length = (view.get(key, 0) for key in ("buffer", "byteOffset", "byteLength"))
+    sound = all(isinstance(value, int) and value >= 0 for value in (number, start, length))
+    if not sound or number >= len(buffers) or length < 1 or start + length > len(buffers[number]):
+        _fail(path, f"an image lies at {str(index)[:20]}, where no buffer reaches")
+    return bytes(buffers[number][start : start + length])
+
+
+def _coloring(path: Path, header: dict[str, Any]) -> set[int]:
+    """Numbers of the images that give surfaces their colour."""
+    textures = _list(path, header, "textures")
+    found = set()
+    for material in _list(path, header, "materials"):
+        reference = (material.get("pbrMetallicRoughness") or {}) if isinstance(material, dict) else {}
+        reference = reference.get("baseColorTexture") if isinstance(reference, dict) else None
+        index = reference.get("index") if isinstance(reference, dict) else None
+        if index is None:
+            continue
+        if not isinstance(index, int) or not 0 <= index < len(textures):
+            _fail(path, f"a material names texture {str(index)[:20]}; there are {len(textures)}, counted from 0")
+        source = textures[index].get("source")
+        if source is not None:
+            if not isinstance(source, int):
+                _fail(path, f"texture {index} names image {str(source)[:20]!r}")
+            found.add(source)
+    return found

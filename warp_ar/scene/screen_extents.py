@@ -1,0 +1,277 @@
+"""What of the screen objects, lights and shadows can touch.
+
+Boxes around shapes are clipped by what reaches them; what is left is a set of convex polygons, an `Outline`, of which
+each frame asks the smallest rectangle of pixels whose rays can meet it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar import scene as scenes
+from warp_ar.kernels import structs
+from warp_ar.scene import Pose
+
+FloatArray = npt.NDArray[np.float64]
+
+Rect = tuple[int, int, int, int]
+"""Part of the screen: row_start, row_stop, column_start, column_stop; all zero where nothing of it is needed."""
+EMPTY: Final[Rect] = (0, 0, 0, 0)
+
+SHADOW_REACH: Final = 12.0
+"""How far an object's shadow of the environment is followed, in radii of the sphere around it.
+
+A sphere that rests on a desk hides (r / d)^3 of an even sky's light from a point at distance d: under 1/512 from 8
+radii on. A lamp's shadow ends within 12 radii if the lamp stands 10 degrees high or more.
+"""
+
+# Sides of the pyramid around a spot's cone: 8 sides reach 8 % farther out than the cone at their edges.
+_CONE_SIDES: Final = 8
+
+# From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
+_WIDE_CONE: Final = math.radians(75.0)
+
+# Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
+_FACES: Final = (
+    (0, 2, 6, 4),
+    (1, 3, 7, 5),
+    (0, 1, 5, 4),
+    (2, 3, 7, 6),
+    (0, 1, 3, 2),
+    (4, 5, 7, 6),
+)
+_CORNERS: Final = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def box_faces(record: Any) -> list[FloatArray]:
+    """Faces of the box around a shape in the world, (4, 3) each."""
+    half = np.array(record["extent"], np.float64)
+    # Float32 records are rounded; a part in a million more keeps the box around what the device sees.
+    corners = _CORNERS * (half * (1.0 + 1e-6)) * float(record["scale"])
+    corners = corners @ np.array(record["rotation"], np.float64).T + np.array(record["position"], np.float64)
+    if record["kind"] == structs.PLANE:
+        return [corners[[0, 2, 6, 4]]]
+    return [corners[list(face)] for face in _FACES]
+
+
+def ball_outline(scene: scenes.Scene) -> Outline:
+    """Boxes around the mirror balls."""
+    boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in scene.probes]
+    return Outline([box[list(face)] for box in boxes for face in _FACES])
+
+
+def _clip(polygon: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
+    """The part of a convex polygon (n, 3) where normal . p >= offset (Sutherland, Hodgman); empty if there is none."""
+    height = polygon @ normal - offset
+    if (height >= 0.0).all():
+        return polygon
+    points: list[FloatArray] = []
+    for index in range(len(polygon)):
+        a, b = height[index - 1], height[index]
+        if (a < 0.0) != (b < 0.0):
+            points.append(polygon[index - 1] + (polygon[index] - polygon[index - 1]) * (a / (a - b)))
+        if b >= 0.0:
+            points.append(polygon[index])
+    return np.array(points).reshape(-1, 3)
+
+
+def lit_faces(light: Any, faces: list[FloatArray]) -> list[FloatArray]:
+    """Parts of a box's faces that a light may reach.
+
+    A spot's cone is taken as the pyramid around it. For a mesh, whose surface lies inside its box, the parts of the
+    faces inside the pyramid and, if the light is in the box, the light itself span all that can be lit.
+    """
+    if light["kind"] != structs.SPOT or light["outer_angle"] >= _WIDE_CONE:
+        return faces
+    apex = np.array(light["position"], np.float64)
+    axis = np.array(light["direction"], np.float64)
+    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    side /= np.linalg.norm(side)
+    across = np.cross(axis, side)
+    # A plane that touches the cone along a line contains its apex; its normal leans by the half angle toward the axis.
+    outer = float(light["outer_angle"]) + 1e-6
+    parts = []
+    for face in faces:
+        part = face
+        for turn in np.arange(_CONE_SIDES) * (2.0 * math.pi / _CONE_SIDES):
+            outward = math.cos(turn) * side + math.sin(turn) * across
+            normal = math.sin(outer) * axis - math.cos(outer) * outward
+            part = _clip(part, normal, float(normal @ apex) - 1e-9)
+            if len(part) == 0:
+                break
+        if len(part):
+            parts.append(part)
+    if len(faces) > 1:
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        if all((apex - face.mean(axis=0)) @ (center - face.mean(axis=0)) >= 0.0 for face in faces):
+            parts.append(apex[None, :])
+    return parts
+
+
+def _outward(face: FloatArray, center: FloatArray, kind: int, rotation: FloatArray) -> FloatArray:
+    """Unit normal of a face of a shape: a plane's own, a box's away from its middle."""
+    if kind == structs.PLANE:
+        return rotation[:, 2]
+    away = face.mean(axis=0) - center
+    normal = np.cross(face[1] - face[0], face[2] - face[1])
+    length = float(np.linalg.norm(normal))
+    return normal * (math.copysign(1.0, float(normal @ away)) / length) if length > 0.0 else np.zeros(3)
+
+
+def bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[FloatArray]:
+    """Parts of the proxies' faces before which some lit face stands, and behind which it does not.
+
+    The surface of a mesh lies in its box and looks every way: it sends from all of its box to all sides.
+    """
+    sources: list[tuple[FloatArray, FloatArray | None]] = []  # lit parts, and the normal if there is one
+    for record in proxies:
+        faces, rotation = box_faces(record), np.array(record["rotation"], np.float64)
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        for light in lights:
+            if record["kind"] == structs.MESH:
+                if lit_faces(light, faces):
+                    sources += [(face, None) for face in faces]
+                continue
+            for face in faces:
+                facing = _outward(face, center, int(record["kind"]), rotation)
+                at, direction = (np.array(light[name], np.float64) for name in ("position", "direction"))
+                directional = light["kind"] == structs.DIRECTIONAL
+                if (float(-direction @ facing) if directional else float((at - face[0]) @ facing)) > 0.0:
+                    sources += [(part, facing) for part in lit_faces(light, [face])]
+    reached: list[FloatArray] = []
+    for record in proxies:
+        faces, rotation = box_faces(record), np.array(record["rotation"], np.float64)
+        center = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        for face in faces:
+            inward = -_outward(face, center, int(record["kind"]), rotation)
+            for part, normal in sources:
+                if record["kind"] != structs.MESH and (part @ inward >= float(face[0] @ inward) - 1e-9).all():
+                    continue
+                seen = face if normal is None else _clip(face, normal, float(normal @ part[0]) - 1e-9)
+                if len(seen):
+                    reached.append(seen)
+    return reached
+
+
+def shaded_faces(record: Any, faces: list[FloatArray]) -> list[FloatArray]:
+    """Parts of a box's faces inside the cube of ``SHADOW_REACH`` around an object, and of the cube's inside the box."""
+    radius = float(record["scale"]) * float(np.linalg.norm(record["extent"]))
+    center = np.array(record["position"], np.float64)
+    cube = [center + SHADOW_REACH * radius * _CORNERS[list(face)] for face in _FACES]
+    near = [_clip_to_cube(face, center, SHADOW_REACH * radius) for face in faces]
+    if len(faces) > 1:  # a mesh lies inside its box, where the cube may end
+        middle = np.mean([face.mean(axis=0) for face in faces], axis=0)
+        for part in cube:
+            for face in faces:
+                inward = middle - face.mean(axis=0)
+                if len(part):
+                    part = _clip(part, inward, float(inward @ face[0]))
+            near.append(part)
+    return [part for part in near if len(part)]
+
+
+def _clip_to_cube(polygon: FloatArray, center: FloatArray, reach: float) -> FloatArray:
+    """The part of a convex polygon within ``reach`` of a point along every axis."""
+    for axis in np.eye(3):
+        for normal in (axis, -axis):
+            if len(polygon):
+                polygon = _clip(polygon, normal, float(normal @ center) - reach)
+    return polygon
+
+
+@functools.lru_cache(maxsize=8)
+def _ray_bounds(camera: scenes.Camera) -> tuple[npt.NDArray[Any], ...]:
+    """Smallest and largest x / z of each column's rays and y / z of each row's, a pixel's own width included.
+
+    In ascending order: where a lens bends rows or columns back, a bound is that of all columns to one side.
+    """
+    if not any(camera.distortion):
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        bounds = (x, x, y, y)
+    else:
+        from warp_ar.scene.pixel_rays import pixel_rays
+
+        rays = pixel_rays(camera).astype(np.float64)
+        bounds = (rays[..., 0].min(0), rays[..., 0].max(0), rays[..., 1].min(1), rays[..., 1].max(1))
+    return (
+        np.minimum.accumulate(bounds[0][::-1])[::-1] - 1.0 / camera.fx,
+        np.maximum.accumulate(bounds[1]) + 1.0 / camera.fx,
+        np.minimum.accumulate(bounds[2][::-1])[::-1] - 1.0 / camera.fy,
+        np.maximum.accumulate(bounds[3]) + 1.0 / camera.fy,
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outline:
+    """Convex polygons in the world, looked at in every frame from somewhere else."""
+
+    polygons: Sequence[FloatArray]
+    """(n, 3) each."""
+
+    @functools.cached_property
+    def corners(self) -> FloatArray:
+        """Those of all polygons, (n, 3)."""
+        return np.concatenate(self.polygons)
+
+
+def screen_rects(outlines: Sequence[Outline], pose: Pose, camera: scenes.Camera) -> list[Rect]:
+    """Smallest rectangles of pixels whose rays can meet the convex hulls of outlines, one pixel of margin included.
+
+    Safe for what reaches behind the camera: polygons are clipped just in front of it. Safe for any distortion: pixels
+    are picked by their undistorted rays, not by distorting the polygons. All at once, because a frame has several, and
+    NumPy takes no longer for all than for one.
+
+    Args:
+        outlines: What to look at, each by itself.
+        pose: ``camera_from_world``.
+        camera: The camera of the frames.
+    """
+    rects = [EMPTY] * len(outlines)
+    parts = {index: outline.corners for index, outline in enumerate(outlines) if outline.polygons}
+    if not parts:
+        return rects
+    points = pose.apply(np.concatenate(list(parts.values())))
+    if points[:, 2].min() < _nearest(points):
+        clipped = {index: _in_front(outlines[index], pose) for index in parts}
+        parts = {index: part for index, part in clipped.items() if len(part)}
+        if not parts:
+            return rects
+        points = np.concatenate(list(parts.values()))
+    projected = points[:, :2] / points[:, 2:]
+    starts = list(itertools.accumulate(map(len, parts.values()), initial=0))[:-1]
+    low, high = np.minimum.reduceat(projected, starts), np.maximum.reduceat(projected, starts)
+    x_low, x_high, y_low, y_high = _ray_bounds(camera)
+    edges = (
+        y_high.searchsorted(low[:, 1]),
+        y_low.searchsorted(high[:, 1], "right"),
+        x_high.searchsorted(low[:, 0]),
+        x_low.searchsorted(high[:, 0], "right"),
+    )
+    for index, top, bottom, left, right in zip(parts, *(edge.tolist() for edge in edges), strict=True):
+        if top < bottom and left < right:
+            rects[index] = top, bottom, left, right
+    return rects
+
+
+def _nearest(points: FloatArray) -> float:
+    """Depth from which on points of the camera's space are looked at."""
+    return 1e-6 * max(float(np.abs(points).max()), 1e-12)
+
+
+def _in_front(outline: Outline, pose: Pose) -> FloatArray:
+    """Corners of what is left of an outline, in the camera's space, when what is behind the camera is cut off."""
+    points = pose.apply(outline.corners)
+    near = _nearest(points)
+    if points[:, 2].min() >= near:
+        return points
+    forward = np.array([0.0, 0.0, 1.0])
+    return np.concatenate([_clip(pose.apply(polygon), forward, near) for polygon in outline.polygons])

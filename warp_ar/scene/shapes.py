@@ -1,0 +1,121 @@
+"""Meshes of round and square shapes, with exact normals, as fine as a camera can see."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.scene.geometry import Mesh, make_mesh
+
+
+def silhouette_tolerance(extent: float, *, distance: float = 0.4, focal: float = 1000.0, pixels: float = 0.1) -> float:
+    """Largest gap between a curved surface and its triangles that a camera cannot see.
+
+    A gap g at distance d moves a silhouette by focal g / d pixels. Things on a desk are seen from 0.4 m or more, and
+    objects larger than that from at least their own extent, else they do not fit into the picture.
+
+    Args:
+        extent: Radius of the object in metres.
+        distance: Nearest distance of the camera in metres.
+        focal: Focal length in pixels.
+        pixels: Silhouette error that is allowed, in pixels.
+
+    Returns:
+        The gap in metres.
+    """
+    return pixels / focal * max(distance, extent)
+
+
+def _segments(radius: float, gap: float) -> int:
+    """Segments of a circle whose chords stay within ``gap`` of it.
+
+    The chord of a segment of angle 2 pi / n is farthest from its arc at its middle, by the sagitta r (1 - cos(pi / n));
+    solved for n: n = pi / acos(1 - gap / r). From 24 on, so that the shading of tiny objects stays smooth.
+    """
+    return max(24, math.ceil(math.pi / math.acos(1.0 - gap / radius))) if gap < radius else 24
+
+
+def torus_mesh(major_radius: float, minor_radius: float, tolerance: float | None = None) -> Mesh:
+    """Torus around the z axis, centred at the origin.
+
+    Args:
+        major_radius: Distance of the tube's centre from the axis in metres.
+        minor_radius: Radius of the tube in metres.
+        tolerance: Largest gap between triangles and surface in metres; :func:`silhouette_tolerance` of the whole torus
+            if left out. Divide by the scale at which the mesh is used.
+
+    Returns:
+        The mesh; u runs around the axis from +x through +y, v around the tube from its outermost circle through +z.
+    """
+    outer = major_radius + minor_radius
+    gap = 0.5 * (silhouette_tolerance(outer) if tolerance is None else tolerance)  # half for either circle: gaps add up
+    columns, rows = _segments(outer, gap), _segments(minor_radius, gap)
+    u, v, faces = _grid(columns, rows)
+    # The seam's two copies take one angle, so that they agree to the last bit and no ray slips through.
+    phi, psi = (2 * np.pi) * (u % 1.0), (2 * np.pi) * (v % 1.0)
+    normals = np.stack([np.cos(phi) * np.cos(psi), np.sin(phi) * np.cos(psi), np.sin(psi)], axis=-1)
+    centers = major_radius * np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1)
+    return make_mesh(centers + minor_radius * normals, faces, normals, np.stack([u, v], axis=-1))
+
+
+def sphere_mesh(radius: float, tolerance: float | None = None) -> Mesh:
+    """Sphere centred at the origin.
+
+    Args:
+        radius: Radius in metres.
+        tolerance: Largest gap between triangles and surface in metres; :func:`silhouette_tolerance` if left out.
+
+    Returns:
+        The mesh; u runs around the z axis from -x through -y, +x and +y as in a latlong map, v from -z to +z.
+    """
+    gap = 0.5 * (silhouette_tolerance(radius) if tolerance is None else tolerance)
+    columns = _segments(radius, gap)
+    rows = (columns + 1) // 2
+    u, v, faces = _grid(columns, rows)
+    # The first and last row are the poles: of the two triangles per cell there, the one with two corners on it goes.
+    cell = np.arange(len(faces)) // 2
+    first = np.arange(len(faces)) % 2 == 0
+    faces = faces[~((cell < columns) & first) & ~((cell >= (rows - 1) * columns) & ~first)]
+    phi, theta = (2 * np.pi) * ((u % 1.0) - 0.5), np.pi * (1.0 - v)
+    sin_theta = np.where((v == 0.0) | (v == 1.0), 0.0, np.sin(theta))
+    normals = np.stack([sin_theta * np.cos(phi), sin_theta * np.sin(phi), np.cos(theta)], axis=-1)
+    return make_mesh(radius * normals, faces, normals, np.stack([u, v], axis=-1))
+
+
+def box_mesh(size: Sequence[float]) -> Mesh:
+    """Axis-aligned box centred at the origin, with flat faces.
+
+    Args:
+        size: Lengths along x, y and z in metres.
+
+    Returns:
+        The mesh: 24 vertices, 12 triangles, every face with texture coordinates from 0 to 1.
+    """
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    vertices, normals = np.empty((6, 4, 3)), np.zeros((6, 4, 3))
+    for axis in range(3):
+        right, up = (axis + 1) % 3, (axis + 2) % 3
+        for side, sign in enumerate((-1.0, 1.0)):
+            face = vertices[2 * axis + side]
+            face[:, axis], face[:, right], face[:, up] = sign, sign * corners[:, 0], corners[:, 1]
+            normals[2 * axis + side, :, axis] = sign
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(6)[:, None, None]
+    half = 0.5 * np.asarray(size, dtype=np.float64)
+    return make_mesh(
+        (half * vertices).reshape(-1, 3),
+        faces.reshape(-1, 3),
+        normals.reshape(-1, 3),
+        np.tile(0.5 + 0.5 * corners, (6, 1)),
+    )
+
+
+def _grid(columns: int, rows: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Parameters u and v of a grid's (rows + 1) x (columns + 1) vertices, and two triangles per cell."""
+    v, u = np.meshgrid(np.arange(rows + 1) / rows, np.arange(columns + 1) / columns, indexing="ij")
+    a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    b, c, d = a + 1, a + columns + 2, a + columns + 1
+    return u.ravel(), v.ravel(), np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)

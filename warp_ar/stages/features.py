@@ -1,0 +1,147 @@
+"""What a request calls for, answered once before any stage is wired.
+
+Stages ask here instead of asking each other: whether light is recovered, which layers are laid over the frame, which
+forms of the environment exist. Nobody asks here whether a stage has readers: the graph finds that out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.scene import Scene
+from warp_ar.scene.ray_scene import (
+    has_sized_lights,
+    has_textures,
+    material_model,
+    proxies_face,
+    reflects_diffusely,
+    reflects_glossily,
+    trace_config,
+)
+from warp_ar.stages.quality import Quality
+from warp_ar.stages.request import Request
+
+FLAT = "flat"
+"""Method of ``relight`` that needs nothing of the environment."""
+LOCAL = ("bounce", "brute_force")
+"""Methods of ``relight`` that know which part of the environment reaches a point, and what lit surfaces send on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Features:
+    """Frozen answers for one request."""
+
+    request: Request
+    """What they were found for."""
+    environment: bool
+    """A mirror ball shows the environment."""
+    recovered: bool
+    """Light that clips in the ball is put back."""
+    emitters: bool
+    """Emitters of the environment are known by their places: there is a resource ``lamps``."""
+    merged: bool
+    """Frames of several exposures are merged."""
+    layers: tuple[str, ...]
+    """Resources that are laid over the frame: of ``virtual``, ``physical_added``, ``shadow_ratio``, ``mirrored``."""
+    exposed: bool
+    """The picture is shown at another exposure than the camera's."""
+    boxed: bool
+    """Darkening looks at the means of a pixel's surroundings."""
+    declipped: bool
+    """Radiance above clipping is estimated, which a shorter exposure shows."""
+    declipped_by_ball: bool
+    """The ball's light, with its energy put back, says more of that radiance."""
+    relight_method: str
+    """The quality's method of ``relight``; ``flat`` where no ball tells anything of the environment."""
+    ambient_visibility: bool
+    """Relighting asks which part of the environment reaches the receiver."""
+    bounced: bool
+    """Proxies that virtual light falls on light each other."""
+    soft_lights: bool
+    """Virtual lights with a size cast soft shadows."""
+    near_field: bool
+    """Objects show what surrounds them at close range."""
+    irradiance: Literal["irradiance_sh", "irradiance_map"]
+    """Resource that holds the environment's irradiance."""
+    distant: DistantLightConfig
+    """Forms of the environment that the objects reflect."""
+
+    @property
+    def shadowed(self) -> bool:
+        """Virtual objects change the environment on the receiver."""
+        return "shadow_ratio" in self.layers
+
+    @property
+    def lit(self) -> bool:
+        """Virtual light falls on the receiver."""
+        return "physical_added" in self.layers
+
+    @property
+    def near_names(self) -> tuple[str, ...]:
+        """Resources of what surrounds the objects, those that their materials show."""
+        diffuse = () if self.distant.diffuse == "none" else ("object_irradiance",)
+        return (*diffuse, "object_mirrored") if self.distant.specular else diffuse
+
+
+def find_features(request: Request) -> Features:
+    """Answer for ``request``; pure Python, nothing of Warp is touched."""
+    scene, quality = request.scene, request.quality
+    environment = bool(scene.probes)
+    recovered = environment and quality.method("recover") not in ("default", "clipped")
+    layers = _find_layers(scene, quality)
+    scale = scene.exposure.scale
+    exposed = "physical_added" in layers if isinstance(scale, str) else scale != 1.0
+    darkened = exposed and (isinstance(scale, str) or scale < 1.0)
+    relight_method = quality.method("relight") if environment else FLAT
+    lit_by_both = bool(environment and scene.lights and scene.proxies)
+    emitters = recovered and quality.method("recover") == "shading"
+    by_series = quality.method("irradiance") == "sh2"
+    return Features(
+        request=request,
+        environment=environment,
+        recovered=recovered,
+        emitters=emitters,
+        merged=recovered and len(request.exposures) > 1,
+        layers=layers,
+        exposed=exposed,
+        boxed=darkened and quality.method("expose") == "box",
+        declipped=darkened and quality.method("expose") in ("glow", "ball"),
+        declipped_by_ball=quality.method("expose") == "ball" and recovered,
+        relight_method=relight_method,
+        ambient_visibility=lit_by_both and relight_method in LOCAL,
+        bounced=relight_method in LOCAL and proxies_face(scene),
+        soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
+        near_field=environment and quality.method("shade") == "one_bounce",
+        irradiance="irradiance_sh" if by_series else "irradiance_map",
+        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters),
+    )
+
+
+def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
+    layers = []
+    if scene.objects:
+        layers.append("virtual")
+    if scene.lights and scene.proxies:
+        layers.append("physical_added")
+    shadows = quality.method("environment_shadow") not in ("default", "none")
+    if shadows and scene.objects and scene.proxies and scene.probes:
+        layers.append("shadow_ratio")
+    if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
+        layers.append("mirrored")
+    return tuple(layers)
+
+
+def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLightConfig:
+    materials = [item.material for item in scene.objects]
+    environment = bool(scene.probes)
+    return DistantLightConfig(
+        trace=trace_config(scene),
+        models=tuple(sorted(set(map(material_model, materials)))),
+        textures=has_textures(scene),
+        diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
+        specular=environment and any(map(reflects_glossily, materials)),
+        probes=environment,
+        lamps=emitters,
+    )

@@ -1,0 +1,102 @@
+"""The irradiance of every orientation from the environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import irradiance, pyramid
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
+
+TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
+MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
+CLUSTERS = (10, 20)
+
+
+class Irradiance(Stage):
+    """Filters the environment with the cosine lobe."""
+
+    name: ClassVar[str] = "irradiance"
+    methods: ClassVar[Mapping[str, str]] = {
+        "top_mip": "a 4x8 map (the paper)",
+        "sh2": "spherical harmonics of order 2",
+        "sh4": "of order 4",
+        "clusters": "200 clusters of the environment, summed for every direction",
+        "brute_force": "every texel for every direction",
+    }
+    summary: ClassVar[str] = "irradiance of the environment for every orientation"
+    subject: ClassVar[str] = "light that matt surfaces receive"
+    unread: ClassVar[str] = "no virtual object is diffuse, and relighting does not ask for the receiver's reflectance"
+    converges: ClassVar[bool] = True
+    settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    unseen_method: ClassVar[str | None] = "sh2"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32 sums of sums over tables made in float64",
+        bound=1e-3,
+        cause="a texel's spread by its second moment; sums 1e-6",
+        measured=0.00051,
+        rows=(4, 5, 6, 17, 18),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Read the environment, write irradiance in the form of the method."""
+        return Wiring(("environment",), (features.irradiance,)) if features.environment else LeftOut(NO_BALL)
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Irradiance, and sums on the way to it."""
+        height = self.request.quality.environment_height
+        if self.method == "top_mip":
+            size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
+            return {"irradiance_map": ArraySpec(size, wp.vec3)}
+        if self.method == "sh2":
+            return {"irradiance_sh": ArraySpec((9,), wp.vec3), "irradiance_row_sums": ArraySpec((height, 5), wp.vec3)}
+        if self.method == "sh4":
+            return {
+                "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
+                "irradiance_row_sums": ArraySpec((height, 9), wp.vec3),
+                "irradiance_coefficients": ArraySpec((25,), wp.vec3),
+            }
+        count = math.prod(self._blocks())
+        return {
+            "irradiance_map": ArraySpec(MAP_SIZE, wp.vec3),
+            "irradiance_clusters": ArraySpec((count,), irradiance.Cluster, irradiance.Cluster()),
+        }
+
+    def _blocks(self) -> tuple[int, int]:
+        height = self.request.quality.environment_height
+        if self.method == "brute_force":
+            return height, 2 * height
+        return min(CLUSTERS[0], height), min(CLUSTERS[1], 2 * height)
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Launches of the method, and the tables that they need."""
+        environment = arrays["environment"]
+        if self.method == "top_mip":
+            top = arrays["irradiance_map"]
+            return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]
+        if self.method in ("sh2", "sh4"):
+            order = 2 if self.method == "sh2" else 4
+            tables = irradiance.make_sh_tables(*environment.shape, order, device)
+            sums = arrays["irradiance_row_sums"]
+            if self.method == "sh2":
+                sh = arrays["irradiance_sh"]
+                return [
+                    Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, sh)),
+                    Pass(lambda rows: irradiance.window_sh(sh)),
+                ]
+            coefficients, target = arrays["irradiance_coefficients"], arrays["irradiance_map"]
+            return [
+                Pass(lambda rows: irradiance.project_irradiance_sh(environment, tables, sums, coefficients)),
+                Pass(lambda rows: irradiance.evaluate_sh4(coefficients, target, rows=rows), rows=MAP_SIZE[0]),
+            ]
+        blocks = self._blocks()
+        clusters, target = arrays["irradiance_clusters"], arrays["irradiance_map"]
+        return [
+            Pass(lambda rows: irradiance.gather_clusters(environment, blocks, clusters, rows=rows), rows=blocks[0]),
+            Pass(lambda rows: irradiance.sum_clusters(clusters, target, rows=rows), rows=MAP_SIZE[0]),
+        ]

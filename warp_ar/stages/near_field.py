@@ -1,0 +1,126 @@
+"""What surrounds virtual objects at close range."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import near_field
+from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
+from warp_ar.scene.ray_scene import reflects_glossily
+from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.variants import distant_variant
+
+SIDE = 4
+"""Pixels along a tile."""
+COUNT = 32
+"""Samples of the environment per pixel."""
+LOBE_COUNT = 4
+"""Rays per pixel into a glossy lobe."""
+MIRROR_SAMPLES = 4
+"""Rays per pixel of a mirror."""
+
+
+def lobe_width(material: Material) -> float:
+    """Width alpha of what a material mirrors, as ``kernels.near_field`` has it."""
+    match material:
+        case MetallicRoughnessMaterial():
+            return material.roughness**2
+        case PhongMaterial():
+            return 1.0 / math.sqrt(max(material.shininess, 1.0))
+    return 0.0
+
+
+class NearField(Stage):
+    """Light that reaches objects past each other, and what they mirror of the desk and of each other."""
+
+    name: ClassVar[str] = "near_field"
+    summary: ClassVar[str] = "what of the desk and of other objects virtual objects show"
+    unread: ClassVar[str] = "virtual objects show the distant environment only"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32",
+        bound=6e-2,
+        cause="two rays of 64 at the picture's border see the desk or do not",
+        measured=2e-07,
+        rows=(5, 6, 8, 13, 14, 17, 18),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Needs objects and an environment that lights them."""
+        if not features.request.scene.objects:
+            return LeftOut(NO_OBJECT)
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        reads = ["frame", "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
+        if features.distant.diffuse != "none":
+            reads.append("environment_samples")
+        reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
+        return Wiring(tuple(reads), features.near_names)
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Irradiance and what is mirrored, before and after averaging."""
+        width, height = self.request.size
+        config = self.features.distant
+        specs = {}
+        if config.diffuse != "none":
+            specs["object_irradiance"] = specs["near_field_irradiance"] = ArraySpec((height, width), wp.vec3)
+        if config.specular:
+            specs["near_field_passed"] = ArraySpec((height, width), wp.vec4)
+            specs["object_mirrored"] = specs["near_field_mirrored"] = ArraySpec((height, width), wp.vec4)
+        return {**specs, **distant_light_arrays(self.features, self.name)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Estimates, then their mean."""
+        layers = self.features.layers
+        forms = self.features.distant
+        widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
+        sharp = [width < near_field.SHARP_ALPHA for width in widths]
+        # The forms themselves stay the scene's: they are what the kernel writes.
+        variant = distant_variant(self.features, device)
+        config = near_field.NearFieldConfig(
+            dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
+            COUNT,
+            0 if all(sharp) else LOBE_COUNT,
+            MIRROR_SAMPLES if any(sharp) else 0,
+            SIDE,
+            "shadow_ratio" in layers,
+            "physical_added" in layers,
+        )
+        near_field.make_near_field_kernel(config)
+        near_field.make_filter_kernel(config)
+        distant = make_distant_light(self.features, arrays, self.name)
+        inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
+        inputs += [arrays.get("shadow_ratio"), arrays.get("physical_added"), arrays["ray_scene"], distant]
+        inputs += [
+            arrays["environment_samples"] if forms.diffuse != "none" else None,
+            arrays["hit_object"],
+            arrays["hits"],
+        ]
+        raw = [arrays.get(f"near_field_{name}") for name in ("irradiance", "mirrored", "passed")]
+        out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
+
+        def estimate(rows: Rows | None) -> None:
+            near_field.light_objects(config, *inputs, *raw, rows=rows)
+
+        def average(rows: Rows | None) -> None:
+            near_field.filter_near_field(
+                config,
+                arrays["params"],
+                arrays["ray_scene"],
+                arrays["hit_object"],
+                arrays["hits"],
+                *raw,
+                *out,
+                rows=rows,
+            )
+
+        height = self.request.size[1]
+        extent = arrays["object_rows"]
+        return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]

@@ -1,0 +1,54 @@
+"""The environment as stages hand it to their kernels: which of its forms a request's objects reflect, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import warp as wp
+
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS
+from warp_ar.stages.base import Arrays, ArraySpec
+from warp_ar.stages.features import Features
+
+# Roughness by cosine; bilinear between them, the table stays within 1e-3 of the integral.
+DFG_SIZE = 32
+
+
+def distant_light_reads(features: Features) -> tuple[str, ...]:
+    """Resources that hold the forms of the environment that objects reflect."""
+    config = features.distant
+    diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
+    specular = ("prefilter_levels",) if config.specular else ()
+    return (*diffuse, *specular, *(("lamps",) if config.lamps and (diffuse or specular) else ()))
+
+
+def distant_light_arrays(features: Features, stage: str) -> Mapping[str, ArraySpec]:
+    """What a stage owns for ``make_distant_light``: for metallic-roughness, the table of its reflectance."""
+    return (
+        {f"{stage}_dfg": ArraySpec((DFG_SIZE, DFG_SIZE), wp.vec2)}
+        if METALLIC_ROUGHNESS in features.distant.models
+        else {}
+    )
+
+
+def make_distant_light(features: Features, arrays: Arrays, stage: str) -> DistantLight:
+    """The environment as kernels of a stage with ``distant_light_arrays`` read it; the table is made here, once."""
+    config = features.distant
+    distant = DistantLight()
+    if config.diffuse == "sh":
+        distant.irradiance_sh = arrays["irradiance_sh"]
+    if config.diffuse == "map":
+        distant.irradiance_map = arrays["irradiance_map"]
+    if config.specular:
+        distant.levels = arrays["prefilter_levels"]
+    distant.level_height = features.request.quality.environment_height
+    if METALLIC_ROUGHNESS in config.models:
+        table = arrays[f"{stage}_dfg"]
+        integrate_dfg(table)
+        distant.dfg = table
+    distant.probes = arrays["probes"]
+    if config.lamps:
+        distant.lamps = arrays["lamps"]
+    return distant

@@ -1,0 +1,25 @@
+"""Sets of samples that stand for the environment: how large they are, and in which arrays they lie."""
+
+from __future__ import annotations
+
+from warp_ar.stages.features import Features
+
+SAMPLES = 1024
+"""Of all sets together: what an 8-bit picture of their mean can tell apart, four times over."""
+REFERENCE_SIZE = (32, 64)
+"""Texels of the map that the reference sums over."""
+
+
+def lists_texels(features: Features) -> bool:
+    """Whether the reference asks for every texel of the environment, beside the samples that follow its light."""
+    return features.request.quality.method("environment_shadow") == "brute_force"
+
+
+def sample_names(features: Features) -> tuple[str, str, str]:
+    """Arrays that shadows read: directions, flux, samples."""
+    listed = "environment_samples_texel_directions", "environment_samples_texel_flux", "environment_samples_texels"
+    return (
+        listed
+        if lists_texels(features)
+        else ("environment_samples_directions", "environment_samples_flux", "environment_samples")
+    )

@@ -1,0 +1,22 @@
+"""The layers over the frame, as the kernels that compose the picture take them."""
+
+from __future__ import annotations
+
+from warp_ar.kernels import composite
+from warp_ar.stages.base import Arrays
+
+
+def layers_of(arrays: Arrays) -> composite.Layers:
+    """The layers that there are, as kernels read them."""
+    names = ("virtual", "physical_added", "shadow_ratio", "mirrored")
+    return composite.make_layers(*(arrays.get(name) for name in names))
+
+
+def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
+    """Which layers to compile in."""
+    return composite.CompositeConfig(
+        virtual="virtual" in layers,
+        added="physical_added" in layers,
+        ratio="shadow_ratio" in layers,
+        mirrored="mirrored" in layers,
+    )

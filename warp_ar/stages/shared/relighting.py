@@ -1,0 +1,39 @@
+"""What relighting is compiled for and reads, in the picture and in what mirror balls show of the receiver."""
+
+from __future__ import annotations
+
+from warp_ar.kernels import relight
+from warp_ar.scene.ray_scene import trace_config
+from warp_ar.stages.features import LOCAL, Features
+
+
+def relight_reads(features: Features) -> tuple[str, ...]:
+    """What the method of ``relight`` needs to know of the environment and the receiver."""
+    method = features.relight_method
+    reads = ["pose", "lights", "objects"]
+    if method != "flat":
+        reads += ["frame", "key_lights"]
+    if method in ("relief", "reflectance", *LOCAL):
+        reads.append("summed_area")
+    if method in ("reflectance", *LOCAL):
+        reads.append(features.irradiance)
+        reads += ["lamps"] * features.emitters
+    if features.ambient_visibility:
+        reads.append("environment_samples")
+    return tuple(reads)
+
+
+def relight_config(features: Features) -> relight.RelightConfig:
+    """What the relighting of a request's receiver calls for."""
+    method = features.relight_method
+    return relight.RelightConfig(
+        "reflectance" if method in LOCAL else method,
+        trace_config(features.request.scene),
+        "sh" if features.irradiance == "irradiance_sh" else "map",
+        features.environment,
+        features.soft_lights,
+        method in ("reflectance", *LOCAL) and features.emitters,
+        features.ambient_visibility,
+        features.bounced,
+        features.request.quality.edge_samples,
+    )

@@ -1,0 +1,18 @@
+"""What the shading of objects is compiled for, in the picture and in what mirror balls show."""
+
+from __future__ import annotations
+
+from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.scene.ray_scene import light_kind
+from warp_ar.stages.features import Features
+
+
+def shade_config(features: Features) -> ShadeConfig:
+    """What the shading of a request's objects calls for."""
+    return ShadeConfig(
+        distant=features.distant,
+        lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
+        edge_samples=features.request.quality.edge_samples,
+        soft=features.soft_lights,
+        near=features.near_field,
+    )

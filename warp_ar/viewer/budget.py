@@ -1,0 +1,234 @@
+"""The page's budget: what a time per frame buys on this device, and how far off that is.
+
+Errors come from the cost table, costs from measurements on this device, both as for ``--quality auto``; they are
+measured here one method at a time between other work, so that frames and edits go on meanwhile.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import statistics
+import time
+from collections.abc import Generator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, Controller
+from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings, turn
+from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_costs, write_costs
+from warp_ar.cache_folder import cache_folder
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import WarpArError
+from warp_ar.scene import Pose
+from warp_ar.stages.quality import PRESETS, Quality
+from warp_ar.viewer.controls import Notify
+
+_COST_FRAMES: Final = 30
+"""Frames whose median tells what a preset costs."""
+_SETTLED: Final = 10
+"""Frames of a new pipeline that do not count."""
+
+
+class BudgetSetting:
+    """Holds the budget and what it buys. The thread that lights frames calls its methods, unless they say otherwise."""
+
+    def __init__(self, notify: Notify, folder: Path | None = None) -> None:
+        """Start switched off.
+
+        Args:
+            notify: Takes ``record`` whenever it has changed, on any thread.
+            folder: Where costs are kept; None means the user's cache folder.
+        """
+        self._notify, self._folder = notify, folder or cache_folder()
+        self._errors = load_errors()
+        self._budget: float | None = None
+        self._last_budget = DEFAULT_BUDGET_MS
+        self._controller: Controller | None = None
+        self._key: str | None = None
+        self._costs: Costs | None = None
+        self._offer: dict[str, Any] = {}
+        self._progress: float | None = None
+        self._failed: str | None = None
+        self._settings: tuple[Setting, ...] = ()
+        self._stopped = False
+        self._preset_ms: dict[str, collections.deque[float]] = {}
+        self._since_restart = 0
+
+    @property
+    def budget(self) -> float | None:
+        """Milliseconds per frame; None while switched off."""
+        return self._budget
+
+    @property
+    def last_budget(self) -> float:
+        """The last one that was set, or the default."""
+        return self._last_budget
+
+    @property
+    def measuring(self) -> bool:
+        """Whether costs are being measured: frames do well to leave time for that."""
+        return self._progress is not None
+
+    def switch(self, budget: float | None) -> None:
+        """Set the budget, or with None switch off. From any thread."""
+        self._last_budget = budget or self._last_budget
+        self._budget = budget
+
+    def stop(self) -> None:
+        """Measure no more. From any thread."""
+        self._stopped = True
+
+    def start_quality(self) -> Quality:
+        """What runs under a budget until something can be chosen."""
+        return dataclasses.replace(BASE, name=AUTO)
+
+    def look(self, pipeline: Pipeline, image: npt.NDArray[np.uint8], pose: Pose | None, helper: Executor) -> None:
+        """Learn the costs for what ``pipeline`` shows: from the cache, else by measuring as soon as there is a budget.
+
+        Args:
+            pipeline: What lights the frames, with the scene as it is edited.
+            image: A frame that shows what the scene needs to see.
+            pose: The camera's in it.
+            helper: Runs the measurements, a step at a time.
+        """
+        if self.measuring or self._stopped:
+            return
+        scene, size = pipeline.scene, pipeline.size
+        # Edits change costs as load does; only another scene, its frames' size or an unknown setting ask for a new
+        # look.
+        key = f"{scene.name} {size}"
+        if key != self._key:
+            self._key = key
+            self._settings = relevant_settings(scene, size)
+            plan = make_plan(dataclasses.replace(pipeline.plan.request, quality=BASE))
+            self._cache_key = cost_key(plan, pipeline.device, self._settings)
+            self._adopt(read_costs(self._folder, self._cache_key, self._settings))
+            self._notify(self.record())
+        if self._costs is None and self._budget is not None and key != self._failed:
+            self._progress = 0.0
+            self._notify(self.record())
+            steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
+            helper.submit(self._step, helper, steps, key)
+
+    def _step(self, helper: Executor, steps: Generator[float, None, Costs], key: str) -> None:
+        progress = None
+        try:
+            if not self._stopped:
+                progress = next(steps)
+        except StopIteration as end:
+            write_costs(self._folder, self._cache_key, end.value)
+            self._adopt(end.value)
+        except WarpArError as error:
+            self._failed = key
+            self._notify({"type": "notice", "text": f"What methods cost cannot be measured: {error}", "bad": True})
+        finally:
+            self._progress = progress
+        self._notify(self.record())
+        if progress is not None and not self._stopped:
+            helper.submit(self._step, helper, steps, key)
+
+    def _adopt(self, costs: Costs | None) -> None:
+        self._costs = costs
+        if costs is None:
+            self._controller, self._offer = None, {}
+            return
+        controller = Controller(costs, self._errors, self._last_budget)
+        self._controller, self._offer = controller, self._list(controller, costs)
+
+    def choose(self, milliseconds: float | None, now: float) -> Quality | None:
+        """What to run under the budget, or None while that is not known or there is no budget.
+
+        Args:
+            milliseconds: What the last frame took; None if it says nothing about the present choice.
+            now: Seconds on a clock that does not jump.
+        """
+        controller, budget = self._controller, self._budget
+        if controller is None or budget is None:
+            return None
+        if controller.budget_ms != budget:
+            controller.set_budget(budget)
+        elif milliseconds is not None:
+            controller.observe(milliseconds, now)
+        return dataclasses.replace(turn(BASE, controller.settings), name=AUTO)
+
+    def observe(self, preset: str, milliseconds: float | None) -> Quality | None:
+        """Note what a frame took; what to run from now on, as ``choose`` has it.
+
+        Args:
+            preset: Name of the quality that it was lit by.
+            milliseconds: What it took; None if it says nothing about that quality.
+        """
+        self._since_restart += 1
+        counts = milliseconds is not None and not self.measuring
+        if counts and milliseconds is not None and self._since_restart > _SETTLED:
+            self._preset_ms.setdefault(preset, collections.deque(maxlen=_COST_FRAMES)).append(milliseconds)
+        return self.choose(milliseconds if counts else None, time.monotonic())
+
+    def costs(self) -> dict[str, float]:
+        """Median milliseconds per frame of every preset that has run on this scene. From any thread."""
+        return {name: round(statistics.median(ms), 2) for name, ms in list(self._preset_ms.items()) if ms}
+
+    def forget_costs(self, preset: str | None = None) -> None:
+        """What a preset took says nothing of it any more; None means all: another scene is shown. From any thread."""
+        for name in [preset] if preset is not None else list(self._preset_ms):
+            self._preset_ms.pop(name, None)
+
+    @staticmethod
+    def rules(quality: Quality) -> bool:
+        """Whether a quality is a budget's choice."""
+        return quality.name == AUTO
+
+    def restart(self) -> None:
+        """Forget the frames so far: another pipeline lights those to come."""
+        self._since_restart = 0
+        if self._controller is not None:
+            self._controller.restart()
+
+    def state(self) -> dict[str, Any] | None:
+        """What is chosen now; None while nothing is. From any thread."""
+        controller = self._controller
+        if controller is None or self._budget is None:
+            return None
+        return {
+            "settings": dict(controller.settings),
+            "expected_ms": round(controller.expected_ms, 2),
+            "expected_error": round(controller.expected_error, 5),
+            "factor": round(controller.factor, 4),
+        }
+
+    def record(self) -> dict[str, Any]:
+        """All that can be bought, as a message for the page. From any thread."""
+        return {"type": "budget", "measuring": self._progress, "known": self._controller is not None, **self._offer}
+
+    def _list(self, controller: Controller, costs: Costs) -> dict[str, Any]:
+        names = [setting.name for setting in self._settings]
+        methods = {setting.name: list(setting.methods) for setting in self._settings}
+        return {
+            "base": costs.base,
+            "settings": methods,
+            "choices": [
+                {
+                    "ms": round(choice.milliseconds, 3),
+                    "error": round(choice.error, 5),
+                    "methods": [methods[name].index(dict(choice.settings)[name]) for name in names],
+                }
+                for choice in controller.choices
+            ],
+            "presets": {name: cost for name in PRESETS if (cost := self._cost_of(PRESETS[name], costs)) is not None},
+        }
+
+    def _cost_of(self, quality: Quality, costs: Costs) -> dict[str, float] | None:
+        """What a preset should cost and err; None where it has methods that are not measured."""
+        methods = {setting.name: chosen(quality, setting) for setting in self._settings}
+        if any(method not in costs.methods[setting] for setting, method in methods.items()):
+            return None
+        return {
+            "ms": round(costs.excess(methods), 3),
+            "error": round(sum(self._errors[setting][method] for setting, method in methods.items()), 5),
+        }

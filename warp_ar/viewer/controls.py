@@ -1,0 +1,170 @@
+"""What viewers ask for: the one state that the page's threads share, and its lock."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from warp_ar.errors import UsageError
+from warp_ar.input.sources import QueueSource, Source, open_source
+from warp_ar.scene import Camera, Scene, SourceSpec
+from warp_ar.stages.quality import PRESETS
+from warp_ar.viewer import messages
+from warp_ar.viewer.edits import Wanted
+
+CAMERA: Final = "camera"
+"""What a picture is compared with when it is not another preset."""
+
+Notify = Callable[[dict[str, Any]], None]
+"""Takes a message for all viewers, on any thread."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Feed:
+    """Where frames come from, and what changes together with that."""
+
+    source: Source
+    camera: Camera | None = None
+    """Another camera than the scene's."""
+    wanted: Wanted | None = None
+    """What to show from then on."""
+    owner: object = None
+    """The viewer whose camera it is."""
+
+    @property
+    def is_browser(self) -> bool:
+        """Whether a browser pushes the frames."""
+        return isinstance(self.source, QueueSource)
+
+
+def _where(spec: SourceSpec) -> str | int | Path:
+    if spec.path is not None:
+        return spec.path
+    return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
+
+
+def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
+    """A scene's own source, or the one that was given instead.
+
+    Raises:
+        WarpArError: It cannot be opened, or the scene names none.
+    """
+    if given is not None:
+        return Feed(open_source(given, loop=True), wanted=wanted)
+    spec = scene.source
+    if spec is None:
+        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
+    return Feed(open_source(_where(spec), fps=spec.fps, loop=True, exposures=spec.exposures or ()), wanted=wanted)
+
+
+class Controls:
+    """What to show, and whether. Methods may be called from any thread; whoever waits holds ``changed``."""
+
+    def __init__(self, feed: Feed, wanted: Wanted, notify: Notify) -> None:
+        self._notify = notify
+        self.changed = threading.Condition()
+        """Guards all of this; notified at every change."""
+        self.wanted = wanted
+        """What viewers see now, or will once it is built."""
+        self.compare = ""
+        """What stands beside the picture: nothing, ``CAMERA`` or a preset."""
+        self.playing = True
+        self.watchers = 0
+        """Viewers; without any, no frame is lit."""
+        self.edits = 0
+        """Grows with every change of what is shown."""
+        self.stopped = False
+        self.feed = feed
+        self._next: Feed | None = None
+
+    @property
+    def newest_feed(self) -> Feed:
+        """The feed that was asked for last; the frames may still come from the one before."""
+        return self._next or self.feed
+
+    @property
+    def leaving(self) -> bool:
+        """Whether the present source shall be left."""
+        return self.stopped or self._next is not None
+
+    def change(self, make: Callable[[Wanted], Wanted]) -> None:
+        """Make what is wanted anew from what was."""
+        with self.changed:
+            self.wanted = make(self.wanted)
+            self._touch()
+        self._notify(messages.scene(self.wanted))
+
+    def _touch(self) -> None:
+        self.edits += 1
+        self.changed.notify_all()
+
+    def set_compare(self, other: str) -> None:
+        """Choose what stands beside the picture.
+
+        Raises:
+            UsageError: There is no such choice.
+        """
+        if other not in ("", CAMERA, *PRESETS):
+            raise UsageError(f"compare with {other!r}; expected {CAMERA} or a preset: {', '.join(PRESETS)}")
+        with self.changed:
+            self.compare = other
+            self._touch()
+
+    def play(self, on: bool) -> None:
+        """Let frames flow, or hold the one in hand."""
+        with self.changed:
+            self.playing = on
+            self.changed.notify_all()
+
+    def watch(self, change: int) -> None:
+        """One viewer more (1) or less (-1)."""
+        with self.changed:
+            self.watchers += change
+            self.edits += change > 0
+            self.changed.notify_all()
+
+    def stop(self) -> None:
+        """End the frames."""
+        with self.changed:
+            self.stopped = True
+            self.changed.notify_all()
+        if self.feed.source.live:
+            self.feed.source.close()
+
+    def switch(self, feed: Feed) -> None:
+        """Go on with another source after the frame in hand."""
+        with self.changed:
+            left, self._next = self._next, feed
+            current = self.feed.source
+            self.changed.notify_all()
+        if left is not None:
+            left.source.close()
+        if current.live:
+            current.close()
+
+    def adopt(self) -> bool:
+        """Take the feed that was asked for last; whether there was one."""
+        with self.changed:
+            if self._next is None:
+                return False
+            self.feed, self._next = self._next, None
+            self.wanted = self.feed.wanted or self.wanted
+            self._touch()
+        self._notify(messages.scene(self.wanted))
+        return True
+
+    def use_camera(self, camera: Camera) -> None:
+        """Say what camera took the present source's frames."""
+        with self.changed:
+            self.feed = dataclasses.replace(self.feed, camera=camera)
+            self._touch()
+
+    def close(self) -> None:
+        """Let the sources go."""
+        self.stopped = True
+        for feed in (self.feed, self._next):
+            if feed is not None:
+                feed.source.close()

@@ -1,0 +1,294 @@
+"""The page's frames: taken from the source when they are due, lit, handed out."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.device import exclusive
+from warp_ar.engine.pipeline import Pipeline, Result
+from warp_ar.errors import WarpArError
+from warp_ar.input.sources import Frame, Source
+from warp_ar.input.tracking import TrackState
+from warp_ar.scene import Camera, Pose
+from warp_ar.stages.quality import PRESETS
+from warp_ar.viewer import messages
+from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
+from warp_ar.viewer.budget import BudgetSetting
+from warp_ar.viewer.calibration import CalibrationSession
+from warp_ar.viewer.controls import Controls, Notify
+from warp_ar.viewer.intrinsics import guessed_camera
+from warp_ar.viewer.lighting import Lighting
+from warp_ar.viewer.recorder import Recorder
+
+PLAY_RATE: Final = 30.0
+"""Frames a second of clips that tell no rate."""
+_LIGHT_SECONDS: Final = 0.25
+"""How often the environment is looked at."""
+_MEASURING_REST: Final = 0.15
+"""Seconds that the frames rest, one from the next, while methods are timed: what runs beside them spoils the times."""
+_STILL_SECONDS: Final = 0.25
+"""How often a held frame is looked at again, where nothing was edited."""
+_BUILDING_SECONDS: Final = 0.03
+"""How often it is looked at while a pipeline is built."""
+_NOTICE_SECONDS: Final = 5.0
+"""Shortest time between two notices of frames that cannot be lit."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lit:
+    """One frame as the viewers get it."""
+
+    id: int
+    """Number of the frame since the page was started."""
+    taken: float
+    """When the source gave it, seconds of ``time.monotonic``."""
+    stamp: float | None
+    """When a browser's camera took it, milliseconds of the browser's own clock; None from other sources."""
+    image: Image
+    """Lit, uint8 RGB; the camera's own where nothing can light it yet."""
+    other: Image | None
+    """What it is compared with."""
+    frame: Image
+    """As the camera gave it."""
+    pose: Pose | None
+    """``camera_from_world``."""
+    state: TrackState | None
+    camera: Camera
+    stages: tuple[tuple[str, float, bool], ...]
+    """Name, milliseconds and whether it was skipped."""
+    light_ms: float
+    """From the frame in hand to the lit frame."""
+    plan: int
+    """Number of the plan that it was lit by; 0 where it was not."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Helpers:
+    """What takes part in every frame."""
+
+    lighting: Lighting
+    budget: BudgetSetting
+    camera: BrowserCamera
+    calibration: CalibrationSession
+    recorder: Recorder
+
+
+class FrameLoop:
+    """Lights frames on one thread, in ``run``. Its attributes may be read by any."""
+
+    def __init__(
+        self,
+        controls: Controls,
+        helpers: Helpers,
+        *,
+        frames: int | None,
+        publish: Callable[[Lit], None],
+        notify: Notify,
+    ) -> None:
+        """Begin nothing yet.
+
+        Args:
+            controls: What to show.
+            helpers: What takes part in every frame.
+            frames: End after so many lit frames.
+            publish: Takes every frame, on the thread of ``run``.
+            notify: Takes what else viewers should know.
+        """
+        self._controls, self._helpers, self._frames = controls, helpers, frames
+        self._publish, self._notify = publish, notify
+        self._id = self._lit = 0
+        self._base = 0.0
+        self._busy_ms = 0.0
+        self._plan = 0
+        self._light_time = self._notice_time = 0.0
+        self._times: collections.deque[float] = collections.deque(maxlen=60)
+        self.latest: Lit | None = None
+        """The newest frame."""
+        self.light: npt.NDArray[np.float32] | None = None
+        """The environment, latlong linear RGB, as it was a moment ago; None while it is not known."""
+
+    @property
+    def fps(self) -> float:
+        """Frames a second over the last ones."""
+        times = list(self._times)
+        return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
+
+    @property
+    def difference(self) -> float | None:
+        """Mean absolute difference of the two compared pictures in percent of full scale."""
+        lit = self.latest
+        if (
+            self._controls.compare not in PRESETS
+            or lit is None
+            or lit.other is None
+            or lit.other.shape != lit.image.shape
+        ):
+            return None
+        return round(100.0 * float(cv2.norm(lit.image, lit.other, cv2.NORM_L1)) / (lit.image.size * 255.0), 3)
+
+    def run(self) -> None:
+        """Light frames until told to stop. Errors of a source are told to the viewers; another source may follow."""
+        controls = self._controls
+        while not controls.stopped:
+            try:
+                with controls.feed.source as source:
+                    self._run_source(source)
+            except WarpArError as error:
+                self._notify(messages.notice(error))
+            with controls.changed:
+                controls.changed.wait_for(lambda: controls.leaving)
+            controls.adopt()
+
+    def _run_source(self, source: Source) -> None:
+        due, previous = time.monotonic(), 0.0
+        start: float | None = None
+        still: Frame | None = None
+        for frame in source:
+            if still is None or frame.exposure_time in (None, *source.exposures[:1]):
+                still = frame  # a held picture is one of those that are shown
+            if start is None:
+                start = self._base - frame.time  # the pipeline's clock never runs back
+            if not source.live:
+                due = self._pace(due, max(frame.time - previous, 0.0))
+                previous = frame.time
+            if not (self._light_frame(frame, frame.time + start) and self._hold(still, frame.time + start)):
+                return
+            if self._frames is not None and self._lit >= self._frames:
+                self._controls.stop()
+                return
+
+    def _pace(self, due: float, step: float) -> float:
+        """Wait until a recorded frame is due; one that is late moves all that follow."""
+        due = max(due + step, time.monotonic())
+        controls = self._controls
+        with controls.changed:
+            controls.changed.wait_for(lambda: controls.leaving, timeout=max(due - time.monotonic(), 0.0))
+        return due
+
+    def _hold(self, frame: Frame, now: float) -> bool:
+        """Rest while nobody watches; while held, light the same frame again after edits. False to leave the source."""
+        controls, lighting, recorder = self._controls, self._helpers.lighting, self._helpers.recorder
+        while True:
+            with controls.changed:
+                idle = controls.watchers == 0 and recorder.count is None and self._frames is None
+                if controls.leaving:
+                    return False
+                if controls.playing and not idle:
+                    return True
+                seen = controls.edits
+                controls.changed.wait_for(
+                    lambda seen=seen, idle=idle: (  # type: ignore[misc]
+                        controls.leaving or controls.edits != seen or (controls.playing and not idle)
+                    ),
+                    timeout=_BUILDING_SECONDS if lighting.busy else None if idle else _STILL_SECONDS,
+                )
+            if controls.watchers == 0 and recorder.count is None:
+                lighting.follow()  # what is being built is to be there when somebody comes
+            elif not controls.playing and not self._light_frame(frame, now):
+                return False
+
+    def _light_frame(self, frame: Frame, now: float) -> bool:
+        """Light one frame and hand it out; False to leave the source."""
+        if self._controls.leaving:
+            return False
+        begin = time.perf_counter()
+        helpers = self._helpers
+        pushed = helpers.camera.begin(frame.image, self._busy_ms)
+        helpers.calibration.look(frame.image)
+        pipeline = helpers.lighting.follow()
+        if helpers.lighting.swaps != self._plan:
+            self._plan = helpers.lighting.swaps
+            helpers.budget.restart()
+        self.latest = self._lit_by(pipeline, frame, now, pushed) or self._plain(frame, pushed)
+        self._times.append(time.monotonic())
+        try:
+            helpers.recorder.add(self.latest.image)
+        except WarpArError as error:
+            self._notify(messages.notice(error))
+        self._publish(self.latest)
+        self._busy_ms = (time.perf_counter() - begin) * 1e3
+        if helpers.budget.measuring:
+            controls = self._controls
+            with controls.changed:
+                controls.changed.wait_for(lambda: controls.leaving, timeout=_MEASURING_REST)
+        return True
+
+    def _lit_by(self, pipeline: Pipeline | None, frame: Frame, now: float, pushed: Pushed | None) -> Lit | None:
+        """The lit frame; None where it cannot be lit."""
+        height, width = frame.image.shape[:2]
+        if pipeline is None or pipeline.size != (width, height):
+            return None  # a pipeline for this camera is being built
+        start = time.perf_counter()
+        try:
+            result = pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time)
+            image = result.image
+        except WarpArError as error:
+            # A frame that is refused, such as one of an exposure that was not announced: the next may be lit.
+            if time.monotonic() - self._notice_time > _NOTICE_SECONDS:
+                self._notice_time = time.monotonic()
+                self._notify(messages.notice(error))
+            return None
+        light_ms = (time.perf_counter() - start) * 1e3
+        self._base = now + 1.0 / PLAY_RATE
+        self._lit += 1
+        other = self._helpers.lighting.other(frame, now)
+        self._look_at_light(pipeline)
+        self._watch_cost(pipeline, frame, result, light_ms)
+        stages = tuple((name, round(t.milliseconds, 3), t.skipped) for name, t in result.stages.items())
+        return dataclasses.replace(
+            self._plain(frame, pushed),
+            image=image,
+            other=other,
+            pose=result.pose,
+            state=result.state,
+            camera=pipeline.camera,
+            stages=stages,
+            light_ms=light_ms,
+            plan=self._plan,
+        )
+
+    def _plain(self, frame: Frame, pushed: Pushed | None) -> Lit:
+        """A frame as the camera gave it, for viewers to see meanwhile."""
+        self._id += 1
+        taken, stamp = (pushed.taken, pushed.stamp) if pushed is not None else (time.monotonic(), None)
+        camera = self._controls.feed.camera or self._controls.wanted.scene.camera
+        size = frame.image.shape[1], frame.image.shape[0]
+        if (camera.width, camera.height) != size:
+            camera = guessed_camera(*size)
+        return Lit(self._id, taken, stamp, frame.image, None, frame.image, None, None, camera, (), 0.0, 0)
+
+    def _look_at_light(self, pipeline: Pipeline) -> None:
+        now = time.monotonic()
+        if now - self._light_time < _LIGHT_SECONDS:
+            return
+        self._light_time = now
+        light = pipeline.arrays.get("environment")
+        if light is None:
+            self.light = None
+            return
+        with exclusive(pipeline.device):
+            values = np.array(light.numpy())
+        # Black until the ball has been seen once.
+        self.light = values if values.any() else None
+
+    def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
+        """Learn what the preset costs; under a budget, choose the methods that it asks for."""
+        if not result.shown or (result.pose is None and pipeline.plan.needs("pose")):
+            return
+        controls, helpers = self._controls, self._helpers
+        wanted = controls.wanted
+        # A held frame changes nothing, a pipeline on its way out says nothing about the next one.
+        steady = not helpers.lighting.changing and controls.playing and pipeline.quality == wanted.shown_quality()
+        helpers.budget.look(pipeline, frame.image, result.pose, helpers.lighting.builder)
+        chosen = helpers.budget.observe(wanted.quality.name, light_ms if steady else None)
+        if chosen is not None and chosen != wanted.quality:
+            helpers.budget.forget_costs(chosen.name)
+            controls.change(lambda w: dataclasses.replace(w, quality=chosen) if helpers.budget.rules(w.quality) else w)

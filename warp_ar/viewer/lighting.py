@@ -1,0 +1,195 @@
+"""The page's pipelines: one lights the frames, one more what they are compared with; both follow what is wanted."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final
+
+from warp_ar.device import resolve_device
+from warp_ar.engine.graph import Plan, make_plan
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.engine.switcher import PipelineSwitcher, Target
+from warp_ar.errors import WarpArError
+from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.sources import Frame
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
+from warp_ar.viewer import messages
+from warp_ar.viewer.browser_camera import Image
+from warp_ar.viewer.controls import CAMERA, Controls, Feed, Notify
+from warp_ar.viewer.edits import Wanted
+
+FIRST: Final = PRESETS["low"]
+"""What lights a scene until the wanted plan is built: it compiles in the shortest time."""
+_AS_QUICK: Final = ("low", "paper")
+"""Presets that are not worth waiting for in two steps."""
+
+
+def make_target(wanted: Wanted, feed: Feed) -> Target:
+    """What a pipeline is built for."""
+    scene = dataclasses.replace(wanted.shown_scene(), camera=feed.camera or wanted.scene.camera)
+    # The page draws handles where parts are: that takes the pose, even where no stage does.
+    outputs = ("image", "pose") if wanted.scene.objects or wanted.scene.lights else ("image",)
+    return Target(scene, wanted.shown_quality(), feed.source.size, outputs, feed.source.exposures)
+
+
+class Lighting:
+    """Follows what is wanted. The thread of the frames calls it; properties may be read by any."""
+
+    def __init__(self, controls: Controls, device: str, notify: Notify, give_up: Callable[[], None]) -> None:
+        """Start without a pipeline.
+
+        Args:
+            controls: What is wanted.
+            device: ``auto``, ``cpu`` or ``cuda:N``.
+            notify: Takes what viewers should know.
+            give_up: Called when what is wanted cannot be built, before what was good is wanted again.
+
+        Raises:
+            UsageError: There is no such device.
+            SceneError: The scene does not fit the source.
+        """
+        self._controls, self._notify, self._give_up = controls, notify, give_up
+        self.device = str(resolve_device(device))
+        # What no plan can be made for is refused before anything is shown.
+        target = make_target(controls.wanted, controls.feed)
+        assert target.size is not None
+        camera = target.scene.camera.scaled_to(*target.size)
+        scene, ratios = dataclasses.replace(target.scene, camera=camera), bracket_ratios(target.exposures)
+        make_plan(Request(scene, target.quality, target.size, target.outputs, ratios))
+        self.builder = ThreadPoolExecutor(1, "warp-ar-build")
+        """Builds pipelines and does other work beside the frames."""
+        self._main = PipelineSwitcher(builder=self.builder, device=device)
+        self._second = PipelineSwitcher(builder=self.builder, device=device)
+        self._good = controls.wanted
+        self._followed: tuple[Wanted, str, Feed] | None = None
+        self._now = target
+        self._first: Target | None = None
+        self._then: Target | None = None
+        self._place: Any = None
+        self._settled = False
+        self._progress: tuple[str, int, int] | None = None
+        self.plan: Plan | None = None
+        """What lights the frames."""
+
+    @property
+    def swaps(self) -> int:
+        """Number of the plan: grows whenever stages or quality change."""
+        return self._main.swaps
+
+    @property
+    def busy(self) -> bool:
+        """Whether a pipeline is being built."""
+        return self.changing or self._second.busy
+
+    @property
+    def changing(self) -> bool:
+        """Whether the frames are about to be lit by another pipeline."""
+        followed = self._followed
+        return not self._settled or followed is None or followed[0] is not self._controls.wanted
+
+    @property
+    def compare_ready(self) -> bool:
+        """Whether what the picture is compared with is there."""
+        return self._controls.compare in ("", CAMERA) or self._second.pipeline is not None
+
+    def doing(self) -> dict[str, Any] | None:
+        """What is being built, for a line on the page; None while nothing is."""
+        if not self.busy:
+            return None
+        name, done, count = self._progress or (self._now.quality.name, 0, 0)
+        return {"quality": name, "done": done, "count": count}
+
+    def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
+        """Note what is to be built from now on."""
+        self._followed, self._settled = (wanted, compare, feed), False
+        now = self._now = make_target(wanted, feed)
+        self._then = dataclasses.replace(now, quality=PRESETS[compare]) if compare in PRESETS else None
+        elsewhere = self._place != _place(now) and now.quality.name not in _AS_QUICK
+        self._first = dataclasses.replace(now, quality=FIRST) if elsewhere else None
+
+    def follow(self) -> Pipeline | None:
+        """The pipeline for the next frame; None where none is built that shows this scene.
+
+        What cannot be built is undone and told.
+        """
+        controls = self._controls
+        with controls.changed:
+            wanted, compare, feed = controls.wanted, controls.compare, controls.feed
+        followed = self._followed
+        if followed is None or followed[0] is not wanted or followed[1] != compare or followed[2] is not feed:
+            self._aim(wanted, compare, feed)
+        before = self._main.swaps
+        try:
+            self._follow_main(wanted)
+        except WarpArError as error:
+            if self._first is not None:
+                self._first = None  # what is wanted itself may do
+            else:
+                self._settled = True
+                self._notify(messages.notice(error))
+                self._give_up()
+                controls.change(lambda _: self._good)
+        if self._main.swaps != before:
+            assert self._main.pipeline is not None
+            self.plan = self._main.pipeline.plan
+            self._notify(self.plan_message())
+        if self._then is None:
+            if self._second.pipeline is not None or self._second.busy:
+                self._second.close(wait=False)
+        elif not self.changing:
+            with contextlib.suppress(WarpArError):
+                self._second.follow(self._then, prepare=self._warm_up)
+        return self._main.pipeline if self._place == _place(self._now) else None
+
+    def _follow_main(self, wanted: Wanted) -> None:
+        target = self._first or self._now
+        self._main.follow(target, prepare=self._warm_up)
+        if self._main.shows(target):
+            self._place = _place(target)
+            if self._first is not None:
+                self._first = None
+            else:
+                self._good, self._settled = wanted, True
+
+    def _warm_up(self, pipeline: Pipeline) -> None:
+        """Load the kernels of a new pipeline; viewers are told how far that is."""
+        name = pipeline.quality.name
+        self._progress = (name, 0, 0)
+        pipeline.warm_up()
+        self._progress = None
+
+    def other(self, frame: Frame, now: float) -> Image | None:
+        """What the picture is compared with; None without a comparison, or until it is built."""
+        if self._controls.compare == CAMERA:
+            return frame.image
+        pipeline = self._second.pipeline
+        if pipeline is None or pipeline.size != (frame.image.shape[1], frame.image.shape[0]):
+            return None
+        with contextlib.suppress(WarpArError):
+            return pipeline(frame.image, time_seconds=now, exposure_time=frame.exposure_time).image
+        return None
+
+    def plan_message(self) -> dict[str, Any]:
+        """The stages that run, and why the others do not."""
+        return messages.plan(self.plan, self.swaps, self.device)
+
+    def close(self, wait_seconds: float | None = None) -> bool:
+        """Let the pipelines go; what is being built is waited for, at most so many seconds. Whether it has ended."""
+        self._main.close(wait=False)
+        self._second.close(wait=False)
+        done = threading.Event()
+        self.builder.submit(done.set)  # after all that was submitted before
+        ended = done.wait(wait_seconds)
+        self.builder.shutdown(wait=ended, cancel_futures=not ended)
+        return ended
+
+
+def _place(target: Target) -> Any:
+    """What a picture is of, whatever its quality: a pipeline of another place would show nonsense."""
+    scene = target.scene
+    return scene.name, scene.path, scene.marker, target.size
