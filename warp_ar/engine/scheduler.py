@@ -141,8 +141,10 @@ class Scheduler:
                 host_kernels += stage.host_kernels()
                 for step in passes:
                     if not step.on_host:
-                        with noting() as notes[id(step)]:
+                        with noting() as noted:
                             step.launch(None if step.rows is None else (0, step.rows))
+                        if noted:  # else it did its work by other means, as it will in each frame
+                            notes[id(step)] = noted
         found = [*self._first_launches, *(note for each in notes.values() for note in each)]
         kernels = [note.kernel for note in found if note.kernel is not None and self._loads_ahead(note)]
         own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []

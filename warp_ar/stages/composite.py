@@ -70,4 +70,4 @@ class Composite(Stage):
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
         extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
-        return [Pass(lambda rows: copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
+        return [Pass(lambda rows: copy(image, frame), rows=height), Pass(launch, rows=height, extent=union_of(extents))]
