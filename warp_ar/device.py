@@ -18,6 +18,11 @@ _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
 
 
+def usable_cores() -> int:
+    """Cores of the host that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
     """Keeps other threads off a CUDA device for as long as it is entered; on CPU it does nothing.
 

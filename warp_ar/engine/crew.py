@@ -99,7 +99,7 @@ class Crew:
         *,
         threads: int,
         bands_per_pass: int | None,
-        decide: Callable[[Stage], None],
+        decide: Callable[[Stage], object],
         finish: Callable[[Stage], None],
     ) -> None:
         """Pack everything; the threads begin with the first frame.
@@ -144,7 +144,7 @@ class Crew:
 
         for stage, own in steps:
             first = len(passes)
-            add_host(lambda stage=stage: self._decide(stage))  # type: ignore[misc]
+            add_host(lambda stage=stage: self._decide(stage))  # type: ignore[misc,arg-type]
             for step in own:
                 self._rows[id(step)] = len(passes)
                 packed = self._pack(step, notes[id(step)]) if id(step) in notes else None

@@ -20,7 +20,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_ar.device import compiling, exclusive
+from warp_ar.device import compiling, exclusive, usable_cores
 
 Progress = Callable[[int, int], None]
 """Told how many of how many modules are compiled, first with 0; not called where all were compiled before."""
@@ -49,7 +49,7 @@ def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress |
 
 
 def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     headers = _Headers() if device.is_cpu else None
 
     def work(module: Any) -> None:

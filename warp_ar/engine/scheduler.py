@@ -12,14 +12,13 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import warp as wp
 
-from warp_ar.device import capturing, exclusive, translating
+from warp_ar.device import capturing, exclusive, translating, usable_cores
 from warp_ar.engine.crew import Crew
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
@@ -63,7 +62,7 @@ class Scheduler:
         self.plan = plan
         self.arrays = arrays
         self.device = device
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         self.bands = bands
         self._threads = min(cores, bands or cores)
         if bands is not None and bands > 1:

@@ -32,7 +32,7 @@ def load_kept_mesh(path: Path) -> geometry.Mesh:
     try:
         if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
             return mesh_files.load_mesh(path)
-        code = b"".join(Path(module.__file__).read_bytes() for module in (geometry, mesh_files))
+        code = b"".join(Path(str(module.__file__)).read_bytes() for module in (geometry, mesh_files))
         key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
     except OSError:
         return mesh_files.load_mesh(path)  # which says what is wrong
