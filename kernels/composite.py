@@ -24,7 +24,7 @@ from warp_ar.kernels.codes import (
     set_code,
     store_codes,
 )
-from warp_ar.kernels.color import decode, encode
+from warp_ar.kernels.color import ENCODE_KEYS, decode, encode
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.visibility import inside_rect
@@ -114,6 +114,154 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 
 
+# A row on CPU, sixteen pixels at a time: layers come apart into channels, so that every step is one of the processor's
+# vectors, the tables' look-ups included; a block that no layer touches is copied. Every product and sum is rounded by
+# itself and in the order of ``compose`` and ``encode_channel``, which it equals in all bits.
+@wp.func_native(
+    """
+#if !defined(__CUDA_ARCH__)
+    #pragma clang fp contract(off)
+    constexpr int N = 16;
+    const int width = frame.shape[1];
+    const unsigned char* codes = reinterpret_cast<const unsigned char*>(frame.data) + size_t(row) * 3 * width;
+    unsigned char* out = reinterpret_cast<unsigned char*>(image.data) + size_t(row) * 3 * width;
+    const float* decoded = reinterpret_cast<const float*>(decode_table.data);
+    const float* table = reinterpret_cast<const float*>(encode_table.data);
+
+    // Columns that each layer reaches in this row, and where it lies.
+    struct Layer { const float* at; int start, stop; };
+    auto reach = [&](const auto& array, const wp::vec_t<4, wp::int32>& rect, int bit) {
+        Layer layer = {nullptr, 0, 0};
+        if ((kept & bit) && array.shape[0] > 0 && row >= rect[0] && row < rect[1]) {
+            layer.at = reinterpret_cast<const float*>(array.data) + size_t(row) * width * (sizeof(*array.data) / 4);
+            layer.start = rect[2] > 0 ? rect[2] : 0;
+            layer.stop = rect[3] < width ? rect[3] : width;
+        }
+        return layer;
+    };
+    const Layer objects = reach(layers.objects, params.object_rect, 1);
+    const Layer added = reach(layers.added, params.light_rect, 2);
+    const Layer ratio = reach(layers.ratio, params.shadow_rect, 4);
+    const Layer mirrored = reach(layers.mirrored, params.ball_rect, 8);
+
+    auto overlaps = [](const Layer& layer, int j) { return j < layer.stop && j + N > layer.start; };
+    typedef float Lanes[N];
+    auto take = [](Lanes* into, const Layer& layer, int channels, int j, float neutral) {
+        if (j >= layer.start && j + N <= layer.stop) {
+            const float* from = layer.at + channels * j;
+            if (channels == 4) {
+                for (int c = 0; c < 4; ++c) for (int k = 0; k < N; ++k) into[c][k] = from[4 * k + c];
+            } else {
+                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) into[c][k] = from[3 * k + c];
+            }
+            return;
+        }
+        for (int c = 0; c < channels; ++c)
+            for (int k = 0; k < N; ++k) {
+                const int column = j + k;
+                const bool inside = column >= layer.start && column < layer.stop;
+                into[c][k] = inside ? layer.at[channels * column + c] : neutral;
+            }
+    };
+
+    for (int j = 0; j < width; j += N) {
+        const int count = width - j < N ? width - j : N;
+        const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirrored, j)};
+        float o[4][N] = {}, a[3][N] = {}, m[3][N] = {}, r[3][N];
+        unsigned touched = 0;
+        unsigned changed[N] = {};
+        if (any[0] || any[1] || any[2] || any[3]) {
+            for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) r[c][k] = 1.0f;
+            if (any[0]) {
+                take(o, objects, 4, j, 0.0f);
+                for (int c = 0; c < 4; ++c) for (int k = 0; k < N; ++k) changed[k] |= o[c][k] != 0.0f;
+            }
+            if (any[1]) {
+                take(a, added, 3, j, 0.0f);
+                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= a[c][k] != 0.0f;
+            }
+            if (any[2]) {
+                take(r, ratio, 3, j, 1.0f);
+                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= r[c][k] != 1.0f;
+            }
+            if (any[3]) {
+                take(m, mirrored, 3, j, 0.0f);
+                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= m[c][k] != 0.0f;
+            }
+            for (int k = 0; k < N; ++k) touched |= changed[k];
+        }
+        if (touched == 0) {
+            memcpy(out + 3 * j, codes + 3 * j, 3 * count);
+            continue;
+        }
+        unsigned char before[3 * N] = {}, after[3 * N];
+        memcpy(before, codes + 3 * j, 3 * count);
+        for (int c = 0; c < 3; ++c) {
+            float x[N], steps[N];
+            wp::int32 code[N];
+            for (int k = 0; k < N; ++k) {
+                float value = decoded[3 * before[3 * k + c] + c];
+                value = value * r[c][k];
+                value = value + a[c][k];
+                value = value + m[c][k];
+                value = value > 0.0f ? value : 0.0f;
+                const float left = 1.0f - o[3][k];
+                value = left * value;
+                value = value + o[c][k];
+                x[k] = value > 0.0f ? (value < 1.0f ? value : 1.0f) : 0.0f;  // NaN is not above 0
+            }
+            unsigned unsure = 0;
+            for (int k = 0; k < N; ++k) {
+                const wp::int32 key = static_cast<wp::int32>(__builtin_sqrtf(x[k]) * static_cast<float>(keys - 1));
+                steps[k] = table[3 * key + c];
+                code[k] = static_cast<wp::int32>(steps[k]) + (x[k] >= table[3 * (keys + key) + c] ? 1 : 0);
+                unsure |= steps[k] != static_cast<float>(static_cast<wp::int32>(steps[k]));
+            }
+            if (unsure)
+                for (int k = 0; k < N; ++k)
+                    if (steps[k] != static_cast<float>(static_cast<wp::int32>(steps[k])))
+                        while (x[k] >= table[3 * (2 * keys + code[k]) + c]) ++code[k];
+            for (int k = 0; k < N; ++k)
+                after[3 * k + c] = changed[k] ? static_cast<unsigned char>(code[k]) : before[3 * k + c];
+        }
+        memcpy(out + 3 * j, after, 3 * count);
+    }
+#endif
+"""
+)
+def composite_row(
+    params: FrameParams,
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    encode_table: wp.array[wp.vec3],
+    layers: Layers,
+    kept: wp.int32,
+    keys: wp.int32,
+    row: wp.int32,
+    image: wp.array2d[wp.vec3ub],
+):
+    """Write a row of the picture, on CPU; ``kept`` has a bit for each layer, ``keys`` are those of the encode table."""
+
+
+@wp.kernel(enable_backward=False)
+def composite_rows_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    encode_table: wp.array[wp.vec3],
+    layers: Layers,
+    kept: wp.int32,
+    keys: wp.int32,
+    # Out:
+    image_out: wp.array2d[wp.vec3ub],
+):
+    """One thread per row, on CPU."""
+    i = row_start + wp.tid()
+    composite_row(params[0], frame, decode_table, encode_table, layers, kept, keys, i, image_out)
+
+
 @functools.cache
 def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
     """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
@@ -197,11 +345,17 @@ def composite(
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
+    tables = [decode_table, encode_table]
+    if frame.device.is_cpu:
+        kept = config.virtual + 2 * config.added + 4 * config.ratio + 8 * config.mirrored
+        inputs = [params, frame, *tables, layers, kept, ENCODE_KEYS]
+        launch_rows(composite_rows_kernel, (height,), inputs, [image_out], rows=rows, device=frame.device)
+        return
     threads, run = row_parts(frame.device, width)
     launch_rows(
         make_composite_kernel(config, by_warps(frame.device, width)),
         (height, threads),
-        [params, frame, decode_table, encode_table, layers, run],
+        [params, frame, *tables, layers, run],
         [image_out],
         rows=rows,
         device=frame.device,

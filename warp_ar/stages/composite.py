@@ -14,7 +14,6 @@ from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.layers import composite_config, layers_of
 from warp_ar.stages.shared.rows import union_of
-from warp_ar.stages.shared.variants import composite_variant
 
 
 class Composite(Stage):
@@ -50,13 +49,13 @@ class Composite(Stage):
         """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
         config = composite_config(self.features.layers)
         width, height = self.request.size
-        variant = composite_variant(config, device)
-        composite.make_composite_kernel(variant, by_warps(device, width))
+        if not device.is_cpu:
+            composite.make_composite_kernel(config, by_warps(device, width))
         image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
 
         def launch(rows: Rows | None) -> None:
             composite.composite(
-                variant,
+                config,
                 arrays["params"],
                 frame,
                 arrays["decode"],
