@@ -114,9 +114,9 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 
 
-# A row on CPU, sixteen pixels at a time: layers come apart into channels, so that every step is one of the processor's
-# vectors, the tables' look-ups included; a block that no layer touches is copied. Every product and sum is rounded by
-# itself and in the order of ``compose`` and ``encode_channel``, which it equals in all bits.
+# A row on CPU, sixteen pixels at a time: their 48 values go side by side through the processor's vectors, all but the
+# tables' look-ups; a block that no layer touches is copied. Every product and sum is rounded by itself and in the order
+# of ``compose`` and ``encode_channel``, which it equals in all bits.
 @wp.func_native(
     """
 #if !defined(__CUDA_ARCH__)
@@ -145,86 +145,103 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     const Layer mirrored = reach(layers.mirrored, params.ball_rect, 8);
 
     auto overlaps = [](const Layer& layer, int j) { return j < layer.stop && j + N > layer.start; };
-    typedef float Lanes[N];
-    auto take = [](Lanes* into, const Layer& layer, int channels, int j, float neutral) {
+    auto take = [&](float* into, const Layer& layer, int j, float neutral) {
         if (j >= layer.start && j + N <= layer.stop) {
-            const float* from = layer.at + channels * j;
-            if (channels == 4) {
-                for (int c = 0; c < 4; ++c) for (int k = 0; k < N; ++k) into[c][k] = from[4 * k + c];
-            } else {
-                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) into[c][k] = from[3 * k + c];
-            }
+            memcpy(into, layer.at + 3 * j, 3 * N * sizeof(*into));
             return;
         }
-        for (int c = 0; c < channels; ++c)
-            for (int k = 0; k < N; ++k) {
-                const int column = j + k;
-                const bool inside = column >= layer.start && column < layer.stop;
-                into[c][k] = inside ? layer.at[channels * column + c] : neutral;
-            }
+        for (int i = 0; i < 3 * N; ++i) {
+            const int column = j + i / 3;
+            into[i] = column >= layer.start && column < layer.stop ? layer.at[3 * j + i] : neutral;
+        }
     };
 
-    for (int j = 0; j < width; j += N) {
+    int start = width, stop = 0;
+    const Layer* all[4] = {&objects, &added, &ratio, &mirrored};
+    for (const Layer* layer : all)
+        if (layer->stop > layer->start) {
+            start = layer->start < start ? layer->start : start;
+            stop = layer->stop > stop ? layer->stop : stop;
+        }
+    if (start >= stop) start = stop = width;
+    memcpy(out, codes, 3 * start);
+    memcpy(out + 3 * stop, codes + 3 * stop, 3 * (width - stop));
+    for (int j = start; j < stop; j += N) {
         const int count = width - j < N ? width - j : N;
         const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirrored, j)};
-        float o[4][N] = {}, a[3][N] = {}, m[3][N] = {}, r[3][N];
+        float covered[3 * N] = {}, left[3 * N], a[3 * N] = {}, m[3 * N] = {}, r[3 * N];
+        unsigned changed[3 * N] = {};
         unsigned touched = 0;
-        unsigned changed[N] = {};
         if (any[0] || any[1] || any[2] || any[3]) {
-            for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) r[c][k] = 1.0f;
+            for (int i = 0; i < 3 * N; ++i) left[i] = r[i] = 1.0f;
             if (any[0]) {
-                take(o, objects, 4, j, 0.0f);
-                for (int c = 0; c < 4; ++c) for (int k = 0; k < N; ++k) changed[k] |= o[c][k] != 0.0f;
+                const int first = objects.start > j ? objects.start - j : 0;
+                const int last = objects.stop < j + N ? objects.stop - j : N;
+                for (int k = first; k < last; ++k) {
+                    const float* at = objects.at + 4 * (j + k);
+                    for (int c = 0; c < 3; ++c) {
+                        covered[3 * k + c] = at[c];
+                        left[3 * k + c] = 1.0f - at[3];
+                    }
+                    changed[3 * k] = at[3] != 0.0f;
+                }
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= covered[i] != 0.0f;
             }
             if (any[1]) {
-                take(a, added, 3, j, 0.0f);
-                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= a[c][k] != 0.0f;
+                take(a, added, j, 0.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= a[i] != 0.0f;
             }
             if (any[2]) {
-                take(r, ratio, 3, j, 1.0f);
-                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= r[c][k] != 1.0f;
+                take(r, ratio, j, 1.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= r[i] != 1.0f;
             }
             if (any[3]) {
-                take(m, mirrored, 3, j, 0.0f);
-                for (int c = 0; c < 3; ++c) for (int k = 0; k < N; ++k) changed[k] |= m[c][k] != 0.0f;
+                take(m, mirrored, j, 0.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= m[i] != 0.0f;
             }
-            for (int k = 0; k < N; ++k) touched |= changed[k];
+            for (int i = 0; i < 3 * N; ++i) touched |= changed[i];
         }
         if (touched == 0) {
             memcpy(out + 3 * j, codes + 3 * j, 3 * count);
             continue;
         }
-        unsigned char before[3 * N] = {}, after[3 * N];
-        memcpy(before, codes + 3 * j, 3 * count);
-        for (int c = 0; c < 3; ++c) {
-            float x[N], steps[N];
-            wp::int32 code[N];
-            for (int k = 0; k < N; ++k) {
-                float value = decoded[3 * before[3 * k + c] + c];
-                value = value * r[c][k];
-                value = value + a[c][k];
-                value = value + m[c][k];
-                value = value > 0.0f ? value : 0.0f;
-                const float left = 1.0f - o[3][k];
-                value = left * value;
-                value = value + o[c][k];
-                x[k] = value > 0.0f ? (value < 1.0f ? value : 1.0f) : 0.0f;  // NaN is not above 0
-            }
-            unsigned unsure = 0;
-            for (int k = 0; k < N; ++k) {
-                const wp::int32 key = static_cast<wp::int32>(__builtin_sqrtf(x[k]) * static_cast<float>(keys - 1));
-                steps[k] = table[3 * key + c];
-                code[k] = static_cast<wp::int32>(steps[k]) + (x[k] >= table[3 * (keys + key) + c] ? 1 : 0);
-                unsure |= steps[k] != static_cast<float>(static_cast<wp::int32>(steps[k]));
-            }
-            if (unsure)
-                for (int k = 0; k < N; ++k)
-                    if (steps[k] != static_cast<float>(static_cast<wp::int32>(steps[k])))
-                        while (x[k] >= table[3 * (2 * keys + code[k]) + c]) ++code[k];
-            for (int k = 0; k < N; ++k)
-                after[3 * k + c] = changed[k] ? static_cast<unsigned char>(code[k]) : before[3 * k + c];
+        unsigned char code[3 * N] = {};
+        memcpy(code, codes + 3 * j, 3 * count);
+        float x[3 * N], steps[3 * N], next[3 * N];
+        wp::int32 key[3 * N], found[3 * N];
+        // Look-ups one by one: a vector of them takes longer on half of all processors, and no less on the others.
+        #pragma clang loop vectorize(disable) unroll_count(6)
+        for (int i = 0; i < 3 * N; ++i) x[i] = decoded[3 * code[i] + i % 3];
+        for (int i = 0; i < 3 * N; ++i) {
+            float value = x[i] * r[i];
+            value = value + a[i];
+            value = value + m[i];
+            value = value > 0.0f ? value : 0.0f;
+            value = left[i] * value;
+            value = value + covered[i];
+            x[i] = value > 0.0f ? (value < 1.0f ? value : 1.0f) : 0.0f;  // NaN is not above 0
+            key[i] = 3 * static_cast<wp::int32>(__builtin_sqrtf(x[i]) * static_cast<float>(keys - 1));
         }
-        memcpy(out + 3 * j, after, 3 * count);
+        #pragma clang loop vectorize(disable) unroll_count(6)
+        for (int i = 0; i < 3 * N; ++i) {
+            steps[i] = table[key[i] + i % 3];
+            next[i] = table[key[i] + i % 3 + 3 * keys];
+        }
+        unsigned unsure = 0;
+        for (int i = 0; i < 3 * N; ++i) {
+            const wp::int32 whole = static_cast<wp::int32>(steps[i]);
+            found[i] = whole + (x[i] >= next[i] ? 1 : 0);
+            unsure |= steps[i] != static_cast<float>(whole);
+        }
+        if (unsure)
+            for (int i = 0; i < 3 * N; ++i)
+                if (steps[i] != static_cast<float>(static_cast<wp::int32>(steps[i])))
+                    while (x[i] >= table[3 * (2 * keys + found[i]) + i % 3]) ++found[i];
+        for (int k = 0; k < 3 * N; k += 3) {
+            const bool kept_code = (changed[k] | changed[k + 1] | changed[k + 2]) == 0;
+            for (int i = k; i < k + 3; ++i) code[i] = kept_code ? code[i] : static_cast<unsigned char>(found[i]);
+        }
+        memcpy(out + 3 * j, code, 3 * count);
     }
 #endif
 """
