@@ -11,12 +11,13 @@ with c_k the confidence of the view: the longest exposure that does not clip has
 keeps equal values exactly.
 
 An exposure has none in a channel where anything within ``REACH`` of the texel clips. That is wider than the texel's own
-footprint on purpose: tracking places the ball a fraction of a pixel differently in every frame, and a lamp that the
+footprint on purpose: tracking places the ball a fraction of a pixel differently in every frame, and an emitter that the
 short exposure shows half a texel beside the place where the long one clips would lose, to the dark of the long
-exposure, what lies over its edge. Around a lamp, all comes from one exposure that shows it whole.
+exposure, what lies over its edge. Around an emitter, all comes from one exposure that shows it whole.
 
-What clips still says that there is no less light than that: where a lamp has just been switched on, the short exposure
-does not know it yet. Where all exposures clip, the shortest that sees the texel stands, with its share at clipping.
+What clips still says that there is no less light than that: where an emitter has just been switched on, the short
+exposure does not know it yet. Where all exposures clip, the shortest that sees the texel stands, with its share at
+clipping.
 
 References:
     [GAWTSL10] Granados, Ajdin, Wand, Theobalt, Seidel, Lensch, "Optimal HDR reconstruction with linear digital
@@ -179,7 +180,7 @@ def merge_exposures(
     """Merge the latest unwrapped frame of every exposure.
 
     Args:
-        exposures: ``BracketExposure`` (K), the reference first, then ever shorter ones.
+        exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
         radiance: ``wp.vec3`` (K, h, w), in camera values of the exposure over the ball's reflectance.
         confidence: ``wp.float32`` (K, h, w); 0 or NaN: not seen.
         clipped: Share at clipping per channel, ``wp.vec3`` (K, h, w).

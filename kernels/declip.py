@@ -10,7 +10,7 @@ channel follows from the hue c of what is around: with u the channels that did n
 Hue is carried in from neighbours that do not clip but are bright, for what is dark is lit otherwise: weight ((m -
 1/4) / (3/4))^2 for a largest channel m above 1/4. A second time around, the pixels so completed carry their hue into
 those where all channels clip (the core); there the darkest channel is at least 1, so the others are at least c / min
-c: the edge of a yellow lamp is red at more than 1 long before its blue clips.
+c: the edge of a yellow emitter is red at more than 1 long before its blue clips.
 
 **Depth.** Inward, radiance goes on growing from that edge value e toward a value a, less and less: with q, a smooth
 log2 of the distance to the nearest known pixel (1 at the edge),
@@ -21,10 +21,10 @@ Without other knowledge a is one stop above e: near the median of clipped pixels
 in a mirror ball (a third to half a stop at the edge, 0.4 to 1 beyond two pixels).
 
 **The ball.** Its recovered light (``recover``) knows how much energy clipping took: that is a. A core pixel on the
-ball shows the direction that it mirrors. One on a modelled surface is not a lamp: hue and depth serve. Any other
+ball shows the direction that it mirrors. One on a modelled surface is not an emitter: hue and depth serve. Any other
 looks at something beyond the scene, at an unknown distance: the ball at p sees a point at distance t along the
 pixel's ray o + t d in the direction d + (o - p) / t, so from 1 / t = 0 up the first run of light that clips in the
-ball as well is what the camera sees; its brightest texel counts. Lamps have sharper edges than glow on surfaces:
+ball as well is what the camera sees; its brightest texel counts. Emitters have sharper edges than glow on surfaces:
 there a is approached as 1 - 2^-q. (At once would be too soon: a region's recovered energy is spread evenly over it.)
 
 **Filling.** Pull and push over a pyramid: a level's sums of weighted values are its children's; downward, what a

@@ -4,11 +4,14 @@ Samples of edges take many times as long as the pixels around them. On a CPU the
 holds up whole warps, and edges are listed first, their samples taken side by side and averaged afterwards.
 """
 
-from __future__ import annotations
-
 import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
+
+from warp_ar.kernels.launch import launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,3 +43,66 @@ def list_edge(i: wp.int32, j: wp.int32, edge_count: wp.array[wp.int32], edges: w
 def listed_edges(edge_count: wp.array[wp.int32], edges: wp.array[wp.vec2i]) -> wp.int32:
     """Edges in the list; none where it did not hold all."""
     return wp.where(edge_count[0] <= edges.shape[0], edge_count[0], 0)
+
+
+@functools.cache
+def make_average_edges_kernel(weighted: bool) -> wp.Kernel:
+    """Kernel that averages the samples of every listed edge, in their order.
+
+    Args:
+        weighted: Whether the fourth component says how much a sample counts, 0 or 1, and the mean goes without it; else
+            it is one of the values.
+    """
+    value_type = wp.vec3 if weighted else wp.vec4
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def average_edges_kernel(
+        # In:
+        threads: wp.int32,
+        count: wp.int32,
+        edge_count: wp.array[wp.int32],
+        edges: wp.array[wp.vec2i],
+        samples: wp.array[wp.vec4],
+        # Out:
+        values_out: wp.array2d[value_type],
+    ):
+        item = wp.tid()
+        stop = listed_edges(edge_count, edges)
+        while item < stop:
+            total = wp.vec4(0.0)
+            for sample in range(count):
+                total += samples[item * count + sample]
+            edge = edges[item]
+            if wp.static(weighted):
+                if total[3] > 0.0:
+                    values_out[edge[0], edge[1]] = wp.vec3(total[0], total[1], total[2]) / total[3]
+            else:
+                values_out[edge[0], edge[1]] = total / wp.float32(count)
+            item += threads
+
+    return average_edges_kernel
+
+
+def sample_listed_edges(
+    kernel: wp.Kernel,
+    inputs: Sequence[Any],
+    lists: EdgeLists,
+    count: int,
+    values_out: wp.array,
+    *,
+    weighted: bool,
+) -> None:
+    """Take the samples of all edges that were listed, side by side, and write their means.
+
+    Args:
+        kernel: Takes the number of threads, ``inputs``, and the counts and edges of the lists, and writes samples.
+        inputs: Of the kernel.
+        lists: Edges; its samples are written.
+        count: Samples of an edge.
+        values_out: (H, W) vec3 if ``weighted``, else vec4; written where an edge is.
+        weighted: As ``make_average_edges_kernel`` has it.
+    """
+    listed, device = [lists.count, lists.edges], values_out.device
+    launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, *listed], [lists.samples], device=device)
+    averaging = [EDGE_THREADS, count, *listed, lists.samples]
+    launch(make_average_edges_kernel(weighted), EDGE_THREADS, averaging, [values_out], device=device)

@@ -5,7 +5,7 @@ The environment becomes ``count * sets`` samples, drawn again whenever it change
     E = sum over samples of  measure * radiance * max(n.w, 0) * visible,   measure = 1 / (number of samples * pdf).
 
 Density. Half of the samples follow what arrives at the receiver, radiance times the weight of the direction, so that a
-lamp of one texel and the sky around it get samples by their light; half follow the weight alone, so that no sample
+emitter of one texel and the sky around it get samples by their light; half follow the weight alone, so that no sample
 stands for more than twice its share of the hemisphere and what objects reflect is sampled evenly. The weight is 0.3 +
 max(w.z, 0): mostly directions above the receiver, some for surfaces of other orientations. Texels are picked by
 inverting the cumulative sums of rows and of the texels in a row; within a texel a sample is uniform.
@@ -14,8 +14,8 @@ Points. The first two dimensions of Sobol's sequence are a (0, 2)-sequence in ba
 consecutive points, and all blocks together, have one point in each elementary interval of their size. A block is a set:
 pixels of a tile take one set each, their mean has the error of all sets together [KH01].
 
-Near lamps. A sample carries the distance at which its light starts; infinity for an environment. A lamp at a known
-distance is thereby a lamp at its place: see ``sample_toward``.
+Near emitters. A sample carries the distance at which its light starts; infinity for an environment. An emitter at a
+known distance is thereby an emitter at its place: see ``sample_toward``.
 
 References:
     [KH01] Keller, Heidrich 2001, Interleaved Sampling.
@@ -41,10 +41,10 @@ SIDE_WEIGHT = wp.constant(wp.float32(0.3))
 """Weight of directions that the receiver does not see, beside the cosine of those that it does."""
 FAR_AWAY = wp.constant(wp.float32(1.0e30))
 """Distance of light that is part of the environment."""
-LAMP_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
-"""Cosine of the largest angle between a lamp's direction and light that belongs to it."""
-MIN_LAMP_DISTANCE = wp.constant(wp.float32(0.05))
-"""Metres from the ball within which no lamp is taken to be."""
+EMITTER_COSINE = wp.constant(wp.float32(math.cos(math.radians(12.0))))
+"""Cosine of the largest angle between an emitter's direction and light that belongs to it."""
+MIN_EMITTER_DISTANCE = wp.constant(wp.float32(0.05))
+"""Metres from the ball within which no emitter is taken to be."""
 # Typed: literals above 2^31 in a kernel make the compiler warn.
 TOP_BIT = wp.constant(wp.uint32(0x80000000))
 
@@ -57,7 +57,16 @@ class EnvironmentSample:
     radiance: wp.vec3
     measure: wp.float32  # solid angle that the sample stands for
     distance: wp.float32  # metres from ``origin`` to the light; FAR_AWAY for the environment
-    origin: wp.vec3  # where it was captured: the ball's centre, or for a lamp the place that mirrors it
+    origin: wp.vec3  # where it was captured: the ball's centre, or for an emitter the place that mirrors it
+
+
+@wp.struct
+class SampleSets:
+    """Samples of the environment, set after set; each is known in two forms."""
+
+    directions: wp.array[wp.vec3]
+    flux: wp.array[wp.vec3]  # radiance times solid angle
+    samples: wp.array[EnvironmentSample]
 
 
 @wp.struct
@@ -71,7 +80,7 @@ class Incidence:
 
 @wp.func
 def sample_toward(sample: EnvironmentSample, point: wp.vec3) -> Incidence:
-    """A sample as ``point`` sees it: a lamp at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
+    """A sample as ``point`` sees it: an emitter at a known distance d0 from the ball turns, and grows by (d0 / d)^2."""
     result = Incidence()
     result.direction = sample.direction
     result.distance = FAR_AWAY
@@ -291,41 +300,42 @@ def list_texels_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def place_lamps_kernel(
+def place_emitters_kernel(
     # In:
     row_start: wp.int32,
-    lamps: wp.array[Emitter],
+    emitters: wp.array[Emitter],
     # Out:
     samples_out: wp.array[EnvironmentSample],
 ):
-    """Give the samples that show a lamp the distance of the lamp that they are nearest to."""
+    """Give the samples that show an emitter the distance of the emitter that they are nearest to."""
     index = wp.tid() + row_start
     sample = samples_out[index]
     if wp.max(sample.radiance) < 1.0:
         return
-    nearest = LAMP_COSINE
-    for k in range(lamps.shape[0]):
-        lamp = lamps[k]
-        cosine = wp.dot(lamp.direction, sample.direction)
+    nearest = EMITTER_COSINE
+    for k in range(emitters.shape[0]):
+        emitter = emitters[k]
+        cosine = wp.dot(emitter.direction, sample.direction)
         if cosine > nearest:
             nearest = cosine
-            samples_out[index].origin = lamp.origin
-            samples_out[index].distance = wp.clamp(lamp.distance, MIN_LAMP_DISTANCE, FAR_AWAY)
+            samples_out[index].origin = emitter.origin
+            samples_out[index].distance = wp.clamp(emitter.distance, MIN_EMITTER_DISTANCE, FAR_AWAY)
 
 
-def place_lamps(
-    lamps: wp.array[Emitter], samples_out: wp.array[EnvironmentSample], *, rows: Rows | None = None
+def place_emitters(
+    emitters: wp.array[Emitter], samples_out: wp.array[EnvironmentSample], *, rows: Rows | None = None
 ) -> None:
-    """Turn the samples of near lamps from directions into places.
+    """Turn the samples of near emitters from directions into places.
 
-    A sample shows a lamp if it is as bright as clipping and within ``LAMP_COSINE`` of its direction.
+    A sample shows an emitter if it is as bright as clipping and within ``EMITTER_COSINE`` of its direction.
 
     Args:
-        lamps: (k,) lamps; those without direction are none, those at infinity stay directions.
-        samples_out: (n,) samples, drawn from an environment captured where the lamps' distances are from.
+        emitters: (k,) emitters; those without direction are none, those at infinity stay directions.
+        samples_out: (n,) samples, drawn from an environment captured where the emitters' distances are from.
         rows: Range of samples; None means all.
     """
-    launch_rows(place_lamps_kernel, samples_out.shape, [lamps], [samples_out], rows=rows, device=samples_out.device)
+    device = samples_out.device
+    launch_rows(place_emitters_kernel, samples_out.shape, [emitters], [samples_out], rows=rows, device=device)
 
 
 def sum_environment(

@@ -7,23 +7,29 @@ that still has a hue is not far above clipping, and lifting it would leave a bri
 Methods:
 ``plain``: scaling alone; a clipped pixel is taken to be just clipped.
 
-``box``: [DH04] section 4.3. Clipped pixels are scaled by a factor that depends on the mean intensity a of a box
-around them, so that centres of over-exposed regions stay bright while their edges fade with the rest, and extreme
-darkening takes the whole region. The box grows linearly from 1 pixel at s = 1 to ``max_box`` at s = 0:
+``paper``: [DH04] section 4.3 to the letter. Clipped pixels are scaled by a factor that depends on "the average
+intensity of surrounding pixels", a, in a box around them, so that "the center of over-exposed regions will remain
+bright while the edges fade with the rest of the image" and "extreme darkening will eventually decimate the entire
+saturated region".
+The box grows linearly from 1 pixel at s = 1 to ``max_box`` at s = 0:
 
     size = 1 + (1 - s) (max_box - 1).
 
-The paper gives no formula for the factor. Here: w rises linearly from 0 where the box is half bright, as it is at the
-straight edge of a large region, to 1 where all of it is saturated; the factor goes from s to 1 with w, and no further
-than ``MAX_GAIN`` above s,
+The paper gives no formula for the factor, nor the largest box. Taken is: w rises linearly from 0 where the box is half
+bright, as it is at the straight edge of a large region, to 1 where all of it is saturated; the factor goes from s to 1
+with w,
 
-    w = clamp(2 a - 1, 0, 1),   factor = min(s + (1 - s) w, MAX_GAIN s).
+    w = clamp(2 a - 1, 0, 1),   factor = s + (1 - s) w.
 
-So s = 1 is the identity; a region smaller than half the box fades like the rest; s = 0 is black everywhere, as no
-light is. In other words factor / s is a guess of the clipped pixel's radiance; the bound of one stop keeps the guess
-near the likeliest values: in renderings and photographs of environments most clipped pixels lie less than one stop
-above clipping. It enters gradually from code ``KNEE`` up, so noise around clipping does not show, and the light is
-guessed before virtual light is added to it: that is known and needs no guess.
+So s = 1 is the identity, a region smaller than half the box fades like the rest, and where s is less than
+``LEAST_SCALE`` the factor falls to 0 with it. With w = a, the other simple
+reading (``paper_mean``), an edge would stay half bright and nothing would be decimated. It enters gradually from code
+``KNEE`` up, so noise around clipping does not show, and the light is guessed before virtual light is added to it: that
+is known and needs no guess. docs/paper.md compares the readings.
+
+``box``: the same, the factor no further than ``MAX_GAIN`` above s. Factor / s is a guess of the clipped pixel's
+radiance; the bound of one stop keeps the guess near the likeliest values: in renderings and photographs of environments
+most clipped pixels lie less than one stop above clipping. Here s = 0 is black everywhere, as no light is.
 
 A longer exposure, s > 1, is scaled and clipped: what a camera does.
 
@@ -71,13 +77,17 @@ from warp_ar.kernels.summed_area import box_mean
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("plain", "box", "declipped")
+METHODS = ("plain", "paper", "box", "declipped")
 """Cheapest first."""
+BOXES = ("paper", "paper_mean", "box")
+"""What looks at a box around clipped pixels: methods, and a reading of the paper that docs/paper.md compares."""
 
 MAX_BOX = 1.0 / 8.0
 """Side of the largest box in frame heights."""
 MAX_GAIN = wp.constant(wp.float32(2.0))
 """How far above clipping a clipped pixel is guessed at most: one stop."""
+LEAST_SCALE = wp.constant(wp.float32(1.0e-3))
+"""Scale below which the paper's factor falls to 0 too: without light there is no picture."""
 KNEE = wp.constant(wp.float32(250.0))
 """Code from which a pixel's darkest channel begins to count as clipped."""
 
@@ -103,14 +113,15 @@ NO_LAYERS = CompositeConfig()
 class ExposeConfig:
     """What is compiled into the kernel."""
 
-    method: Literal["plain", "box", "declipped"] = "plain"
+    method: Literal["plain", "paper", "paper_mean", "box", "declipped"] = "plain"
     """How clipped pixels darken."""
     layers: CompositeConfig = NO_LAYERS
     """What is composed before it is exposed."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ValueError(f"method: {self.method!r} is none of {', '.join(METHODS)}")
+        known = dict.fromkeys((*METHODS, *BOXES))
+        if self.method not in known:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
 
 
 @wp.func
@@ -134,6 +145,19 @@ def clipped_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
     w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
     # min(s + (1 - s) w, G s) / s with 1 / s bounded first, so that s = 0 is no division.
     return wp.min(1.0 + (1.0 / wp.max(scale, 1.0e-6) - 1.0) * w, MAX_GAIN)
+
+
+@wp.func
+def paper_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
+    """Factor / s of [DH04] section 4.3 for a box mean in 0..255 and a scale in 0..1."""
+    w = wp.clamp(2.0 / 255.0 * mean - 1.0, 0.0, 1.0)
+    return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * w
+
+
+@wp.func
+def paper_mean_gain(mean: wp.float32, scale: wp.float32) -> wp.float32:
+    """The same for the reading w = a."""
+    return 1.0 + (1.0 / wp.max(scale, LEAST_SCALE) - 1.0) * (mean / 255.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -237,6 +261,7 @@ def adapt_scale_kernel(
 def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
     """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
     read_layers = make_read_layers(config.layers)
+    box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(config.method, clipped_gain)
 
     @wp.func(module="unique")
     def exposed(
@@ -254,11 +279,12 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         codes: wp.array[wp.vec3ub],
     ) -> wp.vec3ub:
         gain = float(1.0)
-        if wp.static(config.method == "box"):
+        if wp.static(config.method in BOXES):
             least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
             if least > KNEE and s < 1.0:
                 clipped = (least - KNEE) / (255.0 - KNEE)
-                gain = 1.0 + clipped * (clipped_gain(surrounding_mean(table, i, j, s, max_box), s) - 1.0)
+                mean = surrounding_mean(table, i, j, s, max_box)
+                gain = 1.0 + clipped * (box_gain(mean, s) - 1.0)
         guessed = bool(gain != 1.0)
         if wp.static(config.method == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0

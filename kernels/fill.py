@@ -296,7 +296,8 @@ def push_pull(levels_out: wp.array, height: int, width: int, *, most: float = ma
         levels_out: As ``seed_fill`` left it; changed in place.
         height: Rows of level 0.
         width: Columns of level 0.
-        most: Radiance above which a texel counts as this much: what is unseen must not get a share of a lamp beside it.
+        most: Radiance above which a texel counts as this much: what is unseen must not get a share of an emitter beside
+        it.
     """
     shapes, offsets = fill_level_shapes(height, width), fill_level_offsets(height, width)
     device = levels_out.device

@@ -17,13 +17,13 @@ The column integrals for all m are Fourier sums of a row, the row integrals one 
 tables made once, in double precision. There is no quadrature error: a constant map has no coefficient but the first.
 Sums run in a fixed order (a tile per row, then a tile per coefficient): the same input gives the same bits.
 
-Positivity. A small lamp of flux F makes order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle: down to
+Positivity. A small emitter of flux F makes order-2 irradiance F (1/4 + x/2 + 5/32 (3 x^2 - 1)), x = cos angle: down to
 -0.04 F at x = -8/15. As in [Sloan17], the coefficients are smoothed by a window with the least strength s that leaves
 no negative direction, found from the minimum; one s for the three channels, so that no hue shifts; 0 where nothing is
 negative. The mean is untouched: energy is kept. The window of [Sloan17], 1 / (1 + s l^2 (l + 1)^2), needs w_2 = 0.13
-and w_1 = 0.57 for the lamp above. Errors in (w_1, w_2) cost (1 - w_1)^2 / 12 + (1 - w_2)^2 / 51 of F^2, and along the
-border of what is positive, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that is least at (0.86, 0.90). The family through that
-point and the identity is taken, with the mean as its limit:
+and w_1 = 0.57 for the emitter above. Errors in (w_1, w_2) cost (1 - w_1)^2 / 12 + (1 - w_2)^2 / 51 of F^2, and along
+the border of what is positive, w_1^2 = w_2 (1/4 - 5/32 w_2) 15/2, that is least at (0.86, 0.90). The family through
+that point and the identity is taken, with the mean as its limit:
 
     w_1 = 1 / (1 + s),  w_2 = 1 / (1 + 0.7 s).
 
@@ -48,8 +48,8 @@ and a box of that variance the half width h = sqrt(3 n'C n), so
 
     mean of max(x, 0) over [c - h, c + h] = (c + h)^2 / (4 h) for |c| < h,  c = n.m.
 
-Never negative, keeps the energy, does not jump as a lamp moves. With one texel to a block this is the reference: the
-texel's own extent is in C, so that a furnace stays white at any size.
+Never negative, keeps the energy, does not jump as an emitter moves. With one texel to a block this is the reference:
+the texel's own extent is in C, so that a furnace stays white at any size.
 
 References:
     [RH01] Ramamoorthi, Hanrahan 2001, An Efficient Representation for Irradiance Environment Maps.

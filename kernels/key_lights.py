@@ -11,8 +11,8 @@ A direction s dominates as far as the light's flow goes its way and no rival sta
 and the scalar irradiance phi = integral of L, a surface with normal n receives E(n) = phi / 4 + n . V / 2 to first
 order (the cosine lobe's first two bands, pi and 2 pi / 3), so facets toward and away from s differ by (E(s) - E(-s)) /
 (E(s) + E(-s)) = 2 V . s / phi: the contrast that relief shows. It is 0 in a uniform environment and between two equal
-opposite lights, 1 (held there) for a sun and still for a window that is half a black sky; a lamp that gives a share q
-of the light of an otherwise uniform environment has 2 q. Where two lights are of one strength, which is the brighter
+opposite lights, 1 (held there) for a sun and still for a window that is half a black sky; an emitter that gives a share
+q of the light of an otherwise uniform environment has 2 q. Where two lights are of one strength, which is the brighter
 is an accident of noise, and a picture that follows it would flicker; the directionality
 
     D_k = clamp(2 V . s_k / phi, 0, 1) * min over j of (1 - min(1, E_j / E_k) min(1, 2 (1 - s_j . s_k)) valley_jk)

@@ -28,6 +28,19 @@ They wait for memory most of their time. Left alone they take 120 to 255, with w
 one or two blocks of 256 threads; with three it has others to go on with, and gains more than spilling costs.
 """
 
+MAX_PARTIALS = 8
+"""Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""
+ENOUGH_THREADS = 1 << 20
+"""Threads from which more make a CUDA device slower: each finds the cell's point and picks its samples anew."""
+
+
+def count_partials(rows: int, columns: int, most: int = MAX_PARTIALS) -> int:
+    """Threads of a CUDA device per cell: as many as it takes to fill it, up to ``most``, a power of 2."""
+    partials = most
+    while partials > 1 and partials * rows * columns > ENOUGH_THREADS:
+        partials //= 2
+    return partials
+
 
 @dataclasses.dataclass(frozen=True)
 class Note:

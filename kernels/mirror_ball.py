@@ -24,8 +24,8 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
-from warp_ar.kernels.relight import Receiver, RelightConfig, make_lit_by
-from warp_ar.kernels.shade import Nearby, ShadeConfig, make_shade_hit
+from warp_ar.kernels.relight import Receiver, RelightConfig, make_direct_lighting
+from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
 from warp_ar.kernels.visibility import (
@@ -85,7 +85,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     closest_object, closest_proxy = trace.closest_object, trace.closest_proxy
     occluded_by_proxies = trace.occluded_by_proxies
     shade_hit = make_shade_hit(config.shade) if config.shade is not None else None
-    lit_by = make_lit_by(config.relight) if config.relight is not None else None
+    direct_lighting = make_direct_lighting(config.relight) if config.relight is not None else None
     find_in_frame = make_find_in_frame(config.trace, True)
     sample_direction = make_sample_direction(config.samples)
 
@@ -94,11 +94,10 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
         distant: DistantLight,
-        desk: Receiver,
+        receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
@@ -109,16 +108,16 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         if not inside_rect(i, j, params[0].ball_rect):
             return
         origin = params[0].camera_position
-        ray = rays[i, j]
-        seen = decode(desk.decode_table, desk.frame[i, j])
+        ray = receiver.picture.rays[i, j]
+        seen = decode(receiver.picture.decode_table, receiver.picture.frame[i, j])
         change = wp.vec3(0.0, 0.0, 0.0)
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
             direction = sample_direction(params, ray, sample)
-            ball = nearest_ball(desk.probes, origin, direction, FAR)
+            ball = nearest_ball(receiver.probes, origin, direction, FAR)
             if ball < 0:
                 continue
-            probe = desk.probes[ball]
+            probe = receiver.probes[ball]
             t = intersect_sphere(probe.radius, origin - probe.center, direction, FAR)
             # Back onto the ball: what a far camera adds to the error of t ends here.
             normal = wp.normalize(origin - probe.center + t * direction)
@@ -127,39 +126,31 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             if occluded_by_proxies(scene, origin, direction, t):
                 continue
             point = probe.center + probe.radius * normal
-            outward = reflect(-wp.normalize(direction), normal)
+            wi = reflect(-wp.normalize(direction), normal)
             error = ROUNDING * (8.0 * wp.max(wp.abs(point)) + 32.0 * probe.radius)
-            start = offset_origin(point, normal, outward, error)
-            surface = closest_proxy(scene, start, outward, FAR)
+            start = offset_origin(point, normal, wi, error)
+            surface = closest_proxy(scene, start, wi, FAR)
             reach = surface.t
             if wp.static(config.shade is not None):
-                item = closest_object(scene, start, outward, reach)
+                item = closest_object(scene, start, wi, reach)
                 reach = item.t
-            if nearest_ball(desk.probes, start, outward, reach) >= 0:
+            if nearest_ball(receiver.probes, start, wi, reach) >= 0:
                 continue
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
             if wp.static(config.shade is not None):
                 if item.shape >= 0:
-                    radiance = shade_hit(scene, lights, distant, item, outward, Nearby(), tile_turn(i, j))
+                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j))
                     change += wp.cw_mul(rho, radiance) - seen
                     continue
-            if surface.shape < 0 or wp.dot(surface.geometric_normal, outward) >= 0.0:
+            if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
                 continue
             if wp.static(config.ratio):
                 if shadow_ratio.shape[0] > 0:
-                    at = find_in_frame(
-                        params[0],
-                        desk.frame.shape[0],
-                        desk.frame.shape[1],
-                        scene,
-                        desk.probes,
-                        surface.point,
-                        surface.geometric_normal,
-                    )
+                    at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
                     if at[0] >= 0.0:
                         change += wp.cw_mul(seen, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
             if wp.static(config.relight is not None):
-                lit = lit_by(scene, lights, desk, surface, i, j, rho, tile_turn(i, j))
+                lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
                 change += wp.cw_mul(rho, lit.added)
         mirrored_out[i, j] = change / wp.static(float(config.samples))
 
@@ -169,11 +160,10 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
 def mirror_ball(
     config: MirrorBallConfig,
     params: wp.array,
-    rays: wp.array,
     scene: RayScene,
     lights: wp.array | None,
     distant: DistantLight,
-    desk: Receiver,
+    receiver: Receiver,
     shadow_ratio: wp.array | None,
     mirrored_out: wp.array,
     *,
@@ -184,19 +174,19 @@ def mirror_ball(
     Args:
         config: What the scene calls for; what it leaves out may be None.
         params: (1,) FrameParams: camera and ball_rect.
-        rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
         scene: Objects and proxies.
         lights: (n,) Light.
         distant: The environment, as ``shade`` reads it; empty if ``config.shade`` is None.
-        desk: From ``make_receiver``; frame, decode table and probes are always needed.
+        receiver: From ``make_receiver``; picture and probes are always needed.
         shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
         rows: Band of rows; None means all.
     """
+    rays = receiver.picture.rays
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [params, rays, scene, lights, distant, desk, shadow_ratio],
+        [params, scene, lights, distant, receiver, shadow_ratio],
         [mirrored_out],
         rows=rows,
         device=rays.device,

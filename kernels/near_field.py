@@ -29,7 +29,7 @@ angle between h and n, which is 1 / alpha at the peak, where a lobe's n-th has t
 
     | width = 2 / (k sqrt n) |,    Phong: 2 alpha / sqrt(n cos^e), e its exponent.
 
-With one width for all, the few rays in the long tails of GGX would show lamps as squares of a tile's size.
+With one width for all, the few rays in the long tails of GGX would show emitters as squares of a tile's size.
 
 Both are averaged over one tile's worth of neighbours on the same object whose normals agree, as ``environment_shadow``
 does; mirrors are not.
@@ -54,7 +54,7 @@ from warp_ar.kernels.reflect import (
     DistantLightConfig,
     look_up,
     make_find_in_frame,
-    make_mirrored,
+    make_reflected_radiance,
     make_shade_unoccluded,
 )
 from warp_ar.kernels.sampling import (
@@ -63,10 +63,10 @@ from warp_ar.kernels.sampling import (
     sample_ggx_visible,
     sample_phong_lobe,
 )
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, RayScene
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Picture, RayScene
 from warp_ar.kernels.visibility import (
     FAR,
-    Hit,
+    VisibleObjects,
     inside_rect,
     make_primary,
     make_sample_direction,
@@ -107,6 +107,23 @@ class NearFieldConfig:
     """Whether virtual lights light the receiver."""
 
 
+@wp.struct
+class ReceiverLayers:
+    """What virtual objects and lights change in the picture of the receiver; empty where nothing does."""
+
+    shadow_ratio: wp.array2d[wp.vec3]  # factor on the frame
+    added: wp.array2d[wp.vec3]  # radiance of virtual light
+
+
+@wp.struct
+class NearLight:
+    """What reaches the pixels of objects from near by; empty where no material asks for it."""
+
+    irradiance: wp.array2d[wp.vec3]
+    reflected: wp.array2d[wp.vec4]  # premultiplied near radiance, and its share of the rays
+    transmitted: wp.array2d[wp.vec4]  # the environment along rays that pass the near field, and its brightness on all
+
+
 @wp.func
 def lobe_alpha(model: wp.int32, roughness: wp.float32, shininess: wp.float32) -> wp.float32:
     """Width of a surface's lobe; 0 for a mirror."""
@@ -144,10 +161,8 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
     @wp.func(module="unique")
     def look_near(
         params: FrameParams,
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
-        shadow_ratio: wp.array2d[wp.vec3],
-        physical_added: wp.array2d[wp.vec3],
+        picture: Picture,
+        layers: ReceiverLayers,
         scene: RayScene,
         distant: DistantLight,
         origin: wp.vec3,
@@ -157,19 +172,17 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
         other = closest_object(scene, origin, direction, t_max)
         proxy = closest_proxy(scene, origin, direction, other.t)
         if proxy.shape >= 0:
-            height = frame.shape[0]
-            width = frame.shape[1]
-            at = find_in_frame(params, height, width, scene, distant.probes, proxy.point, proxy.geometric_normal)
+            at = find_in_frame(params, picture, scene, distant.probes, proxy)
             if at[0] < 0.0:
                 return wp.vec4(0.0)
-            radiance = look_up(frame, decode_table, at[0], at[1])
+            radiance = look_up(picture, at[0], at[1])
             row = wp.int32(at[1] + 0.5)
             column = wp.int32(at[0] + 0.5)
             if wp.static(config.ratio):
-                radiance = wp.cw_mul(radiance, shadow_ratio[row, column])
+                radiance = wp.cw_mul(radiance, layers.shadow_ratio[row, column])
             if wp.static(config.added):
                 if inside_rect(row, column, params.light_rect):
-                    radiance += physical_added[row, column]
+                    radiance += layers.added[row, column]
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         if other.shape >= 0:
             radiance = shade_unoccluded(scene, distant, other, direction)
@@ -186,17 +199,15 @@ def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
     Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
     """
     look_near = make_look_near(config)
-    distant_mirrored = make_mirrored(config.distant)
+    reflected_radiance = make_reflected_radiance(config.distant)
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
     @wp.func(module="unique")
     def mirror_pixel(
         params: wp.array[FrameParams],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
-        shadow_ratio: wp.array2d[wp.vec3],
-        physical_added: wp.array2d[wp.vec3],
+        picture: Picture,
+        layers: ReceiverLayers,
         scene: RayScene,
         distant: DistantLight,
         surface: Surface,
@@ -211,24 +222,13 @@ def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
                 geometric = seen.geometric_normal
                 if wp.dot(geometric, direction) > 0.0:
                     geometric = -geometric
-                outward = reflect(-direction, seen.normal)
-                if wp.dot(outward, geometric) > 0.0:
-                    origin = offset_origin(seen.point, geometric, outward, seen.error)
-                    shown = look_near(
-                        params[0],
-                        frame,
-                        decode_table,
-                        shadow_ratio,
-                        physical_added,
-                        scene,
-                        distant,
-                        origin,
-                        outward,
-                        FAR,
-                    )
+                wi = reflect(-direction, seen.normal)
+                if wp.dot(wi, geometric) > 0.0:
+                    origin = offset_origin(seen.point, geometric, wi, seen.error)
+                    shown = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR)
                     if shown[3] <= 0.0:
-                        beyond = distant_mirrored(
-                            distant, surface.model, surface.roughness, surface.shininess, seen.point, outward, 0.0
+                        beyond = reflected_radiance(
+                            distant, surface.model, surface.roughness, surface.shininess, seen.point, wi, 0.0
                         )
                         shown = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
                     total += shown
@@ -251,30 +251,23 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         row_start: wp.int32,
         # In:
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
-        shadow_ratio: wp.array2d[wp.vec3],
-        physical_added: wp.array2d[wp.vec3],
+        picture: Picture,
+        layers: ReceiverLayers,
         scene: RayScene,
         distant: DistantLight,
         samples: wp.array[EnvironmentSample],
-        stride: wp.int32,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
+        visible: VisibleObjects,
         # Out:
-        irradiance_out: wp.array2d[wp.vec3],
-        mirrored_out: wp.array2d[wp.vec4],
-        passed_out: wp.array2d[wp.vec4],
+        near_out: NearLight,
     ):
         i, j = wp.tid()
         i += row_start
         if not inside_rect(i, j, params[0].object_rect):
             return
-        if hit_object[i, j] < 0:
+        if visible.objects[i, j] < 0:
             return
-        hit = hits[i, j]
-        ray = rays[i, j]
+        hit = visible.hits[i, j]
+        ray = picture.rays[i, j]
         direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
         wo = -direction
         normal = hit.normal
@@ -289,6 +282,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         if wp.static(config.distant.diffuse != "none"):
             total = wp.vec3(0.0)
             if surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2] > 0.0:
+                stride = samples.shape[0] / wp.static(side * side)
                 first = set_index * stride
                 # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part
                 # of it is a smaller set.
@@ -303,43 +297,22 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                             radiance = wp.vec3(0.0)
                         else:
                             origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
-                            near = look_near(
-                                params[0],
-                                frame,
-                                decode_table,
-                                shadow_ratio,
-                                physical_added,
-                                scene,
-                                distant,
-                                origin,
-                                toward.direction,
-                                toward.distance,
-                            )
+                            wi = toward.direction
+                            near = look_near(params[0], picture, layers, scene, distant, origin, wi, toward.distance)
                             if near[3] > 0.0:
                                 radiance = wp.vec3(near[0], near[1], near[2])
                         total += share * cosine * toward.measure * radiance
-            irradiance_out[i, j] = total
+            near_out.irradiance[i, j] = total
 
         if wp.static(config.distant.specular):
-            mirrored = wp.vec4(0.0)
-            passed = wp.vec4(0.0)
+            reflected = wp.vec4(0.0)
+            transmitted = wp.vec4(0.0)
             leaving = float(0.0)  # rays; those into the surface are part of its reflectance
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
                 alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
                 if wp.static(config.mirror_samples > 0):
                     if alpha < SHARP:
-                        mirrored = mirror_pixel(
-                            params,
-                            frame,
-                            decode_table,
-                            shadow_ratio,
-                            physical_added,
-                            scene,
-                            distant,
-                            surface,
-                            hit.shape,
-                            ray,
-                        )
+                        reflected = mirror_pixel(params, picture, layers, scene, distant, surface, hit.shape, ray)
                 if wp.static(lobes > 0):
                     if alpha >= SHARP:
                         basis = frame_from_normal(normal)
@@ -349,42 +322,31 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                             shift = wp.static(0.5 / (max(lobes, 1) * side * side))
                             u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
                             if surface.model == PHONG:
-                                outward = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
-                                width = phong_ray_width(wp.dot(outward, center), surface.shininess, alpha)
+                                wi = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+                                width = phong_ray_width(wp.dot(wi, center), surface.shininess, alpha)
                             else:
                                 half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
-                                outward = reflect(wo, half)
+                                wi = reflect(wo, half)
                                 width = ggx_ray_width(wp.dot(half, normal), alpha)
-                            if wp.dot(outward, geometric) > 0.0:
-                                origin = offset_origin(hit.point, geometric, outward, hit.error)
-                                near = look_near(
-                                    params[0],
-                                    frame,
-                                    decode_table,
-                                    shadow_ratio,
-                                    physical_added,
-                                    scene,
-                                    distant,
-                                    origin,
-                                    outward,
-                                    FAR,
-                                )
+                            if wp.dot(wi, geometric) > 0.0:
+                                origin = offset_origin(hit.point, geometric, wi, hit.error)
+                                near = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR)
                                 leaving += 1.0
-                                mirrored += near
+                                reflected += near
                                 level = level_from_alpha(
                                     wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width,
                                     distant.level_height,
                                 )
-                                turned = outward
-                                if wp.static(config.distant.lamps):
-                                    turned = correct_parallax(distant.lamps, hit.point, outward)
+                                turned = wi
+                                if wp.static(config.distant.emitters):
+                                    turned = correct_parallax(distant.emitters, hit.point, wi)
                                 beyond = sample_levels(distant.levels, turned, level, distant.level_height)
                                 missed = (1.0 - near[3]) * beyond
-                                passed += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
-                mirrored = mirrored / wp.max(leaving, 1.0)
-                passed = passed / wp.max(leaving, 1.0)
-            mirrored_out[i, j] = mirrored
-            passed_out[i, j] = passed
+                                transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
+                reflected = reflected / wp.max(leaving, 1.0)
+                transmitted = transmitted / wp.max(leaving, 1.0)
+            near_out.reflected[i, j] = reflected
+            near_out.transmitted[i, j] = transmitted
 
     return near_field_kernel
 
@@ -400,21 +362,19 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         # In:
         params: wp.array[FrameParams],
         scene: RayScene,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
-        irradiance: wp.array2d[wp.vec3],
-        mirrored: wp.array2d[wp.vec4],
-        passed: wp.array2d[wp.vec4],
+        visible: VisibleObjects,
+        estimate: NearLight,
         # Out:
-        irradiance_out: wp.array2d[wp.vec3],
-        mirrored_out: wp.array2d[wp.vec4],
+        near_out: NearLight,
     ):
         i, j = wp.tid()
         i += row_start
         rect = params[0].object_rect
         if not inside_rect(i, j, rect):
             return
-        found = hit_object[i, j]
+        objects = visible.objects
+        hits = visible.hits
+        found = objects[i, j]
         if found < 0:
             return
         normal = hits[i, j].normal
@@ -428,20 +388,20 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         for a in range(-reach, reach + 1):
             for b in range(-reach, reach + 1):
                 if inside_rect(i + a, j + b, rect):
-                    if hit_object[i + a, j + b] == found and wp.dot(hits[i + a, j + b].normal, normal) > SAME_NORMAL:
+                    if objects[i + a, j + b] == found and wp.dot(hits[i + a, j + b].normal, normal) > SAME_NORMAL:
                         weight = wp.where(a == reach or a == -reach, 0.5, 1.0)
                         weight *= wp.where(b == reach or b == -reach, 0.5, 1.0)
                         weights += weight
                         if wp.static(config.distant.diffuse != "none"):
-                            light += weight * irradiance[i + a, j + b]
+                            light += weight * estimate.irradiance[i + a, j + b]
                         if wp.static(config.distant.specular):
-                            glossy += weight * mirrored[i + a, j + b]
-                            distant += weight * passed[i + a, j + b]
+                            glossy += weight * estimate.reflected[i + a, j + b]
+                            distant += weight * estimate.transmitted[i + a, j + b]
         if wp.static(config.distant.diffuse != "none"):
-            irradiance_out[i, j] = light / weights
+            near_out.irradiance[i, j] = light / weights
         if wp.static(config.distant.specular):
             if sharp:
-                mirrored_out[i, j] = mirrored[i, j]
+                near_out.reflected[i, j] = estimate.reflected[i, j]
                 return
             near = glossy / weights
             distant = distant / weights
@@ -452,72 +412,45 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
             for channel in range(3):
                 near[channel] += near[3] * distant[channel]
             near[3] = 1.0 - left
-            mirrored_out[i, j] = near
+            near_out.reflected[i, j] = near
 
     return filter_near_field_kernel
 
 
-def light_objects(
+def estimate_near_field(
     config: NearFieldConfig,
     params: wp.array[FrameParams],
-    rays: wp.array2d[wp.vec2],
-    frame: wp.array2d[wp.vec3ub],
-    decode_table: wp.array[wp.vec3],
-    shadow_ratio: wp.array2d[wp.vec3] | None,
-    physical_added: wp.array2d[wp.vec3] | None,
+    picture: Picture,
+    layers: ReceiverLayers,
     scene: RayScene,
     distant: DistantLight,
     samples: wp.array[EnvironmentSample] | None,
-    hit_object: wp.array2d[wp.int32],
-    hits: wp.array2d[Hit],
-    irradiance_out: wp.array2d[wp.vec3] | None,
-    mirrored_out: wp.array2d[wp.vec4] | None,
-    passed_out: wp.array2d[wp.vec4] | None,
+    visible: VisibleObjects,
+    near_out: NearLight,
     *,
     rows: Rows | None = None,
 ) -> None:
     """Estimate what surrounds the objects, each pixel with one set of samples.
 
     Args:
-        config: What the scene calls for; what it leaves out may be None.
+        config: What the scene calls for; what it leaves out may be None, or empty in a struct.
         params: (1,) FrameParams: camera, object_rect and light_rect.
-        rays: (H, W) undistorted (x / z, y / z) of each pixel's centre.
-        frame: (H, W) the camera's frame, RGB.
-        decode_table: (256,) of ``color.decode_table``.
-        shadow_ratio: (H, W) factor on the frame.
-        physical_added: (H, W) virtual light on the receiver.
+        picture: (H, W) the camera's.
+        layers: (H, W) what virtual objects and lights change in it.
         scene: Objects and proxies.
         distant: The environment.
         samples: Samples of the environment, set after set.
-        hit_object: (H, W) as ``trace_pixels`` writes.
-        hits: (H, W) likewise.
-        irradiance_out: (H, W) irradiance; written only where an object is seen.
-        mirrored_out: (H, W) premultiplied near radiance and its share of the rays; likewise.
-        passed_out: (H, W) of glossy lobes: the environment along rays that meet nothing near, and its brightness along
-            all of them.
+        visible: (H, W) as ``trace_pixels`` writes.
+        near_out: (H, W) estimates of single pixels; written only where an object is visible.
         rows: Band of rows; None means all.
     """
-    stride = 0 if samples is None else samples.shape[0] // config.side**2
     launch_rows(
         make_near_field_kernel(config),
-        rays.shape,
-        [
-            params,
-            rays,
-            frame,
-            decode_table,
-            shadow_ratio,
-            physical_added,
-            scene,
-            distant,
-            samples,
-            stride,
-            hit_object,
-            hits,
-        ],
-        [irradiance_out, mirrored_out, passed_out],
+        picture.rays.shape,
+        [params, picture, layers, scene, distant, samples, visible],
+        [near_out],
         rows=rows,
-        device=rays.device,
+        device=picture.rays.device,
     )
 
 
@@ -525,25 +458,22 @@ def filter_near_field(
     config: NearFieldConfig,
     params: wp.array[FrameParams],
     scene: RayScene,
-    hit_object: wp.array2d[wp.int32],
-    hits: wp.array2d[Hit],
-    irradiance: wp.array2d[wp.vec3] | None,
-    mirrored: wp.array2d[wp.vec4] | None,
-    passed: wp.array2d[wp.vec4] | None,
-    irradiance_out: wp.array2d[wp.vec3] | None,
-    mirrored_out: wp.array2d[wp.vec4] | None,
+    visible: VisibleObjects,
+    estimate: NearLight,
+    near_out: NearLight,
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Average the estimates over tiles, along objects only; arguments as ``light_objects``.
+    """Average the estimates over tiles, along objects only; arguments as those of ``estimate_near_field``.
 
-    The last of ``mirrored_out`` is the share of the prefiltered environment that ``shade`` leaves out.
+    Of ``near_out``, irradiance and reflected are written; the last of reflected becomes the share of the prefiltered
+    environment that ``shade`` leaves out.
     """
     launch_rows(
         make_filter_kernel(config),
-        hit_object.shape,
-        [params, scene, hit_object, hits, irradiance, mirrored, passed],
-        [irradiance_out, mirrored_out],
+        visible.objects.shape,
+        [params, scene, visible, estimate],
+        [near_out],
         rows=rows,
-        device=hit_object.device,
+        device=visible.objects.device,
     )

@@ -7,7 +7,7 @@ Levels. Level 0 is the environment itself (a mirror). Level l >= 1 holds the env
 L such that the narrowest is about three texels of the map wide (full width at half maximum). Between levels,
 ``level_from_alpha`` is linear in log2 alpha: that lies between the blend with the least squared error and the one with
 the best encircled energy, for both lobes and all widths. A wider lobe needs fewer texels: level l has (H >> s, 2 H >>
-s) with s = max(l - 2, 0), which leaves eight texels per unit of alpha, bilinear error below 2 % of a single lamp's
+s) with s = max(l - 2, 0), which leaves eight texels per unit of alpha, bilinear error below 2 % of a single emitter's
 peak. All levels lie in one packed ``wp.array[wp.vec3]``, row-major, one after another.
 
 Lobes, about the mirror direction R, cos theta = R.w, each normalised by its own sum so that a constant environment
@@ -76,7 +76,7 @@ BLOCK = 64
 LARGE_LEVELS = wp.constant(3)
 """Levels that have as many texels as the environment, if there are so many at all."""
 # How much coarser a level of the pyramid is read than the bare share of a sample asks for: samples then overlap, as
-# [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small lamps, by error against brute force.
+# [KC08] advise. Between 0, best for smooth skies, and 0.5, best for small emitters, by error against brute force.
 SAMPLE_BIAS = 0.25
 # An energy correction beyond this factor would be a fault, not a correction.
 MAX_CORRECTION = wp.constant(wp.float32(4.0))

@@ -4,7 +4,7 @@ The real desk is known twice: as part of the environment, seen from the mirror b
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
-Lamps of the environment that are known by their places are seen, and light objects, from there (see ``lamps``).
+Emitters of the environment that are known by their places are seen, and light objects, from there (see ``emitters``).
 """
 
 from __future__ import annotations
@@ -17,12 +17,22 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode
-from warp_ar.kernels.emitters import add_nearness, correct_parallax
+from warp_ar.kernels.emitters import add_emitters, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Emitter, FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    METALLIC_ROUGHNESS,
+    MIRROR,
+    PHONG,
+    Emitter,
+    FrameParams,
+    Picture,
+    Probe,
+    RayScene,
+)
 from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace, meets_probe
 
 wp.set_module_options({"enable_backward": False})
@@ -49,8 +59,8 @@ class DistantLightConfig:
     """Whether the prefiltered environment is read."""
     probes: bool
     """Whether there are mirror balls, which hide the receiver."""
-    lamps: bool = False
-    """Whether lamps of the environment are known by their places."""
+    emitters: bool = False
+    """Whether emitters of the environment are known by their places."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
         """For any scene with as many mirror balls: forms that it does not call for may then be empty.
@@ -60,7 +70,7 @@ class DistantLightConfig:
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
         diffuse: DiffuseForm = form if self.probes else "none"
-        return DistantLightConfig(self.trace.general(), models, True, diffuse, self.probes, self.probes, self.lamps)
+        return DistantLightConfig(self.trace.general(), models, True, diffuse, self.probes, self.probes, self.emitters)
 
 
 @wp.struct
@@ -74,12 +84,14 @@ class DistantLight:
     level_height: wp.int32  # rows of level 0
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``, for METALLIC_ROUGHNESS
     probes: wp.array[Probe]
-    lamps: wp.array[Emitter]
+    emitters: wp.array[Emitter]
 
 
 @wp.func
-def look_up(frame: wp.array2d[wp.vec3ub], decode_table: wp.array[wp.vec3], x: wp.float32, y: wp.float32) -> wp.vec3:
+def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
     """Bilinear sample of a frame's linear radiance; x and y are inside the outermost pixel centres."""
+    frame = picture.frame
+    decode_table = picture.decode_table
     j = wp.min(wp.int32(x), frame.shape[1] - 2)
     i = wp.min(wp.int32(y), frame.shape[0] - 2)
     fx = x - wp.float32(j)
@@ -115,22 +127,18 @@ def knows_levels(distant: DistantLight) -> wp.bool:
 
 @functools.cache
 def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
-    """``find_in_frame(params, height, width, scene, probes, point, geometric_normal) -> vec2``: (x, y), or x = -1."""
+    """``find_in_frame(params, picture, scene, probes, hit) -> vec2``: (x, y) of a point of a proxy, or x = -1."""
     occluded_by_proxies = make_trace(trace).occluded_by_proxies
 
     @wp.func(module="unique")
     def find_in_frame(
-        params: FrameParams,
-        height: wp.int32,
-        width: wp.int32,
-        scene: RayScene,
-        balls: wp.array[Probe],
-        point: wp.vec3,
-        geometric_normal: wp.vec3,
+        params: FrameParams, picture: Picture, scene: RayScene, balls: wp.array[Probe], hit: Hit
     ) -> wp.vec2:
         nowhere = wp.vec2(-1.0, -1.0)
-        from_camera = point - params.camera_position
-        if wp.dot(from_camera, geometric_normal) >= 0.0:
+        height = picture.frame.shape[0]
+        width = picture.frame.shape[1]
+        from_camera = hit.point - params.camera_position
+        if wp.dot(from_camera, hit.geometric_normal) >= 0.0:
             return nowhere
         at = project(params, from_camera)
         if at[2] <= 0.0:
@@ -149,9 +157,9 @@ def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
 
 @functools.cache
 def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
-    """``shade_unoccluded(scene, environment, hit, direction) -> vec3``: radiance under the environment alone."""
+    """``shade_unoccluded(scene, distant, hit, direction) -> vec3``: radiance under the environment alone."""
     surface_at = make_surface(config.models, config.textures)
-    glossy = make_mirrored(config)
+    glossy = make_reflected_radiance(config)
     distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
@@ -166,9 +174,9 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
         radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
         if wp.static(config.specular):
             if knows_levels(distant):
-                outward = reflect(wo, normal)
-                mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
-                radiance += wp.cw_mul(surface.reflectance, mirrored)
+                wi = reflect(wo, normal)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                radiance += wp.cw_mul(surface.reflectance, reflected)
         return radiance
 
     return shade_unoccluded
@@ -176,7 +184,7 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
 
 @functools.cache
 def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
-    """``distant_irradiance(environment, point, normal) -> vec3``: under the environment; 0 if none is known."""
+    """``distant_irradiance(distant, point, normal) -> vec3``: under the environment; 0 if none is known."""
 
     @wp.func(module="unique")
     def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
@@ -187,23 +195,23 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
                     irradiance = sh_irradiance(distant.irradiance_sh, normal)
                 if wp.static(config.diffuse == "map"):
                     irradiance = sample_latlong(distant.irradiance_map, normal)
-                if wp.static(config.lamps):
-                    irradiance = add_nearness(irradiance, distant.lamps, point, normal)
+                if wp.static(config.emitters):
+                    irradiance = add_emitters(irradiance, distant.emitters, point, normal)
         return irradiance
 
     return distant_irradiance
 
 
 @functools.cache
-def make_mirrored(config: DistantLightConfig) -> wp.Function:
-    """``mirrored(environment, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
+def make_reflected_radiance(config: DistantLightConfig) -> wp.Function:
+    """``reflected_radiance(distant, model, roughness, shininess, point, direction, floor) -> vec3``: as a lobe sees it.
 
     The lobe is that of a surface at ``point``, around ``direction`` (unit). ``floor`` is the least level to read: 0 for
     what is looked at, more for what is only one ray of many.
     """
 
     @wp.func(module="unique")
-    def mirrored(
+    def reflected_radiance(
         distant: DistantLight,
         model: wp.int32,
         roughness: wp.float32,
@@ -213,8 +221,8 @@ def make_mirrored(config: DistantLightConfig) -> wp.Function:
         floor: wp.float32,
     ) -> wp.vec3:
         toward = direction
-        if wp.static(config.lamps):
-            toward = correct_parallax(distant.lamps, point, direction)
+        if wp.static(config.emitters):
+            toward = correct_parallax(distant.emitters, point, direction)
         level = level_from_roughness(roughness, distant.level_height)
         if wp.static(PHONG in config.models):
             if model == PHONG:
@@ -224,4 +232,4 @@ def make_mirrored(config: DistantLightConfig) -> wp.Function:
                 level = 0.0
         return sample_levels(distant.levels, toward, wp.max(level, floor), distant.level_height)
 
-    return mirrored
+    return reflected_radiance

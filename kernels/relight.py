@@ -9,17 +9,25 @@ What Kd and the response are makes the methods, with N.L = max(normal . wi, 0):
 
 ``flat``: what plain alpha blending of a lit proxy does. Kd is a grey constant, response = N.L.
 
-``paper``: [DH04] section 4.2 to the letter. The *additive factor* is N.L, the *multiplicative factor* m the frame's
-intensity, alpha the dot product of the virtual light's direction and the brightest physical direction. The text asks
-for m at alpha = 1, for the additive factor at 0 and for the inverse of m at -1; the printed shader's lerp, (1 -
-alpha) N.L + alpha m, gives 2 N.L - m at -1: weight two for the flat term and a light twice as bright, which the text
-does not mean. The text's three cases are met, continuously, by weighting with |alpha|:
+``paper``: [DH04] section 4.2 to the letter. The *additive factor* is N.L, the *multiplicative factor* m the intensity
+of the video, and alpha "the dot product of the virtual light vector and the brightest physical lighting vector". "When
+the dot product is close to one, most of the contribution is from the multiplicative factor, when it is close to zero,
+the contribution is from the additive factor, and when it is negative one, the inverse of the multiplicative factor is
+used":
 
     response = (1 - |alpha|) N.L + |alpha| (m if alpha > 0 else 1 - m).                                            (1)
 
-``relief``: (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark desk and
-shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes the pixel's
-luminance over that of its surroundings (a box of the frame's summed-area table) and multiplies N.L. A desk without
+What the text leaves open is a ``Reading``. Taken are: m in video values, the codes that the shader samples over 255,
+for no camera's curve is mentioned; the three cases of the text above the printed shader's lerp, (1 - alpha) N.L +
+alpha m, which gives 2 N.L - m at -1; and alpha as it is, for the remark of section 4.4 that several lights end as plain
+blending is an observation, not a step of the shader. docs/paper.md says what the other readings give.
+
+``directional``: (1) with the frame's linear luminance for m, and alpha times the directionality of the environment's
+dominant light: where the light is ambient, or comes from rivals, it says nothing about bumps and ``flat`` remains.
+
+``relief``: (1) with the multiplicative factor made relative. The raw intensity makes a light weak on a dark receiver
+and shines on faces that are turned away from it; what the paper wants from m is its *pattern*. So m becomes the pixel's
+luminance over that of its surroundings (a box of the frame's summed-area table) and multiplies N.L. A receiver without
 structure has m = 1, and gives what ``flat`` gives, for every alpha. The inverse: a bump that tilts the surface by a
 small angle along the physical light changes its shading to 1 + e; seen from the opposite side it is 1 - e = 2 - m, to
 first order, which also keeps the mean over the surroundings. With it (1) is
@@ -33,8 +41,8 @@ receiver's reflectance if white paper were just below clipping.
 
     rho = pi L / E_environment(normal),                                                                        (3)
 
-which is (exactly) right for a Lambertian desk, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane where
-the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower bound.
+which is (exactly) right for a Lambertian receiver, whatever its pattern. A prior of ``PRIOR_WEIGHT`` keeps (3) sane
+where the environment is dark, and no reflectance exceeds 1; a clipped channel gives what its code says, a lower bound.
 Shading by relief is in rho as well, as if it were paint. Moderate deviations e from the surroundings are taken for
 relief (beyond ``RELIEF_LIMIT`` they are paint: print, other objects), as far as the environment has a direction, and
 are turned to the virtual light:
@@ -46,10 +54,10 @@ the irradiance by virtual light that lit proxies send to each other is added to 
 
     added += Kd / pi * E_bounced.                                                                                  (5)
 
-Where the environment is ambient its light says nothing about bumps: alpha in (1) and (2) is multiplied by the key
-light's directionality.
+Where the environment is ambient its light says nothing about bumps: alpha in (2), and in (1) for ``directional``, is
+multiplied by the key light's directionality.
 
-Edges. A lamp without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
+Edges. A light without size has shadows without penumbra. Where a neighbour sees another surface and one of the two is
 lit, or something else hides lights from it, the pixel is traced again with n^2 samples and averaged, as ``shade`` does
 along outlines; what the camera's pixel says of the receiver holds for all of them.
 
@@ -62,19 +70,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import warp as wp
 
+from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
 from warp_ar.kernels.color import decode, luminance
-from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
-from warp_ar.kernels.emitters import add_nearness
+from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
-from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Probe, RayScene
-from warp_ar.kernels.summed_area import box_mean
+from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
+from warp_ar.kernels.summed_area import box_mean, intensity
 from warp_ar.kernels.visibility import (
     FAR,
     Hit,
@@ -89,19 +100,43 @@ from warp_ar.kernels.visibility import (
 
 wp.set_module_options({"enable_backward": False})
 
-METHODS = ("flat", "paper", "relief", "reflectance")
+METHODS = ("flat", "paper", "directional", "relief", "reflectance")
 """Cheapest first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How equation (1) takes what the paper's text leaves open; the defaults are the letter of the text."""
+
+    values: Literal["video", "linear"] = "video"
+    """Of the multiplicative factor: codes over 255 as the shader samples them, or linear luminance."""
+    blend: Literal["text", "shader"] = "text"
+    """The three cases of the text, or the printed shader's lerp, which differs where alpha is negative."""
+    weighted: bool = False
+    """Whether alpha is multiplied by the directionality of the environment's light (section 4.4)."""
+
+
+READINGS: Mapping[str, Reading] = MappingProxyType(
+    {
+        "paper": Reading(),
+        "directional": Reading("linear", weighted=True),
+        "paper_linear": Reading("linear"),
+        "paper_shader": Reading(blend="shader"),
+        "paper_weighted": Reading(weighted=True),
+    }
+)
+"""Ways to take equation (1), by name: the two methods, and readings that docs/paper.md compares with ``paper``."""
 
 DEFAULT_REFLECTANCE = wp.constant(wp.float32(0.5))
 """Of a receiver that nothing is known about: the material of ``flat`` and ``paper``, the prior of ``reflectance``."""
 PRIOR_WEIGHT = wp.constant(wp.float32(0.002 * math.pi))
-"""Irradiance at which the prior counts as much as the frame: that of a white desk at half a code of 255."""
+"""Irradiance at which the prior counts as much as the frame: that of a white receiver at half a code of 255."""
 RELIEF_LIMIT = wp.constant(wp.float32(0.6))
 """Relative deviation from the surroundings from which structure is paint, not relief."""
 MAX_RELIEF = wp.constant(wp.float32(4.0))
 """Largest m: a glint of the receiver is no reason to add more than four times the light."""
 SURROUNDINGS = 1.0 / 8.0
-"""Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a lamp's falloff."""
+"""Side of the box of a pixel's surroundings, in frame heights: larger than a wire, smaller than a light's falloff."""
 _HUE_FLOOR = wp.constant(wp.float32(0.01))  # linear; noise in dark pixels has no hue
 _INV_PI = wp.constant(wp.float32(1.0 / math.pi))
 _MASKED = 8
@@ -117,8 +152,8 @@ _BALL = wp.constant(-2 << (_MASKED + 1))
 class RelightConfig:
     """What is compiled into the kernel."""
 
-    method: Literal["flat", "paper", "relief", "reflectance"]
-    """How the receiver responds."""
+    method: str
+    """How the receiver responds: one of ``METHODS`` or ``READINGS``."""
     trace: TraceConfig
     """Kinds of shape in the scene."""
     irradiance: Literal["sh", "map"] = "sh"
@@ -127,9 +162,9 @@ class RelightConfig:
     """Whether there are mirror balls, which hide the receiver and throw shadows of virtual light."""
     soft: bool = False
     """Whether lights with a radius cast soft shadows; those of mirror balls stay hard."""
-    lamps: bool = False
-    """Whether ``reflectance`` knows lamps of the environment by their places."""
-    share: bool = False
+    emitters: bool = False
+    """Whether ``reflectance`` knows emitters of the environment by their places."""
+    ambient_visibility: bool = False
     """Whether ``reflectance`` knows which part of the environment reaches a point."""
     bounced: bool = False
     """Whether light that lit proxies send to each other is known."""
@@ -141,14 +176,21 @@ class RelightConfig:
         return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise ValueError(f"method: {self.method!r} is none of {', '.join(METHODS)}")
+        known = dict.fromkeys((*METHODS, *READINGS))
+        if self.method not in known:
+            raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
         check_edge_samples(self.edge_samples)
 
 
 @wp.func
-def printed_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
-    """Equation (1)."""
+def shader_response(n_dot_l: wp.float32, multiplicative: wp.float32, alpha: wp.float32) -> wp.float32:
+    """The lerp of [DH04]'s fragment shader as printed; light is not taken away."""
+    return wp.max((1.0 - alpha) * n_dot_l + alpha * multiplicative, 0.0)
+
+
+@wp.func
+def text_response(n_dot_l: wp.float32, intensity: wp.float32, alpha: wp.float32) -> wp.float32:
+    """Equation (1), [DH04] section 4.2."""
     weight = wp.min(wp.abs(alpha), 1.0)
     multiplicative = wp.where(alpha > 0.0, intensity, 1.0 - intensity)
     return (1.0 - weight) * n_dot_l + weight * multiplicative
@@ -194,9 +236,9 @@ def surrounding_luminance(
 class ReceiverCells:
     """What ``kernels/receiver_cells.py`` found for cells of the frame, each with the surface that it lies on."""
 
-    share: wp.array2d[wp.vec3]  # of the environment that reaches a cell
-    share_surface: wp.array2d[wp.int32]
-    share_stride: wp.int32  # pixels per cell
+    ambient_visibility: wp.array2d[wp.vec3]  # share of the environment that reaches a cell
+    ambient_surface: wp.array2d[wp.int32]  # ``surface_key`` of the cell, -1 for none
+    ambient_stride: wp.int32  # pixels per cell
     bounced: wp.array2d[wp.vec3]  # irradiance by virtual light that other proxies send there
     bounced_surface: wp.array2d[wp.int32]
     bounced_stride: wp.int32
@@ -206,24 +248,23 @@ class ReceiverCells:
 class Receiver:
     """The receiver and the environment that lights it; what a ``RelightConfig`` leaves out is empty."""
 
-    frame: wp.array2d[wp.vec3ub]
-    decode_table: wp.array[wp.vec3]
-    table: wp.array2d[wp.uint32]
+    picture: Picture
+    table: wp.array2d[wp.uint32]  # the frame's summed-area table
     box: wp.int32  # side of a pixel's surroundings
     probes: wp.array[Probe]
     key_lights: wp.array[KeyLight]
     irradiance_sh: wp.array[wp.vec3]
     irradiance_map: wp.array2d[wp.vec3]
-    lamps: wp.array[Emitter]
+    emitters: wp.array[Emitter]
     cells: ReceiverCells
 
 
 @wp.struct
-class Lit:
+class DirectLighting:
     """What virtual light does at a point of the receiver."""
 
     added: wp.vec3  # radiance
-    seen: wp.int32  # whether any light arrives, whatever the receiver makes of it, and which do not: see ``is_edge``
+    visibility: wp.int32  # whether any light arrives, and which do not: see ``is_edge``
 
 
 @wp.struct
@@ -236,130 +277,54 @@ class Matter:
     directionality: wp.float32
 
 
-@wp.func
-def middle_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
-    """Row or column at which a cell is estimated."""
-    return wp.min(cell * stride + stride / 2, size - 1)
-
-
-@wp.func
-def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
-    """Which cell is estimated at a row or column: whole numbers at ``middle_pixel``, even between, none beyond."""
-    last = (size - 1) / stride
-    low = wp.clamp((pixel - stride / 2) / stride, 0, last)
-    here = middle_pixel(low, stride, size)
-    there = middle_pixel(wp.min(low + 1, last), stride, size)
-    if pixel <= here or there <= here:
-        return wp.float32(low)
-    return wp.float32(low) + wp.min(wp.float32(pixel - here) / wp.float32(there - here), 1.0)
-
-
-@wp.func
-def look_up_cells(
-    values: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    key: wp.int32,
-    size: wp.vec2i,
-    row: wp.int32,
-    col: wp.int32,
-) -> wp.vec4:
-    """Mean of the cells around a pixel that lie on its surface, weighted as bilinear interpolation does, and 1.
-
-    Where none of those is on its surface, the mean of others that touch the pixel; zero where no cell around it shows
-    its surface. ``size`` is that of the frame.
-    """
-    y = cell_place(row, stride, size[0])
-    x = cell_place(col, stride, size[1])
-    i0 = wp.int32(y)
-    j0 = wp.int32(x)
-    total = wp.vec3()
-    weights = float(0.0)
-    beside = wp.vec3()
-    count = float(0.0)
-    for a in range(2):
-        for b in range(2):
-            i = wp.min(i0 + a, values.shape[0] - 1)
-            j = wp.min(j0 + b, values.shape[1] - 1)
-            if surface[i, j] == key:
-                weight = (1.0 - wp.abs(y - wp.float32(i0 + a))) * (1.0 - wp.abs(x - wp.float32(j0 + b)))
-                if weight > 0.0:
-                    total += weight * values[i, j]
-                    weights += weight
-                else:
-                    beside += values[i, j]
-                    count += 1.0
-    if weights <= 0.0:
-        if count <= 0.0:
-            return wp.vec4()
-        total = beside
-        weights = count
-    mean = total / weights
-    return wp.vec4(mean[0], mean[1], mean[2], 1.0)
-
-
-@wp.func
-def is_bounced_to(
-    values: wp.array2d[wp.vec3],
-    surface: wp.array2d[wp.int32],
-    stride: wp.int32,
-    size: wp.vec2i,
-    row: wp.int32,
-    col: wp.int32,
-) -> wp.bool:
-    """Whether any cell that ``look_up_cells`` may read for a pixel receives light."""
-    i0 = wp.int32(cell_place(row, stride, size[0]))
-    j0 = wp.int32(cell_place(col, stride, size[1]))
-    for a in range(2):
-        for b in range(2):
-            i = wp.min(i0 + a, values.shape[0] - 1)
-            j = wp.min(j0 + b, values.shape[1] - 1)
-            if surface[i, j] >= 0 and wp.max(values[i, j]) > 0.0:
-                return True
-    return False
-
-
 @functools.cache
 def make_find_matter(config: RelightConfig) -> wp.Function:
-    """``find_matter(scene, desk, hit, row, col, mirror) -> Matter``; arguments as those of ``lit_by``."""
-    method = config.method
+    """``find_matter(scene, receiver, hit, row, col, mirror) -> Matter``; arguments as those of ``direct_lighting``."""
+    method, reading = config.method, READINGS.get(config.method)
 
     @wp.func(module="unique")
-    def find_matter(scene: RayScene, desk: Receiver, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3) -> Matter:
+    def find_matter(
+        scene: RayScene, receiver: Receiver, hit: Hit, row: wp.int32, col: wp.int32, mirror: wp.vec3
+    ) -> Matter:
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         matter.m = 1.0
-        radiance = decode(desk.decode_table, desk.frame[row, col])
+        radiance = decode(receiver.picture.decode_table, receiver.picture.frame[row, col])
         is_mirrored = mirror[0] > 0.0
         if is_mirrored:
             radiance = wp.cw_div(radiance, mirror)
-        matter.key = desk.key_lights[0].direction
-        matter.directionality = desk.key_lights[0].directionality
-        if wp.static(method == "paper"):
-            matter.m = luminance(radiance)
+        matter.key = receiver.key_lights[0].direction
+        matter.directionality = receiver.key_lights[0].directionality
+        if wp.static(reading is not None):
+            if wp.static(reading is not None and reading.values == "video"):
+                matter.m = wp.float32(intensity(receiver.picture.frame[row, col])) / 255.0
+            else:
+                matter.m = luminance(radiance)
         else:
             around = luminance(radiance)
             if not is_mirrored:
-                around = surrounding_luminance(desk.table, desk.decode_table, row, col, desk.box)
+                around = surrounding_luminance(receiver.table, receiver.picture.decode_table, row, col, receiver.box)
                 matter.m = luminance(radiance) / around
             if wp.static(method == "relief"):
                 hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
                 matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
             else:
                 if wp.static(config.irradiance == "sh"):
-                    distant = sh_irradiance(desk.irradiance_sh, hit.normal)
+                    distant = sh_irradiance(receiver.irradiance_sh, hit.normal)
                 else:
-                    distant = sample_latlong(desk.irradiance_map, hit.normal)
-                if wp.static(config.lamps):
-                    distant = add_nearness(distant, desk.lamps, hit.point, hit.normal)
-                if wp.static(config.share):
+                    distant = sample_latlong(receiver.irradiance_map, hit.normal)
+                if wp.static(config.emitters):
+                    distant = add_emitters(distant, receiver.emitters, hit.point, hit.normal)
+                if wp.static(config.ambient_visibility):
                     if not is_mirrored:
-                        cells = desk.cells
+                        cells = receiver.cells
                         key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-                        size = wp.vec2i(desk.frame.shape[0], desk.frame.shape[1])
-                        share = look_up_cells(cells.share, cells.share_surface, cells.share_stride, key, size, row, col)
-                        if share[3] > 0.0:
-                            distant = wp.cw_mul(distant, wp.vec3(share[0], share[1], share[2]))
+                        size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
+                        visibility = cells.ambient_visibility
+                        stride = cells.ambient_stride
+                        left = look_up_cells(visibility, cells.ambient_surface, stride, key, size, row, col)
+                        if left[3] > 0.0:
+                            distant = wp.cw_mul(distant, wp.vec3(left[0], left[1], left[2]))
                 matter.kd = wp.vec3(
                     reflectance_of(radiance[0], distant[0]),
                     reflectance_of(radiance[1], distant[1]),
@@ -371,8 +336,8 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 
 
 @functools.cache
-def make_lit_by(config: RelightConfig) -> wp.Function:
-    """``lit_by(scene, lights, desk, hit, row, col, mirror, turn) -> Lit``: what virtual light does at a hit.
+def make_direct_lighting(config: RelightConfig) -> wp.Function:
+    """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
 
     The pixel (row, col) shows the hit: straight where ``mirror`` is zero, else as a mirror ball of that reflectance has
     it, which says nothing about the hit's surroundings. ``turn`` is for ``visible_share``.
@@ -380,20 +345,20 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter = make_find_matter(config)
-    method = config.method
+    method, reading = config.method, READINGS.get(config.method)
 
     @wp.func(module="unique")
-    def lit_by(
+    def direct_lighting(
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Receiver,
+        receiver: Receiver,
         hit: Hit,
         row: wp.int32,
         col: wp.int32,
         mirror: wp.vec3,
         turn: wp.float32,
-    ) -> Lit:
-        result = Lit()
+    ) -> DirectLighting:
+        result = DirectLighting()
         known = bool(False)  # what the receiver is, found only once some light falls here
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
@@ -409,25 +374,30 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
                 visible = visible_share(scene, hit.point, hit.geometric_normal, hit.error, lights[index], light, turn)
                 if visible <= 0.0:
                     if not has_penumbra(lights[index], light):
-                        result.seen |= bit
+                        result.visibility |= bit
                     continue
             else:
                 if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
-                    result.seen |= bit
+                    result.visibility |= bit
                     continue
             if wp.static(config.probes):
-                if meets_probe(desk.probes, hit.point, light.wi, light.distance):
-                    result.seen |= bit
+                if meets_probe(receiver.probes, hit.point, light.wi, light.distance):
+                    result.visibility |= bit
                     continue
-            result.seen |= _LIT
+            result.visibility |= _LIT
             response = n_dot_l
             if wp.static(method != "flat"):
                 if not known:
                     known = True
-                    matter = find_matter(scene, desk, hit, row, col, mirror)
+                    matter = find_matter(scene, receiver, hit, row, col, mirror)
                 alpha = wp.dot(light.wi, matter.key)
-                if wp.static(method == "paper"):
-                    response = printed_response(n_dot_l, matter.m, alpha * matter.directionality)
+                if wp.static(reading is not None):
+                    if wp.static(reading is not None and reading.weighted):
+                        alpha = alpha * matter.directionality
+                    if wp.static(reading is not None and reading.blend == "shader"):
+                        response = shader_response(n_dot_l, matter.m, alpha)
+                    else:
+                        response = text_response(n_dot_l, matter.m, alpha)
                 elif wp.static(method == "relief"):
                     response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
                 else:
@@ -435,90 +405,89 @@ def make_lit_by(config: RelightConfig) -> wp.Function:
             added += visible * response * light.irradiance_normal
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
-                cells = desk.cells
+                cells = receiver.cells
                 key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-                size = wp.vec2i(desk.frame.shape[0], desk.frame.shape[1])
+                size = wp.vec2i(receiver.picture.frame.shape[0], receiver.picture.frame.shape[1])
                 stride = cells.bounced_stride
                 bounced = look_up_cells(cells.bounced, cells.bounced_surface, stride, key, size, row, col)
                 if bounced[0] + bounced[1] + bounced[2] > 0.0:
-                    result.seen |= _LIT
+                    result.visibility |= _LIT
                     if not known:
-                        matter = find_matter(scene, desk, hit, row, col, mirror)
+                        matter = find_matter(scene, receiver, hit, row, col, mirror)
                     added += wp.vec3(bounced[0], bounced[1], bounced[2])
         result.added = wp.cw_mul(matter.kd, added) * _INV_PI
         return result
 
-    return lit_by
+    return direct_lighting
 
 
 @functools.cache
 def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel specialised to ``config``; equal configs share one kernel."""
     closest_proxy = make_trace(config.trace).closest_proxy
-    lit_by = make_lit_by(config)
+    direct_lighting = make_direct_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def relight_kernel(
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Receiver,
+        receiver: Receiver,
         # Out:
-        physical_added_out: wp.array2d[wp.vec3],
-        seen_out: wp.array2d[wp.int32],
+        added_out: wp.array2d[wp.vec3],
+        visibility_out: wp.array2d[wp.int32],
     ):
         i, j = wp.tid()
         i += row_start
         black = wp.vec3(0.0, 0.0, 0.0)
-        physical_added_out[i, j] = black
+        added_out[i, j] = black
         if not inside_rect(i, j, params[0].light_rect):
             return
         if wp.static(config.edge_samples > 1):
-            seen_out[i, j] = _NOTHING
+            visibility_out[i, j] = _NOTHING
         if wp.static(config.bounced):
             if not inside_rect(i, j, params[0].direct_rect):
-                cells = desk.cells
-                size = wp.vec2i(rays.shape[0], rays.shape[1])
-                if not is_bounced_to(cells.bounced, cells.bounced_surface, cells.bounced_stride, size, i, j):
+                cells = receiver.cells
+                size = wp.vec2i(receiver.picture.rays.shape[0], receiver.picture.rays.shape[1])
+                if not any_cell_above_zero(cells.bounced, cells.bounced_surface, cells.bounced_stride, size, i, j):
                     return
-        ray = rays[i, j]
+        ray = receiver.picture.rays[i, j]
         direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
         hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
         # A face that is seen from behind is not the surface that the camera sees.
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return
         if wp.static(config.probes):
-            if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
+            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
                 if wp.static(config.edge_samples > 1):
-                    seen_out[i, j] = _BALL
+                    visibility_out[i, j] = _BALL
                 return
-        lit = lit_by(scene, lights, desk, hit, i, j, black, tile_turn(i, j))
-        physical_added_out[i, j] = lit.added
+        lit = direct_lighting(scene, lights, receiver, hit, i, j, black, tile_turn(i, j))
+        added_out[i, j] = lit.added
         if wp.static(config.edge_samples > 1):
             surface = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
-            seen_out[i, j] = (surface << _SURFACE) | lit.seen
+            visibility_out[i, j] = (surface << _SURFACE) | lit.visibility
 
     return relight_kernel
 
 
 @wp.func
-def is_edge(seen: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
+def is_edge(visibility: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: wp.int32) -> wp.bool:
     """Whether virtual light may change within a pixel, or between it and the next one.
 
     That is where something stands before a light without penumbra for one of them alone, or where they see different
     surfaces and any light arrives. Balls have light of their own, which ``mirror_ball`` adds.
     """
-    here = seen[row, column]
+    here = visibility[row, column]
     if here == _BALL:
         return False
     for k in range(4):
         i = row + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
         j = column + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
         if inside_rect(i, j, rect):
-            there = seen[i, j]
+            there = visibility[i, j]
             if there != here and there != _BALL:
                 differs = here ^ there
                 if (differs & (_LIT - 1)) != 0:
@@ -529,58 +498,56 @@ def is_edge(seen: wp.array2d[wp.int32], rect: wp.vec4i, row: wp.int32, column: w
 
 
 @functools.cache
-def make_sample_lit(config: RelightConfig) -> wp.Function:
-    """``sample_lit(params, rays, scene, lights, desk, row, col, sample) -> vec4``: a sample's light, and 1.
+def make_sample_lighting(config: RelightConfig) -> wp.Function:
+    """``sample_lighting(params, scene, lights, receiver, row, col, sample) -> vec4``: a sample's light, and 1.
 
     Zero where it sees a ball: such a sample does not count.
     """
     closest_proxy = make_trace(config.trace).closest_proxy
-    lit_by = make_lit_by(config)
+    direct_lighting = make_direct_lighting(config)
     sample_direction = make_sample_direction(config.edge_samples)
 
     @wp.func(module="unique")
-    def sample_lit(
+    def sample_lighting(
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Receiver,
+        receiver: Receiver,
         row: wp.int32,
         col: wp.int32,
         sample: wp.int32,
     ) -> wp.vec4:
-        direction = sample_direction(params, rays[row, col], sample)
+        direction = sample_direction(params, receiver.picture.rays[row, col], sample)
         hit = closest_proxy(scene, params[0].camera_position, direction, FAR)
         if wp.static(config.probes):
-            if meets_probe(desk.probes, params[0].camera_position, direction, hit.t):
+            if meets_probe(receiver.probes, params[0].camera_position, direction, hit.t):
                 return wp.vec4(0.0)
         if hit.shape < 0 or wp.dot(hit.geometric_normal, direction) >= 0.0:
             return wp.vec4(0.0, 0.0, 0.0, 1.0)
-        lit = lit_by(scene, lights, desk, hit, row, col, wp.vec3(), tile_turn(row, col))
+        lit = direct_lighting(scene, lights, receiver, hit, row, col, wp.vec3(), tile_turn(row, col))
         return wp.vec4(lit.added[0], lit.added[1], lit.added[2], 1.0)
 
-    return sample_lit
+    return sample_lighting
 
 
 @functools.cache
 def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp.Kernel:
     """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
-    sample_lit = make_sample_lit(config)
+    sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def smooth_edges_kernel(
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Receiver,
-        seen: wp.array2d[wp.int32],
+        receiver: Receiver,
+        visibility: wp.array2d[wp.int32],
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
         # Out:
-        physical_added_out: wp.array2d[wp.vec3],
+        added_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
         i += row_start
@@ -590,14 +557,14 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         rect = params[0].light_rect
         if not inside_rect(i, j, rect):
             return
-        if not is_edge(seen, rect, i, j):
+        if not is_edge(visibility, rect, i, j):
             return
         total = wp.vec4()
         count = wp.int32(wp.static(config.edge_samples))  # a variable: the loop must not be unrolled
         for sample in range(count):
-            total += sample_lit(params, rays, scene, lights, desk, i, j, sample)
+            total += sample_lighting(params, scene, lights, receiver, i, j, sample)
         if total[3] > 0.0:
-            physical_added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
+            added_out[i, j] = wp.vec3(total[0], total[1], total[2]) / total[3]
 
     return smooth_edges_kernel
 
@@ -606,7 +573,7 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
 def list_edges_kernel(
     # In:
     params: wp.array[FrameParams],
-    seen: wp.array2d[wp.int32],
+    visibility: wp.array2d[wp.int32],
     # Out:
     edge_count_out: wp.array[wp.int32],
     edges_out: wp.array[wp.vec2i],
@@ -615,24 +582,23 @@ def list_edges_kernel(
     i, j = wp.tid()
     rect = params[0].light_rect
     if inside_rect(i, j, rect):
-        if is_edge(seen, rect, i, j):
+        if is_edge(visibility, rect, i, j):
             list_edge(i, j, edge_count_out, edges_out)
 
 
 @functools.cache
 def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
     """Kernel that takes every sample of the edges that were listed."""
-    sample_lit = make_sample_lit(config)
+    sample_lighting = make_sample_lighting(config)
 
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
-    def sample_lit_edges_kernel(
+    def sample_lighting_edges_kernel(
         # In:
         threads: wp.int32,
         params: wp.array[FrameParams],
-        rays: wp.array2d[wp.vec2],
         scene: RayScene,
         lights: wp.array[Light],
-        desk: Receiver,
+        receiver: Receiver,
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
         # Out:
@@ -643,33 +609,10 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
         while item < stop:
             edge = edges[item / wp.static(config.edge_samples)]
             sample = item % wp.static(config.edge_samples)
-            samples_out[item] = sample_lit(params, rays, scene, lights, desk, edge[0], edge[1], sample)
+            samples_out[item] = sample_lighting(params, scene, lights, receiver, edge[0], edge[1], sample)
             item += threads
 
-    return sample_lit_edges_kernel
-
-
-@wp.kernel(enable_backward=False)
-def average_lit_edges_kernel(
-    # In:
-    threads: wp.int32,
-    count: wp.int32,
-    edge_count: wp.array[wp.int32],
-    edges: wp.array[wp.vec2i],
-    samples: wp.array[wp.vec4],
-    # Out:
-    physical_added_out: wp.array2d[wp.vec3],
-):
-    """Mean of every listed edge's samples that count, in their order."""
-    item = wp.tid()
-    stop = listed_edges(edge_count, edges)
-    while item < stop:
-        total = wp.vec4(0.0)
-        for sample in range(count):
-            total += samples[item * count + sample]
-        if total[3] > 0.0:
-            physical_added_out[edges[item][0], edges[item][1]] = wp.vec3(total[0], total[1], total[2]) / total[3]
-        item += threads
+    return sample_lighting_edges_kernel
 
 
 def surroundings_size(height: int) -> int:
@@ -679,45 +622,47 @@ def surroundings_size(height: int) -> int:
 
 def make_receiver(
     config: RelightConfig,
-    frame: wp.array,
-    decode_table: wp.array,
-    table: wp.array | None,
-    probes: wp.array | None,
-    key_lights: wp.array | None,
-    irradiance: wp.array | None,
-    lamps: wp.array | None = None,
+    picture: Picture,
+    *,
+    table: wp.array | None = None,
+    probes: wp.array | None = None,
+    key_lights: wp.array | None = None,
+    irradiance: wp.array | None = None,
+    emitters: wp.array | None = None,
     cells: ReceiverCells | None = None,
 ) -> Receiver:
-    """What kernels read of the receiver; arguments as those of ``relight``."""
-    desk = Receiver()
-    if cells is not None:
-        desk.cells = cells
-    desk.frame, desk.decode_table, desk.box = frame, decode_table, surroundings_size(frame.shape[0])
+    """What kernels read of the receiver; what the method leaves out may be None.
+
+    Args:
+        config: Method and forms of light.
+        picture: (H, W) the camera's.
+        table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
+        probes: (p,) Probe; needed if ``config.probes``.
+        key_lights: (k,) KeyLight, brightest first; needed by all methods but ``flat``.
+        irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
+            needed by ``reflectance``.
+        emitters: (q,) Emitter, seen from the first probe; needed if ``config.emitters``.
+        cells: From ``receiver_cells``; needed if ``config.ambient_visibility`` or ``config.bounced``.
+    """
+    receiver = Receiver()
+    receiver.picture, receiver.box = picture, surroundings_size(picture.rays.shape[0])
     form = f"irradiance_{config.irradiance}"
-    optional = {"table": table, "probes": probes, "key_lights": key_lights, form: irradiance, "lamps": lamps}
-    for name, array in optional.items():
-        if array is not None:
-            setattr(desk, name, array)
-    return desk
+    optional = {"table": table, "probes": probes, "key_lights": key_lights, form: irradiance, "emitters": emitters}
+    for name, value in {**optional, "cells": cells}.items():
+        if value is not None:
+            setattr(receiver, name, value)
+    return receiver
 
 
 def relight(
     config: RelightConfig,
-    params: wp.array,
-    rays: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    table: wp.array | None,
+    params: wp.array[FrameParams],
     scene: RayScene,
-    probes: wp.array | None,
-    lights: wp.array,
-    key_lights: wp.array | None,
-    irradiance: wp.array | None,
-    physical_added_out: wp.array,
-    seen_out: wp.array | None = None,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    added_out: wp.array2d[wp.vec3],
+    visibility_out: wp.array2d[wp.int32] | None = None,
     *,
-    lamps: wp.array | None = None,
-    cells: ReceiverCells | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the radiance that virtual lights add to the receiver; zero outside ``params[0].light_rect``.
@@ -727,43 +672,33 @@ def relight(
     Args:
         config: Method and kinds of shape.
         params: (1,) FrameParams: camera, light_rect and, if ``config.bounced``, direct_rect.
-        rays: (H, W) vec2, undistorted (x / z, y / z) of each pixel's centre.
-        frame: (H, W) vec3ub, the camera's frame, RGB.
-        decode_table: (256,) vec3 of ``color.decode_table``.
-        table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
         scene: Objects and proxies.
-        probes: (p,) Probe; needed if ``config.probes``.
         lights: (n,) Light.
-        key_lights: (k,) KeyLight, brightest first; needed by all methods but ``flat``.
-        irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
-            needed by ``reflectance``.
-        physical_added_out: (H, W) vec3, linear radiance in camera values.
-        seen_out: (H, W) int32, which surface a pixel sees and which lights do not; needed if ``config.edge_samples``
-            is more than 1. Only what lies in ``light_rect`` is written.
-        lamps: (q,) Emitter, seen from the first probe; needed if ``config.lamps``.
-        cells: From ``receiver_cells``; needed if ``config.share`` or ``config.bounced``.
+        receiver: Of ``make_receiver``.
+        added_out: (H, W) linear radiance in camera values.
+        visibility_out: (H, W) which surface a pixel sees and which lights do not; needed if ``config.edge_samples`` is
+            more than 1. Only what lies in ``light_rect`` is written.
         rows: Band of rows; None means all.
     """
-    desk = make_receiver(config, frame, decode_table, table, probes, key_lights, irradiance, lamps, cells)
+    rays = receiver.picture.rays
     launch_rows(
         make_relight_kernel(config),
-        frame.shape,
-        [params, rays, scene, lights, desk],
-        [physical_added_out, seen_out],
+        rays.shape,
+        [params, scene, lights, receiver],
+        [added_out, visibility_out],
         rows=rows,
-        device=frame.device,
+        device=rays.device,
     )
 
 
 def smooth_edges(
     config: RelightConfig,
-    params: wp.array,
-    rays: wp.array,
+    params: wp.array[FrameParams],
     scene: RayScene,
-    lights: wp.array,
-    desk: Receiver,
-    seen: wp.array,
-    physical_added_out: wp.array,
+    lights: wp.array[Light],
+    receiver: Receiver,
+    visibility: wp.array2d[wp.int32],
+    added_out: wp.array2d[wp.vec3],
     *,
     edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
@@ -773,27 +708,25 @@ def smooth_edges(
     Args:
         config: As that of ``relight``, and so are all arguments that are not named here.
         params: Likewise.
-        rays: Likewise.
         scene: Likewise.
         lights: Likewise.
-        desk: Of ``make_receiver``.
-        seen: (H, W) int32 as ``relight`` writes.
-        physical_added_out: (H, W) vec3 as ``relight`` writes; changed along edges.
+        receiver: Likewise.
+        visibility: (H, W) as ``relight`` writes.
+        added_out: (H, W) as ``relight`` writes; changed along edges.
         edge_lists: Scratch, for a launch over all rows: edges are then sampled on their own.
         rows: Band of rows; None means all.
     """
-    device = rays.device
-    inputs = [params, rays, scene, lights, desk]
+    shape, device = receiver.picture.rays.shape, receiver.picture.rays.device
+    inputs = [params, scene, lights, receiver]
     if edge_lists is None:
-        kernel, given = make_smooth_edges_kernel(config), [*inputs, seen, None, None]
-        launch_rows(kernel, rays.shape, given, [physical_added_out], rows=rows, device=device)
+        kernel = make_smooth_edges_kernel(config)
+        launch_rows(kernel, shape, [*inputs, visibility, None, None], [added_out], rows=rows, device=device)
         return
     listed = [edge_lists.count, edge_lists.edges]
     edge_lists.count.zero_()
-    launch(list_edges_kernel, rays.shape, [params, seen], listed, device=device)
-    kernel, given = make_smooth_edges_kernel(config, left=True), [*inputs, seen, *listed]
-    launch_rows(kernel, rays.shape, given, [physical_added_out], rows=None, device=device)
-    sampling = [EDGE_THREADS, *inputs, *listed]
-    launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [edge_lists.samples], device=device)
-    averaging = [EDGE_THREADS, config.edge_samples, *listed, edge_lists.samples]
-    launch(average_lit_edges_kernel, EDGE_THREADS, averaging, [physical_added_out], device=device)
+    launch(list_edges_kernel, shape, [params, visibility], listed, device=device)
+    kernel = make_smooth_edges_kernel(config, left=True)
+    launch_rows(kernel, shape, [*inputs, visibility, *listed], [added_out], rows=None, device=device)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
+    )

@@ -6,7 +6,7 @@ Edges. Inside a surface one sample per pixel is enough. Where a neighbour sees a
 tangent plane than two pixels' footprint, or a normal turned by more than 30 degrees, the pixel is traced again with n^2
 samples and averaged (a box filter, as a camera's pixels have). The samples are n-rooks in both axes, for n = 2 the
 rotated grid: no two of them share a row or column, so near-vertical and near-horizontal edges pass through n^2 shades,
-not n. What surrounds a sample at close range is taken from the pixel around it whose normal is most like its own.
+not n. The near field of a sample is taken from the pixel around it whose normal is most like its own.
 
 Normals. Surfaces are seen from both sides: normals are turned toward the viewer. An interpolated normal can still point
 away at a silhouette; it is then tipped just as far as makes it perpendicular to the view, continuously, so that the
@@ -21,20 +21,28 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.edges import EDGE_THREADS, EdgeLists, list_edge, listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
+from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.reflect import (
     DiffuseForm,
     DistantLight,
     DistantLightConfig,
     knows_levels,
     make_distant_irradiance,
-    make_mirrored,
+    make_reflected_radiance,
 )
 from warp_ar.kernels.shadow import ALL_LIGHTS, make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import Hit, check_edge_samples, inside_rect, make_primary, make_sample_direction
+from warp_ar.kernels.visibility import (
+    Hit,
+    VisibleObjects,
+    check_edge_samples,
+    inside_rect,
+    make_primary,
+    make_sample_direction,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,8 +69,8 @@ class ShadeConfig:
     """Samples per pixel along edges: a square number; 1 leaves edges hard."""
     soft: bool = False
     """Whether lights with a radius cast soft shadows."""
-    near: bool = False
-    """Whether ``near_field`` says what surrounds the objects at close range."""
+    near_field: bool = False
+    """Whether ``near_field`` says what surrounds the objects."""
 
     def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
         """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
@@ -73,12 +81,12 @@ class ShadeConfig:
 
 
 @wp.struct
-class Nearby:
-    """What surrounds a point of an object at close range, of ``near_field``."""
+class NearPoint:
+    """What ``near_field`` knows of a point of an object."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
     irradiance: wp.vec3
-    mirrored: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
+    reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
 @functools.cache
@@ -89,7 +97,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """
     forms = config.distant
     surface_at = make_surface(forms.models, forms.textures)
-    glossy = make_mirrored(forms)
+    glossy = make_reflected_radiance(forms)
     distant_irradiance = make_distant_irradiance(forms)
     reflect_direct = make_reflect_direct(forms.models)
     sample_light = make_sample_light(config.lights)
@@ -103,7 +111,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         distant: DistantLight,
         hit: Hit,
         direction: wp.vec3,
-        near: Nearby,
+        near: NearPoint,
         turn: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
@@ -121,32 +129,32 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         radiance = wp.vec3(0.0)
         if wp.static(forms.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
-            if wp.static(config.near):
+            if wp.static(config.near_field):
                 if near.known:
                     irradiance = near.irradiance
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
             if glossiness > 0.0 and knows_levels(distant):
-                outward = reflect(wo, normal)
-                mirrored = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, outward, 0.0)
-                if wp.static(config.near):
+                wi = reflect(wo, normal)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                if wp.static(config.near_field):
                     if near.known:
-                        close = wp.vec3(near.mirrored[0], near.mirrored[1], near.mirrored[2])
-                        mirrored = (1.0 - near.mirrored[3]) * mirrored + close
-                radiance += wp.cw_mul(surface.reflectance, mirrored)
+                        added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
+                        reflected = (1.0 - near.reflected[3]) * reflected + added
+                radiance += wp.cw_mul(surface.reflectance, reflected)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
                 light = sample_light(lights[index], hit.point)
                 if wp.max(light.irradiance_normal) > 0.0:
-                    reflected = reflect_direct(surface, normal, wo, light.wi)
-                    if wp.max(reflected) > 0.0:
+                    direct = reflect_direct(surface, normal, wo, light.wi)
+                    if wp.max(direct) > 0.0:
                         if wp.static(config.soft):
-                            visible = visible_share(scene, hit.point, geometric, hit.error, lights[index], light, turn)
-                            radiance += visible * wp.cw_mul(reflected, light.irradiance_normal)
+                            share = visible_share(scene, hit.point, geometric, hit.error, lights[index], light, turn)
+                            radiance += share * wp.cw_mul(direct, light.irradiance_normal)
                         else:
                             if is_lit(scene, hit.point, geometric, hit.error, light):
-                                radiance += wp.cw_mul(reflected, light.irradiance_normal)
+                                radiance += wp.cw_mul(direct, light.irradiance_normal)
         return radiance
 
     return shade_hit
@@ -159,37 +167,39 @@ def differs(
     found: wp.int32,
     reach: wp.float32,
     rect: wp.vec4i,
-    hit_object: wp.array2d[wp.int32],
-    hits: wp.array2d[Hit],
+    visible: VisibleObjects,
     hit: Hit,
 ) -> wp.bool:
     """Whether a neighbour sees another surface than this pixel."""
     other = wp.int32(-1)
     if inside_rect(i, j, rect):
-        other = hit_object[i, j]
+        other = visible.objects[i, j]
     if other != found:
         return True
     if found < 0:
         return False
+    hits = visible.hits
     if wp.abs(wp.dot(hit.geometric_normal, hits[i, j].point - hit.point)) > reach:
         return True
     return wp.dot(hit.normal, hits[i, j].normal) < EDGE_COSINE
 
 
 @wp.func
-def most_alike(hit_object: wp.array2d[wp.int32], hits: wp.array2d[Hit], i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
+def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> wp.vec2i:
     """Of a pixel and its eight neighbours, the one that sees what is most like a hit; (-1, -1): none sees its object.
 
     Normals decide, nearness where they are the same.
     """
+    objects = visible.objects
+    hits = visible.hits
     found = wp.vec2i(-1, -1)
     best = float(-2.0)
     for a in range(-1, 2):
         for b in range(-1, 2):
             row = i + a
             column = j + b
-            if row >= 0 and column >= 0 and row < hit_object.shape[0] and column < hit_object.shape[1]:
-                if hit_object[row, column] == hit.shape:
+            if row >= 0 and column >= 0 and row < objects.shape[0] and column < objects.shape[1]:
+                if objects[row, column] == hit.shape:
                     likeness = wp.dot(hits[row, column].normal, hit.normal) - 1.0e-3 * wp.float32(a * a + b * b)
                     if likeness > best:
                         best = likeness
@@ -211,10 +221,8 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         scene: RayScene,
         lights: wp.array[Light],
         distant: DistantLight,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
-        near_irradiance: wp.array2d[wp.vec3],
-        near_mirrored: wp.array2d[wp.vec4],
+        visible: VisibleObjects,
+        near: NearLight,
         i: wp.int32,
         j: wp.int32,
         sample: wp.int32,
@@ -229,20 +237,20 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
                 hit = closest_visible(scene, params[0].camera_position, direction)
         if hit.shape < 0:
             return wp.vec4(0.0)
-        near = Nearby()
-        if wp.static(config.near):
+        point = NearPoint()
+        if wp.static(config.near_field):
             pixel = wp.vec2i(i, j)
             if not alone:
-                pixel = most_alike(hit_object, hits, i, j, hit)
-            near.known = pixel[0] >= 0
-            if near.known:
+                pixel = most_alike(visible, i, j, hit)
+            point.known = pixel[0] >= 0
+            if point.known:
                 if wp.static(config.distant.diffuse != "none"):
-                    if near_irradiance.shape[0] > 0:
-                        near.irradiance = near_irradiance[pixel[0], pixel[1]]
+                    if near.irradiance.shape[0] > 0:
+                        point.irradiance = near.irradiance[pixel[0], pixel[1]]
                 if wp.static(config.distant.specular):
-                    if near_mirrored.shape[0] > 0:
-                        near.mirrored = near_mirrored[pixel[0], pixel[1]]
-        radiance = shade_hit(scene, lights, distant, hit, direction, near, tile_turn(i, j))
+                    if near.reflected.shape[0] > 0:
+                        point.reflected = near.reflected[pixel[0], pixel[1]]
+        radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j))
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 
     return shade_sample
@@ -269,10 +277,8 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         scene: RayScene,
         lights: wp.array[Light],
         distant: DistantLight,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
-        near_irradiance: wp.array2d[wp.vec3],
-        near_mirrored: wp.array2d[wp.vec4],
+        visible: VisibleObjects,
+        near: NearLight,
         # Out:
         virtual_out: wp.array2d[wp.vec4],
         edge_count_out: wp.array[wp.int32],
@@ -287,17 +293,17 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         samples = wp.int32(0)
         rect = params[0].object_rect
         if inside_rect(i, j, rect):
-            found = hit_object[i, j]
+            found = visible.objects[i, j]
             hit = Hit()
             if found >= 0:
-                hit = hits[i, j]
+                hit = visible.hits[i, j]
             samples = wp.where(found >= 0, 1, 0)
             if wp.static(config.edge_samples > 1):
                 reach = EDGE_FOOTPRINTS * hit.t / params[0].focal[0]
                 for k in range(4):
                     row = i + wp.where(k == 0, -1, 0) + wp.where(k == 1, 1, 0)
                     column = j + wp.where(k == 2, -1, 0) + wp.where(k == 3, 1, 0)
-                    if differs(row, column, found, reach, rect, hit_object, hits, hit):
+                    if differs(row, column, found, reach, rect, visible, hit):
                         samples = wp.static(config.edge_samples)
             if wp.static(edges == LISTED):
                 if samples > 1:
@@ -310,10 +316,8 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
                     scene,
                     lights,
                     distant,
-                    hit_object,
-                    hits,
-                    near_irradiance,
-                    near_mirrored,
+                    visible,
+                    near,
                     i,
                     j,
                     sample,
@@ -344,10 +348,8 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         scene: RayScene,
         lights: wp.array[Light],
         distant: DistantLight,
-        hit_object: wp.array2d[wp.int32],
-        hits: wp.array2d[Hit],
-        near_irradiance: wp.array2d[wp.vec3],
-        near_mirrored: wp.array2d[wp.vec4],
+        visible: VisibleObjects,
+        near: NearLight,
         edge_count: wp.array[wp.int32],
         edges: wp.array[wp.vec2i],
         # Out:
@@ -363,10 +365,8 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
                 scene,
                 lights,
                 distant,
-                hit_object,
-                hits,
-                near_irradiance,
-                near_mirrored,
+                visible,
+                near,
                 edge[0],
                 edge[1],
                 item % wp.static(config.edge_samples),
@@ -378,28 +378,6 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
     return sample_edges_kernel
 
 
-@wp.kernel(enable_backward=False)
-def average_edges_kernel(
-    # In:
-    threads: wp.int32,
-    count: wp.int32,
-    edge_count: wp.array[wp.int32],
-    edges: wp.array[wp.vec2i],
-    samples: wp.array[wp.vec4],
-    # Out:
-    virtual_out: wp.array2d[wp.vec4],
-):
-    """Mean of every listed edge's samples, in their order."""
-    item = wp.tid()
-    stop = listed_edges(edge_count, edges)
-    while item < stop:
-        result = wp.vec4(0.0)
-        for sample in range(count):
-            result += samples[item * count + sample]
-        virtual_out[edges[item][0], edges[item][1]] = result / wp.float32(count)
-        item += threads
-
-
 def shade(
     config: ShadeConfig,
     params: wp.array[FrameParams],
@@ -407,12 +385,10 @@ def shade(
     scene: RayScene,
     lights: wp.array[Light] | None,
     distant: DistantLight,
-    hit_object: wp.array2d[wp.int32],
-    hits: wp.array2d[Hit],
+    visible: VisibleObjects,
     virtual_out: wp.array2d[wp.vec4],
     *,
-    near_irradiance: wp.array2d[wp.vec3] | None = None,
-    near_mirrored: wp.array2d[wp.vec4] | None = None,
+    near: NearLight | None = None,
     edge_lists: EdgeLists | None = None,
     rows: Rows | None = None,
 ) -> None:
@@ -428,28 +404,21 @@ def shade(
         scene: What rays meet, and what it is made of.
         lights: Virtual lights.
         distant: The environment; neither its map nor its probes are read.
-        hit_object: (H, W) as ``trace_pixels`` writes.
-        hits: (H, W) likewise.
+        visible: (H, W) as ``trace_pixels`` writes.
         virtual_out: (H, W) premultiplied linear RGB and coverage; zero outside ``params.object_rect``.
-        near_irradiance: (H, W) as ``filter_near_field`` writes; needed if ``config.near``.
-        near_mirrored: (H, W) likewise.
+        near: (H, W) as ``filter_near_field`` writes; needed if ``config.near_field``.
         edge_lists: Scratch, for a launch over all rows.
         rows: Band of rows; None means all.
     """
-    inputs = [params, rays, scene, lights, distant, hit_object, hits]
-    near = [near_irradiance, near_mirrored]
+    inputs = [params, rays, scene, lights, distant, visible, NearLight() if near is None else near]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:
-        kernel, outputs = make_shade_kernel(config), [virtual_out, None, None]
-        launch_rows(kernel, rays.shape, [*inputs, *near], outputs, rows=rows, device=device)
+        launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, None, None], rows=rows, device=device)
         return
-    count, edges, samples = edge_lists.count, edge_lists.edges, edge_lists.samples
-    count.zero_()
-    outputs = [virtual_out, count, edges]
+    edge_lists.count.zero_()
+    outputs = [virtual_out, edge_lists.count, edge_lists.edges]
     for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
-        launch_rows(kernel, rays.shape, [*inputs, *near], outputs, rows=rows, device=device)
-    listed = [count, edges]
-    sampling = [EDGE_THREADS, *inputs, *near, *listed]
-    launch(make_sample_edges_kernel(config), EDGE_THREADS, sampling, [samples], device=device)
-    averaging = [EDGE_THREADS, config.edge_samples, *listed, samples]
-    launch(average_edges_kernel, EDGE_THREADS, averaging, [virtual_out], device=device)
+        launch_rows(kernel, rays.shape, inputs, outputs, rows=rows, device=device)
+    sample_listed_edges(
+        make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, virtual_out, weighted=False
+    )

@@ -127,6 +127,24 @@ class RayScene:
 
 
 @wp.struct
+class Picture:
+    """The camera's frame, and where its pixels look."""
+
+    frame: wp.array2d[wp.vec3ub]  # RGB
+    decode_table: wp.array[wp.vec3]  # (256,) of ``color.decode_table``
+    rays: wp.array2d[wp.vec2]  # undistorted (x / z, y / z) of each pixel's centre
+
+
+def make_picture(frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None) -> Picture:
+    """The arrays of a picture together; None for what a kernel does not read."""
+    picture = Picture()
+    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays)):
+        if value is not None:
+            setattr(picture, name, value)
+    return picture
+
+
+@wp.struct
 class KeyLight:
     """A dominant direction of the environment."""
 
@@ -137,9 +155,9 @@ class KeyLight:
 
 @wp.struct
 class Emitter:
-    """A lamp of the environment whose light clips in the ball; distant ones are directions."""
+    """An emitter of the environment whose light clips in the ball; distant ones are directions."""
 
     origin: wp.vec3  # where on the first ball the camera sees it mirrored
-    direction: wp.vec3  # unit, from there, as in the environment; zero where there is no lamp
+    direction: wp.vec3  # unit, from there, as in the environment; zero where there is no emitter
     distance: wp.float32  # metres from there, infinite for a distant one
     power: wp.vec3  # radiance times solid angle from there, beyond what was captured; * distance^2: radiant intensity

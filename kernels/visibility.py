@@ -71,6 +71,14 @@ class Hit:
     error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
 
 
+@wp.struct
+class VisibleObjects:
+    """The virtual objects that pixels show."""
+
+    objects: wp.array2d[wp.int32]  # index of the object; -1 where there is none
+    hits: wp.array2d[Hit]  # defined only where there is an object
+
+
 @wp.func
 def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
     """World point in the shape's coordinates."""
@@ -482,6 +490,29 @@ def make_primary(config: TraceConfig) -> wp.Function:
     return closest_visible
 
 
+@functools.cache
+def make_visible_proxy(config: TraceConfig, probes: bool) -> wp.Function:
+    """``visible_proxy(params, ray, scene, probes) -> Hit``: the proxy that a pixel shows, or shape -1.
+
+    A face that is seen from behind, or a mirror ball before it, is not what the camera sees of it.
+    """
+    closest_proxy = make_trace(config).closest_proxy
+
+    @wp.func(module="unique")
+    def visible_proxy(params: FrameParams, ray: wp.vec2, scene: RayScene, balls: wp.array[Probe]) -> Hit:
+        direction = params.world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
+        hit = closest_proxy(scene, params.camera_position, direction, FAR)
+        if hit.shape >= 0:
+            if wp.dot(hit.geometric_normal, direction) >= 0.0:
+                hit.shape = -1
+            if wp.static(probes):
+                if meets_probe(balls, params.camera_position, direction, hit.t):
+                    hit.shape = -1
+        return hit
+
+    return visible_proxy
+
+
 def check_edge_samples(count: int) -> None:
     """Raise an error unless ``make_sample_direction`` can place so many samples.
 
@@ -515,6 +546,13 @@ def make_sample_direction(count: int) -> wp.Function:
     return sample_direction
 
 
+def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
+    """The arrays of ``trace_pixels`` together."""
+    visible = VisibleObjects()
+    visible.objects, visible.hits = objects, hits
+    return visible
+
+
 @functools.cache
 def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
@@ -528,24 +566,19 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
         rays: wp.array2d[wp.vec2],
         scene: RayScene,
         # Out:
-        hit_object_out: wp.array2d[wp.int32],
-        hit_depth_out: wp.array2d[wp.float32],
-        hits_out: wp.array2d[Hit],
+        visible_out: VisibleObjects,
     ):
         i, j = wp.tid()
         i += row_start
         found = wp.int32(-1)
-        depth = wp.float32(wp.inf)
         if inside_rect(i, j, params[0].object_rect):
             ray = rays[i, j]
             direction = params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0)
             hit = closest_visible(scene, params[0].camera_position, direction)
             if hit.shape >= 0:
                 found = hit.shape
-                depth = hit.t
-                hits_out[i, j] = hit
-        hit_object_out[i, j] = found
-        hit_depth_out[i, j] = depth
+                visible_out.hits[i, j] = hit
+        visible_out.objects[i, j] = found
 
     return trace_pixels_kernel
 
@@ -555,9 +588,7 @@ def trace_pixels(
     params: wp.array[FrameParams],
     rays: wp.array2d[wp.vec2],
     scene: RayScene,
-    hit_object_out: wp.array2d[wp.int32],
-    hit_depth_out: wp.array2d[wp.float32],
-    hits_out: wp.array2d[Hit],
+    visible_out: VisibleObjects,
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -568,16 +599,14 @@ def trace_pixels(
         params: Frame values: camera and object_rect.
         rays: (H, W) undistorted x / z and y / z of each pixel centre.
         scene: What rays meet.
-        hit_object_out: (H, W) index of the visible object; -1 where there is none, and outside the rectangle.
-        hit_depth_out: (H, W) depth along the camera's z axis in metres, infinity where there is none.
-        hits_out: (H, W) the hits; defined only where there is an object.
+        visible_out: (H, W) the objects and hits.
         rows: Band of rows; None means all.
     """
     launch_rows(
         make_trace_pixels_kernel(config),
         rays.shape,
         [params, rays, scene],
-        [hit_object_out, hit_depth_out, hits_out],
+        [visible_out],
         rows=rows,
         device=rays.device,
     )

@@ -80,12 +80,13 @@ def test_plain_scales_linear_light(device, scale):
     check_error("expose", run(frame, scale, "plain"), exact)
 
 
+@pytest.mark.parametrize("method", expose.BOXES)
 @pytest.mark.parametrize("scale", SCALES)
-def test_box_matches_twin(device, scale):
+def test_boxes_match_their_twins(device, scale, method):
     frame = np.concatenate([disc(48, 10), make_layers(2)[0][:, :40].repeat(2, 0)], axis=1)
-    gains = reference.gains(frame, scale, expose.largest_box(frame.shape[0]))
+    gains = reference.gains(frame, scale, expose.largest_box(frame.shape[0]), method)
     exact = reference_color.encoded_srgb(np.clip(linear(frame) * gains[..., None] * np.float64(scale), 0.0, 1.0))
-    check_error("expose", run(frame, scale), exact)
+    check_error("expose", run(frame, scale, method), exact)
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.75, 2.0])
@@ -97,10 +98,11 @@ def test_layers_are_composed_before_they_are_exposed(device, scale):
     check_error("expose", run(frame, scale, "box", CONFIGS[15], *layers), exact)
 
 
-def test_centre_stays_bright_and_edge_fades(device):
+@pytest.mark.parametrize("method", ["paper", "box"])
+def test_centre_stays_bright_and_edge_fades(device, method):
     """Figure 7 of the paper: at half the exposure the middle of a large disc is white, its rim grey."""
     frame = disc(96, 30)
-    box, plain = run(frame, 0.5)[..., 0].astype(int), run(frame, 0.5, "plain")[..., 0].astype(int)
+    box, plain = run(frame, 0.5, method)[..., 0].astype(int), run(frame, 0.5, "plain")[..., 0].astype(int)
     assert box[48, 48] == 255
     assert plain[48, 48] == 188
     profile = box[48, 48:79]
@@ -126,21 +128,23 @@ def test_pixel_with_a_hue_is_not_lifted(device):
     np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
 
 
-def test_extreme_darkening_takes_a_small_region_like_the_rest(device):
+@pytest.mark.parametrize("method", ["paper", "box"])
+def test_extreme_darkening_takes_a_small_region_like_the_rest(device, method):
     """A disc smaller than half the largest box."""
     frame = disc(400, 12)
-    np.testing.assert_array_equal(run(frame, 0.05), run(frame, 0.05, "plain"))
+    np.testing.assert_array_equal(run(frame, 0.05, method), run(frame, 0.05, "plain"))
 
 
+@pytest.mark.parametrize("method", expose.BOXES)
 @pytest.mark.parametrize("frame", [disc(96, 30), np.full((30, 30, 3), 255, np.uint8)], ids=["disc", "saturated"])
-def test_brightness_never_falls_as_the_scale_rises(device, frame):
+def test_brightness_never_falls_as_the_scale_rises(device, frame, method):
     """No pixel may flash while the exposure is turned down; also continuous at 1."""
-    before = run(frame, 0.0).astype(int)
+    before = run(frame, 0.0, method).astype(int)
     for scale in np.linspace(0.05, 1.0, 20):
-        now = run(frame, scale).astype(int)
+        now = run(frame, scale, method).astype(int)
         assert (now >= before).all()
         before = now
-    almost = run(frame, np.nextafter(np.float32(1), np.float32(0))).astype(int)
+    almost = run(frame, np.nextafter(np.float32(1), np.float32(0)), method).astype(int)
     assert np.abs(almost - frame).max() <= 0
 
 
@@ -149,16 +153,42 @@ def test_all_black_stays_black(device, scale):
     np.testing.assert_array_equal(run(np.zeros((20, 30, 3), np.uint8), scale), 0)
 
 
+@pytest.mark.parametrize("scale", [0.01, 0.1, 0.25, 0.5, 0.9])
+def test_in_the_paper_nothing_bounds_what_stays_bright(device, scale):
+    """Section 4.3 knows no limit: where all around is saturated, white stays white, far more than a stop above s."""
+    np.testing.assert_array_equal(run(np.full((64, 64, 3), 255, np.uint8), scale, "paper"), 255)
+    wide = disc(96, 40)
+    assert (run(wide, scale, "paper")[48, 48] == 255).all()
+
+
+@pytest.mark.parametrize(("other", "factor"), [(255, 1.0), (191, 0.806), (128, 0.615)])
+def test_the_papers_factor_by_hand(device, other, factor):
+    """Stripes of white and of another code, far wider than the box: a is their mean, factor = s + (1 - s) (2 a - 1).
+
+    With 240 rows the box at a quarter is 1 + 0.75 * 29 = 22.75 pixels: between 21 and 23 whole ones, which hold 11 and
+    12 white columns of 21 and 23 around a white column when every other column is white.
+    """
+    frame = np.full((240, 240, 3), other, np.uint8)
+    frame[:, ::2] = 255
+    share = 0.125 * 11 / 21 + 0.875 * 11 / 23  # white columns around a white one: 11 of 21, 11 of 23
+    mean = (share * 255 + (1 - share) * other) / 255
+    exact = 0.25 + 0.75 * (2 * mean - 1)
+    assert exact == pytest.approx(factor, abs=0.01)
+    got = run(frame, 0.25, "paper")[120, 120]
+    np.testing.assert_allclose(got, reference_color.encoded_srgb(np.array(exact)), atol=0.51)
+
+
 @pytest.mark.parametrize("scale", [0.25, 0.5, 0.9])
 def test_all_saturated_darkens_by_the_bound(device, scale):
     expected = reference_color.encode(np.array(min(1.0, 2.0 * scale)), reference_color.encoded_srgb)
     np.testing.assert_array_equal(run(np.full((64, 64, 3), 255, np.uint8), scale), expected)
 
 
-def test_one_saturated_pixel_fades_with_the_rest(device):
+@pytest.mark.parametrize("method", ["paper", "box"])
+def test_one_saturated_pixel_fades_with_the_rest(device, method):
     frame = np.full((80, 80, 3), 60, np.uint8)
     frame[40, 40] = 255
-    np.testing.assert_array_equal(run(frame, 0.5), run(frame, 0.5, "plain"))
+    np.testing.assert_array_equal(run(frame, 0.5, method), run(frame, 0.5, "plain"))
 
 
 @pytest.mark.parametrize("scale", [-1.0, np.nan])

@@ -23,7 +23,11 @@ SCENES = ("darken", "desk", "mirror", "torus", "wire_coincident", "wire_opposing
 SIZE = (320, 240)
 FRAMES = 5  # the last one is compared: by then the light has been accumulated over several
 QUALITY = PRESETS["medium"]
-CASES = {**{name: (name, QUALITY) for name in SCENES}, "desk_bounce": ("desk", QUALITY.with_methods(relight="bounce"))}
+CASES = {
+    **{name: (name, QUALITY) for name in SCENES},
+    "desk_bounce": ("desk", QUALITY.with_methods(relight="bounce")),
+    **{f"{name}_paper": (name, PRESETS["paper"]) for name in SCENES},
+}
 """Scene and quality of every golden frame."""
 
 # Codes. Video decoders may differ by a code or two, CPU and CUDA by rounding; both are spread over all pixels.

@@ -232,6 +232,149 @@ def test_interrupt_finishes_the_file_and_exits_130(tmp_path: Path) -> None:
         assert sum(1 for _ in container.decode(video=0)) > 0
 
 
+@pytest.mark.skipif(os.name == "nt", reason="signals are sent as on POSIX")
+@pytest.mark.parametrize("moment", [0.0, 0.4])
+def test_sigterm_ends_as_an_interrupt_does(tmp_path: Path, moment: float) -> None:
+    video, report, light = tmp_path / "out.mp4", tmp_path / "run.json", tmp_path / "light"
+    command = [sys.executable, "-m", "warp_ar.live", str(write_scene(tmp_path)), "--device", "cpu", "--quality", "low"]
+    command += ["--loop", "--headless", "--output", str(video), "--report", str(report)]
+    command += ["--save-environment", str(light)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not (light / "0002.exr").exists() and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.05)
+        time.sleep(moment)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 143, errors
+    assert errors == ""
+    frames = json.loads(report.read_text())["frames"]
+    with av.open(str(video)) as container:
+        assert container.streams.video[0].frames == len(frames)  # an ordinary MP4 says how many it has
+    assert len(list(light.iterdir())) == len(frames)
+    assert not list(tmp_path.rglob(".*"))
+
+
+def write_frames(folder: Path) -> Path:
+    """A folder of frames that this program did not write."""
+    folder.mkdir()
+    with Synthetic("card", length=3) as card:
+        for frame in card:
+            cv2.imwrite(str(folder / f"{frame.index:04d}.png"), frame.image[..., ::-1])
+    return folder
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+# Options, of which two lead to one place: by one name, by a link of either kind, by a folder and a file in it.
+ONE_PLACE = {
+    "source and output": "--source frames --output frames",
+    "source and output, by ..": "--source frames --output frames/../frames",
+    "source and output, by a link": "--source frames --output link",
+    "source and output, videos": "--source clip.mp4 --output clip.mp4",
+    "source and output, hard links": "--source clip.mp4 --output hard.mp4",
+    "output and report": "--output z.mp4 --report z.mp4",
+    "output and report, by ..": "--output z.mp4 --report frames/../z.mp4",
+    "source and report": "--source clip.mp4 --report clip.mp4",
+    "scene and report": "--report scene.toml",
+    "scene's mesh and report": "--report ball.ply",
+    "scene's source and report": "--report here.mp4",
+    "calibration and report": "--calibration camera.yml --report camera.yml",
+    "calibration and report, hard links": "--calibration camera.yml --report hard.yml",
+    "output and environments": "--output out --save-environment out",
+    "source and environments": "--source frames --save-environment frames",
+    "an image and the folder it is in": "--source frames/0001.png --output frames",
+    "a report among the frames": "--output out --report out/0001.png",
+    "a report among the environments": "--save-environment out --report out/0001.exr",
+}
+
+
+@pytest.mark.parametrize("case", ONE_PLACE)
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_nothing_is_written_over_what_is_read_or_twice(
+    case: str, overwrite: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mesh = '[[object]]\nshape = "mesh"\nfile = "ball.ply"\n'
+    scene = write_scene(tmp_path, body=PROBE + mesh, source='path = "here.mp4"')
+    write_frames(tmp_path / "frames")
+    for name in ("clip.mp4", "here.mp4", "camera.yml", "ball.ply"):
+        (tmp_path / name).write_bytes(b"mine")
+    (tmp_path / "link").symlink_to("frames")
+    os.link("clip.mp4", "hard.mp4")
+    os.link("camera.yml", "hard.yml")
+    before = snapshot(tmp_path)
+    assert run(scene, "--headless", *ONE_PLACE[case].split(), *["--overwrite"] * overwrite) == 2
+    assert "name another" in message(capsys)
+    assert snapshot(tmp_path) == before
+
+
+def test_a_command_can_be_given_twice_and_foreign_files_stay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = write_scene(tmp_path)
+    out, light, report, video = (tmp_path / name for name in ("out", "light", "run.json", "a.mp4"))
+
+    def twice(frames: int, *more: str) -> int:
+        capsys.readouterr()
+        options = ["--save-environment", light, "--report", report]
+        code = run(scene, "--headless", "--frames", frames, "--output", video, *more)
+        return code or run(scene, "--headless", "--frames", frames, "--output", out, *options, *more)
+
+    assert twice(4) == 0
+    assert capsys.readouterr().err == ""
+    assert twice(2) == 0
+    words = capsys.readouterr().err
+    for path in (out, light, report, video):
+        assert f"warp_ar: {path}" in words
+    assert words.count("replaced") == words.count("\n") == 4
+    assert len(list(out.iterdir())) == len(list(light.iterdir())) == 2
+
+    for foreign in (report, video, out / "0007.png", light / "0007.exr"):
+        kept = foreign.read_bytes() if foreign.exists() else None
+        foreign.write_bytes(b"mine")
+        assert twice(2) == 2, foreign
+        assert "--overwrite" in capsys.readouterr().err
+        assert foreign.read_bytes() == b"mine"
+        assert twice(2, "--overwrite") == 0
+        assert foreign.exists() == (kept is not None)
+        assert not foreign.exists() or foreign.read_bytes() != b"mine"
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "device", "long", "nothing to write to"])
+def test_a_report_that_cannot_be_is_one_line_before_any_frame(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run.json"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "long":
+        path = tmp_path / ("x" * 5000)
+    else:
+        path = Path("/proc/no/run.json")
+    assert run(write_scene(tmp_path), "--headless", "--output", tmp_path / "out", "--report", path) == 2
+    assert len(message(capsys)) < 2000
+    assert not (tmp_path / "out").exists()
+
+
+def test_control_characters_do_not_reach_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a\x1b[31mb\x07", "two\nlines", "\u202edesrever", "half\ud800"):
+        assert live.main(["desk", "--headless", "--source", name]) == 2
+        text = message(capsys)
+        assert not set(text[:-1]) & set("\x1b\x07\n\u202e\ud800")
+    scene = write_scene(tmp_path)
+    scene.write_text(scene.read_text().replace('"small"', '"\\u001b[2J[red]small"'))
+    assert run(scene, "--frames", 2, "--output", tmp_path / "out") == 0
+    shown = capsys.readouterr()
+    assert "\x1b[2J" not in shown.out + shown.err
+
+
 def test_explain_runs_no_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(tmp_path, source='path = "scene.toml"')  # no picture: opening it as a source would fail
     assert explain.main([str(scene)]) == 0

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
+import os
+import re
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +26,7 @@ from warp_ar.scene import (
     Marker,
     MetallicRoughnessMaterial,
     Object,
+    Pose,
     Probe,
     Proxy,
     Scene,
@@ -275,6 +279,78 @@ def test_wrong_frames_are_refused_and_the_next_one_works(image: object, expected
         with pytest.raises(UsageError, match=expected):
             pipeline(image)
         assert pipeline(frames[0]).pose is not None
+
+
+def test_a_closed_pipeline_says_so(frames: Frames) -> None:
+    pipeline = Pipeline(make_scene(), device="cpu", quality="low", size=SIZE)
+    run(pipeline, frames[:1])
+    pipeline.close()
+    pipeline.close()
+    calls = (
+        lambda: pipeline(frames[0]),
+        lambda: pipeline.submit(frames[0]),
+        lambda: pipeline.update(make_scene()),
+        pipeline.warm_up,
+    )
+    for call in calls:
+        with pytest.raises(UsageError, match="the pipeline is closed; make another one"):
+            call()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_child_is_told_at_once(frames: Frames) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low", size=SIZE) as pipeline:
+        run(pipeline, frames[:1])
+        read, write = os.pipe()
+        if (child := os.fork()) == 0:
+            try:
+                pipeline.close()
+                pipeline(frames[0])
+            except UsageError as error:
+                os.write(write, str(error).encode())
+            finally:
+                os._exit(0)
+        os.close(write)
+        with os.fdopen(read, "rb") as told:
+            assert b"fork" in told.read()
+        os.waitpid(child, 0)
+        run(pipeline, frames[1:2])  # the parent goes on
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"time_seconds": math.nan}, "time_seconds = nan"),
+        ({"time_seconds": math.inf}, "time_seconds = inf"),
+        ({"time_seconds": "now"}, "time_seconds = 'now'"),
+        ({"exposure_time": math.nan}, "exposure_time = nan: expected a finite number of seconds above 0"),
+        ({"exposure_time": 0.0}, "exposure_time = 0.0"),
+        ({"exposure_time": -1.0}, "exposure_time = -1.0"),
+        ({"pose": Pose(np.full((3, 3), np.nan), np.zeros(3))}, "pose holds a number that is not finite"),
+    ],
+)
+def test_impossible_numbers_are_refused_and_the_next_frame_works(
+    arguments: dict[str, object], expected: str, frames: Frames
+) -> None:
+    with Pipeline(make_scene(), device="cpu", quality="low", size=SIZE, exposures=(0.02, 0.002)) as pipeline:
+        for call in (pipeline, pipeline.submit):
+            with pytest.raises(UsageError, match=re.escape(expected)):
+                call(frames[0], **arguments)
+        assert run(pipeline, frames[:1])[0].state is TrackState.TRACKED
+
+
+def test_impossible_exposures_are_refused(frames: Frames) -> None:
+    for scale in (math.nan, math.inf, -1.0, "dark"):
+        with pytest.raises(UsageError, match=r"exposure\.scale"):
+            Pipeline(make_scene(exposure=Exposure(scale)), device="cpu", quality="low", size=SIZE)
+    for exposures in ((math.nan, 0.01), (0.01, 0.0), (0.01, -0.02)):
+        with pytest.raises(UsageError, match="exposures = "):
+            Pipeline(make_scene(), device="cpu", quality="low", size=SIZE, exposures=exposures)
+    with Pipeline(make_scene(), device="cpu", quality="low", size=SIZE) as pipeline:
+        with pytest.raises(UsageError, match=r"exposure\.scale"):
+            pipeline.update(make_scene(exposure=Exposure(math.nan)))
+        run(pipeline, frames[:1])
 
 
 def test_wrong_warp_frame_is_refused() -> None:

@@ -21,6 +21,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.visibility import TraceConfig
 
@@ -104,21 +105,15 @@ def run(
     if irradiance_map is not None:
         surroundings = wp.array(irradiance_map, dtype=wp.vec3)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    relight.relight(
+    receiver = relight.make_receiver(
         config,
-        params,
-        wp.array(RAYS, dtype=wp.vec2),
-        frame_array,
-        tables()[0],
-        table,
-        scene,
-        records(Probe, *probes),
-        records(Light, *lights),
-        keys,
-        surroundings,
-        out,
-        rows=rows,
+        make_picture(frame_array, tables()[0], wp.array(RAYS, dtype=wp.vec2)),
+        table=table,
+        probes=records(Probe, *probes),
+        key_lights=keys,
+        irradiance=surroundings,
     )
+    relight.relight(config, params, scene, records(Light, *lights), receiver, out, rows=rows)
     return out.numpy()
 
 
@@ -157,18 +152,24 @@ def run_edges(
     summed_area.sum_area(frame, table)
     keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
     rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
-    known = frame, tables()[0], table
-    balls, lamps = records(Probe, *probes), records(Light, *lights)
-    surroundings = wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3)
-    out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
-    relight.relight(config, params, rays, *known, scene, balls, lamps, keys, surroundings, out, seen)
+    receiver = relight.make_receiver(
+        config,
+        make_picture(frame, tables()[0], rays),
+        table=table,
+        probes=records(Probe, *probes),
+        key_lights=keys,
+        irradiance=wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3),
+    )
+    inputs = config, params, scene, records(Light, *lights), receiver
+    out, visibility = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
+    relight.relight(*inputs, out, visibility)
     if samples > 1:
-        desk, lists = relight.make_receiver(config, *known, balls, keys, surroundings), None
+        lists = None
         if listed:
             sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
             lists = EdgeLists(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
         for band in rows or (None,):
-            relight.smooth_edges(config, params, rays, scene, lamps, desk, seen, out, edge_lists=lists, rows=band)
+            relight.smooth_edges(*inputs, visibility, out, edge_lists=lists, rows=band)
     return out.numpy()
 
 
@@ -211,13 +212,69 @@ def test_reflectance_of_a_lambertian_desk_is_recovered(device, rho):
     np.testing.assert_allclose(got, np.broadcast_to(rho / np.pi * n_dot_l * e, got.shape), rtol=HALF_CODE)
 
 
-@pytest.mark.parametrize("alpha", [-1.0, 0.0, 1.0])
-def test_paper_is_exact_at_its_three_cases(device, alpha):
-    n_dot_l, m = 0.7, 0.2
-    expected = {-1.0: 1.0 - m, 0.0: n_dot_l, 1.0: m}[alpha]
-    assert responses(n_dot_l, m, [alpha])[0][0] == pytest.approx(expected, abs=1e-6)
-    expected = {-1.0: 2.0 - m, 0.0: 1.0, 1.0: m}[alpha]
-    assert responses(n_dot_l, m, [alpha])[1][0] == pytest.approx(expected, abs=1e-6)
+SLANT = unit(0.6, 0.0, 0.8)
+"""Toward the virtual light of the paper's three cases: N.L = 0.8 on the desk."""
+CASES = {"coincident": (SLANT, 1.0), "orthogonal": (unit(-0.8, 0.0, 0.6), 0.0), "opposing": (-SLANT, -1.0)}
+"""Brightest physical direction, and the cosine between both."""
+
+
+def slanted():
+    return [{"kind": DIRECTIONAL, "direction": -SLANT, "intensity": (0.5, 0.4, 0.3)}]
+
+
+@pytest.mark.parametrize("directionality", [0.0, 0.41, 1.0])
+@pytest.mark.parametrize("case", CASES)
+def test_paper_in_its_three_cases_by_hand(device, case, directionality):
+    """[DH04] section 4.2 from a frame: Kd / pi E times the video at alpha = 1, N.L at 0, the video's inverse at -1.
+
+    Kd is 0.5, E (0.5, 0.4, 0.3). Columns of code 51 and 204: m = 0.2 and 0.8, the code over 255 (their linear luminance
+    would be 0.033 and 0.604). How far the environment's light dominates plays no part in the text.
+    """
+    frame = np.full((H, W, 3), 51, np.uint8)
+    frame[:, ::2] = 204
+    got = run("paper", slanted(), frame, key=(CASES[case][0], directionality))
+    dark, bright = {"coincident": (0.2, 0.8), "orthogonal": (0.8, 0.8), "opposing": (0.8, 0.2)}[case]
+    arriving = 0.5 / np.pi * np.array([0.5, 0.4, 0.3])
+    np.testing.assert_allclose(got[:, 1::2], np.broadcast_to(dark * arriving, got[:, 1::2].shape), rtol=FLOAT_ERROR)
+    np.testing.assert_allclose(got[:, ::2], np.broadcast_to(bright * arriving, got[:, ::2].shape), rtol=FLOAT_ERROR)
+
+
+@pytest.mark.parametrize("alpha", [-0.5, 0.25, 0.75])
+def test_paper_between_its_cases_by_hand(device, alpha):
+    """Between the cases the shader's interpolation, by |alpha|: (1 - |alpha|) N.L + |alpha| (m or 1 - m)."""
+    across = unit(-0.8, 0.0, 0.6)
+    key = alpha * SLANT + np.sqrt(1.0 - alpha * alpha) * across
+    got = run("paper", slanted(), np.full((H, W, 3), 51, np.uint8), key=(key, 0.41))
+    factor = (1.0 - abs(alpha)) * 0.8 + abs(alpha) * (0.2 if alpha > 0.0 else 0.8)
+    expected = factor * 0.5 / np.pi * np.array([0.5, 0.4, 0.3])
+    np.testing.assert_allclose(got, np.broadcast_to(expected, got.shape), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("reading", "expected"),
+    [
+        ("paper_linear", 1.0 - 0.03310477),  # the inverse of linear luminance, code 51
+        ("paper_shader", 2.0 * 0.8 - 0.2),  # the printed lerp at alpha = -1
+        ("paper_weighted", 0.6 * 0.8 + 0.4 * 0.8),  # alpha = -0.4: flat and inverse happen to be 0.8 both
+        ("directional", 0.6 * 0.8 + 0.4 * (1.0 - 0.03310477)),
+    ],
+)
+def test_other_readings_by_hand(device, reading, expected):
+    """The opposing case on a frame of code 51 where the light dominates by 0.4."""
+    got = run(reading, slanted(), np.full((H, W, 3), 51, np.uint8), key=(-SLANT, 0.4))
+    exact = expected * 0.5 / np.pi * np.array([0.5, 0.4, 0.3])
+    np.testing.assert_allclose(got, np.broadcast_to(exact, got.shape), rtol=1e-5)
+
+
+def test_relief_in_the_same_three_cases(device):
+    """m relative to its surroundings: at alpha = 1 structure shows as it is, at -1 turned around, at 0 not at all."""
+    frame = np.full((H, W, 3), 120, np.uint8)
+    frame[:, ::2] = 136
+    coincident, orthogonal, opposing = (run("relief", slanted(), frame, key=(key, 1.0)) for key, _ in CASES.values())
+    np.testing.assert_allclose(coincident + opposing, 2.0 * orthogonal, rtol=1e-5)
+    inner = slice(20, 40)
+    assert (coincident[24, inner][::2] > orthogonal[24, inner][::2]).all()
+    assert (opposing[24, inner][::2] < orthogonal[24, inner][::2]).all()
 
 
 @wp.kernel(enable_backward=False)
@@ -226,12 +283,12 @@ def response_kernel(
     m: wp.float32,
     directionality: wp.float32,
     alpha: wp.array[wp.float32],
-    printed_out: wp.array[wp.float32],
+    text_out: wp.array[wp.float32],
     relief_out: wp.array[wp.float32],
     turned_out: wp.array[wp.float32],
 ):
     i = wp.tid()
-    printed_out[i] = relight.printed_response(n_dot_l, m, alpha[i])
+    text_out[i] = relight.text_response(n_dot_l, m, alpha[i])
     relief_out[i] = relight.relief_factor(m, alpha[i])
     turned_out[i] = relight.turned_relief(m, alpha[i], directionality)
 
@@ -249,13 +306,11 @@ STEP = 5e-3  # alpha moves by 1e-3 and no response is steeper than 4 (e = -0.2 t
 @pytest.mark.parametrize("m", [0.0, 0.2, 0.8, 1.0, 1.3, 3.0, 50.0])
 def test_responses_are_continuous_and_never_negative(device, m):
     alpha = np.linspace(-1.0, 1.0, 2001)
-    printed, relief, turned = responses(0.7, min(m, 1.0), alpha)[0], *responses(0.7, m, alpha)[1:]
-    for values in (printed, relief, turned):
-        assert (
-            np.abs(np.diff(values)).max() < 4e-3 * 1.5
-        )  # slope at most 3 (m = 4) plus a kink; the printed lerp's is the same
+    text, relief, turned = responses(0.7, min(m, 1.0), alpha)[0], *responses(0.7, m, alpha)[1:]
+    for values in (text, relief, turned):
+        assert np.abs(np.diff(values)).max() < 4e-3 * 1.5  # slope at most 3 (m = 4) plus a kink; the text's is the same
         assert (values >= 0.0).all()
-    np.testing.assert_allclose(printed, reference.printed_response(0.7, min(m, 1.0), alpha), atol=1e-6)
+    np.testing.assert_allclose(text, reference.text_response(0.7, min(m, 1.0), alpha), atol=1e-6)
     np.testing.assert_allclose(relief, reference.relief_factor(m, alpha), atol=1e-6)
     np.testing.assert_allclose(turned, reference.turned_relief(m, alpha, 1.0), atol=1e-6)
 
@@ -270,13 +325,13 @@ def test_desk_without_structure_gives_the_same_for_every_alpha(device):
         )
 
 
-@pytest.mark.parametrize("method", ["paper", "relief"])
+@pytest.mark.parametrize("method", ["directional", "relief"])
 def test_ambient_environment_says_nothing_about_relief(device, method):
     """No dominant direction, or two equal and opposite lamps: directionality 0 and the direction does not matter."""
     light, frame = [point((0.1, 0.05, 0.3))], noise_frame()
     one = run(method, light, frame, key=((0, 0, 1), 0.0))
     np.testing.assert_array_equal(run(method, light, frame, key=((0, 0, -1), 0.0)), one)
-    if method == "paper":
+    if method == "directional":
         np.testing.assert_array_equal(one, run("flat", light, frame))
 
 
@@ -305,7 +360,7 @@ def test_relief_keeps_the_mean(device):
 # --- twins
 
 
-@pytest.mark.parametrize("method", relight.METHODS)
+@pytest.mark.parametrize("method", dict.fromkeys((*relight.METHODS, *relight.READINGS)))
 def test_matches_twin(device, method):
     frame = noise_frame()
     key, directionality = unit(-0.5, 0.3, 0.8), 0.7
@@ -572,29 +627,28 @@ def test_nearer_to_the_truth_method_by_method(device, shared):
     frame, table = wp.array(camera, dtype=wp.vec3ub), wp.zeros((height, width), wp.uint32)
     summed_area.sum_area(frame, table)
     decode_table = color.decode_table("srgb")
+    rays = wp.array(pixel_rays(scene.camera), dtype=wp.vec2)
+    picture = make_picture(frame, wp.array(decode_table, dtype=wp.vec3), rays)
     before, wanted = (reference_color.decode(decode_table, image) for image in (camera, truth))
     changed = np.abs(wanted - before).max(-1) > 0.05
     left = {}
     for method in relight.METHODS:
         added = wp.zeros((height, width), wp.vec3)
-        relight.relight(
-            relight.RelightConfig(method, trace_config(scene), "sh", True),
-            records(FrameParams, {**params, "light_rect": (0, height, 0, width)}),
-            wp.array(pixel_rays(scene.camera), dtype=wp.vec2),
-            frame,
-            wp.array(decode_table, dtype=wp.vec3),
-            table,
-            host.ray_scene,
-            records(Probe, {"center": probe.center, "radius": probe.radius}),
-            wp.array(lights, dtype=Light),
-            records(KeyLight, {"direction": direction, "directionality": directionality}),
-            wp.array(sh, dtype=wp.vec3),
-            added,
+        config = relight.RelightConfig(method, trace_config(scene), "sh", True)
+        receiver = relight.make_receiver(
+            config,
+            picture,
+            table=table,
+            probes=records(Probe, {"center": probe.center, "radius": probe.radius}),
+            key_lights=records(KeyLight, {"direction": direction, "directionality": directionality}),
+            irradiance=wp.array(sh, dtype=wp.vec3),
         )
+        place = records(FrameParams, {**params, "light_rect": (0, height, 0, width)})
+        relight.relight(config, place, host.ray_scene, wp.array(lights, dtype=Light), receiver, added)
         got = np.minimum(before + added.numpy(), 1.0)
         left[method] = np.abs(got - wanted)[changed].mean() / np.abs(before - wanted)[changed].mean()
-    assert left["paper"] < left["flat"]
-    assert left["relief"] < left["paper"]
+    assert left["directional"] < left["flat"]
+    assert left["relief"] < min(left["paper"], left["directional"])
     assert left["reflectance"] < min(left["relief"], REFLECTANCE_LEFT)
 
 

@@ -17,6 +17,7 @@ import pytest
 
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.input.sources import open_source
+from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.sink import FRAMES_WAITING
 from warp_ar.output.sinks import (
     EnvironmentSink,
@@ -84,12 +85,71 @@ def test_folder_holds_exactly_what_was_written(tmp_path: pathlib.Path) -> None:
 
 
 def test_folder_leaves_other_files_alone(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "0000.png").write_text("old")
-    (tmp_path / "0007.png").write_text("kept")
+    for name in ("notes.txt", "0007.exr", "f0007.png", "7.png"):
+        (tmp_path / name).write_text("kept")
     with open_sink(tmp_path, fps=24) as sink:
         sink.write(flat(9))
+        assert sink.replaced == ""
     assert cv2.imread(str(tmp_path / "0000.png")).mean() == 9
-    assert (tmp_path / "0007.png").read_text() == "kept"
+    for name in ("notes.txt", "0007.exr", "f0007.png", "7.png"):
+        assert (tmp_path / name).read_text() == "kept"
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_frames_of_an_earlier_run_go_with_a_word(tmp_path: pathlib.Path, kind: str) -> None:
+    def run(count: int, **options: bool) -> str:
+        with FolderSink(tmp_path, **options) if kind == "png" else EnvironmentSink(tmp_path, **options) as sink:
+            for _ in range(count):
+                sink.write(flat(9) if kind == "png" else radiance())
+            return sink.replaced
+
+    assert run(6) == ""
+    assert "6 numbered frames of an earlier run" in run(0)
+    assert len(list(tmp_path.iterdir())) == 6  # nothing new, nothing lost
+    assert "6 numbered frames of an earlier run" in run(2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"0000.{kind}", f"0001.{kind}"]
+    (tmp_path / f"0009.{kind}").write_bytes(b"mine")
+    with pytest.raises(SinkError, match=r"1 numbered frames that this program did not write, such as 0009"):
+        run(2)
+    assert (tmp_path / f"0009.{kind}").read_bytes() == b"mine"
+    assert "3 numbered frames" in run(1, overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == [f"0000.{kind}"]
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.mkv", "clip.mov", "e.exr"])
+def test_only_what_was_written_here_is_replaced(tmp_path: pathlib.Path, name: str) -> None:
+    path = tmp_path / name
+
+    def write(**options: bool) -> str:
+        if name == "e.exr":
+            write_environment(path, radiance(), **options)
+            return ""
+        with open_sink(path, fps=24, **options) as sink:
+            for _ in range(30):
+                sink.write(flat(9))
+            return sink.replaced
+
+    assert write() == ""
+    assert name == "e.exr" or "this program wrote it before" in write()
+    path.write_bytes(b"mine")
+    with pytest.raises(SinkError, match="did not write it; name another, or replace it with --overwrite"):
+        write()
+    assert path.read_bytes() == b"mine"
+    write(overwrite=True)
+    write()
+    path.write_bytes(b"")  # an empty file, as mktemp makes one: nothing is lost
+    write()
+    assert path.stat().st_size > 4
+
+
+def test_a_video_that_was_cut_off_by_a_kill_is_known_as_ones_own(tmp_path: pathlib.Path) -> None:
+    with open_sink(tmp_path / "clip.mp4", fps=24) as sink:
+        for level in range(96):
+            sink.write(flat(level))
+        while not (tmp_path / "clip.mp4").exists():
+            sink.write(flat(0))
+        shutil.copy(tmp_path / "clip.mp4", tmp_path / "killed.mp4")
+    assert "this program wrote it before" in open_sink(tmp_path / "killed.mp4", fps=24).replaced
 
 
 @pytest.mark.parametrize("name", ["frames", "clip.mp4"])
@@ -267,26 +327,93 @@ def test_no_frame_leaves_no_file_and_no_loss(tmp_path: pathlib.Path) -> None:
     open_sink(tmp_path / "new.mp4", fps=24).close()
     assert not (tmp_path / "new.mp4").exists()
     (tmp_path / "old.mp4").write_text("old")
-    open_sink(tmp_path / "old.mp4", fps=24).close()
+    open_sink(tmp_path / "old.mp4", fps=24, overwrite=True).close()
     assert (tmp_path / "old.mp4").read_text() == "old"
 
 
-@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="needs /dev/full, a disk without environment")
-@pytest.mark.parametrize("name", ["clip.mkv", "clip.mp4"])
-def test_full_disk_is_told(tmp_path: pathlib.Path, name: str) -> None:
-    (tmp_path / name).symlink_to("/dev/full")
-    sink = open_sink(tmp_path / name, fps=24)
+@pytest.fixture
+def disk(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A disk of 400 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = (
+        sys.platform == "linux"
+        and not subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)], check=False, capture_output=True
+        ).returncode
+    )
+    if not mounted:
+        pytest.skip("no small disk can be mounted here")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+# What is on the disk beside: every fragment, and the end of the file, is cut off somewhere.
+@pytest.mark.parametrize("taken", [0, 130, 200, 270, 330, 390])
+@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
+def test_full_disk_leaves_whole_files_and_true_counts(disk: pathlib.Path, name: str, taken: int) -> None:
+    (disk / "other").write_bytes(bytes(1000 * taken))
     rng = np.random.default_rng(0)
+    sink = EnvironmentSink(disk / name) if name == "light" else open_sink(disk / name, fps=24)
 
     def fill() -> None:
-        try:
-            for _ in range(60):
-                sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
-        finally:
-            sink.close()
+        with sink:
+            for _ in range(260):
+                image = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+                sink.write(image.astype(np.float32) if name == "light" else image)
 
     with pytest.raises(SinkError, match="No space left"):
         fill()
+    if name == "light":
+        assert [read_environment(path).shape for path in (disk / name).iterdir()] == [(48, 64, 3)] * sink.written
+    elif name == "frames":
+        assert len(list((disk / name).iterdir())) == sink.written
+        assert sink.written == 0 or len(levels(disk / name)) == sink.written
+    elif (disk / name).exists():
+        assert len(levels(disk / name)) == sink.written
+    assert not list(disk.rglob(".*"))
+    assert threading.active_count() < 20
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_an_end_that_does_not_fit_leaves_the_fragments(disk: pathlib.Path, name: str) -> None:
+    # 60 frames take 110 to 124 kB: the last fragments fit or not, and so does what makes an ordinary file of them.
+    outcomes = set()
+    for free in range(96, 136, 4):
+        (disk / name).unlink(missing_ok=True)
+        (disk / "other").write_bytes(bytes((400 - free) * 1024))
+        rng, told = np.random.default_rng(0), ""
+        try:
+            with open_sink(disk / name, fps=24) as sink:
+                for _ in range(60):
+                    sink.write(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        except SinkError as error:
+            told = str(error)
+        assert len(levels(disk / name)) == sink.written
+        assert (sink.written == 60) == (told == "") or "finished" in told
+        outcomes.add(sink.written)
+    assert 60 in outcomes
+    assert len(outcomes) > 1
+
+
+@pytest.mark.parametrize("name", VIDEOS)
+def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name: str) -> None:
+    with open_sink(disk / name, fps=24) as sink:
+        for level in range(20):
+            sink.write(flat(level))
+    before = (disk / name).read_bytes()
+    free = shutil.disk_usage(disk).free
+    (disk / "other").write_bytes(bytes(max(free - 8192, 0)))
+    rng = np.random.default_rng(0)
+
+    def fill() -> None:
+        with open_sink(disk / name, fps=24) as sink:
+            for _ in range(60):
+                sink.write(rng.integers(0, 256, (480, 640, 3), dtype=np.uint8))
+
+    with pytest.raises(SinkError, match="No space left"):
+        fill()
+    assert (disk / name).read_bytes() == before
 
 
 # --------------------------------------------------------------------------------------------------------------- errors
@@ -411,9 +538,10 @@ def test_environment_errors(tmp_path: pathlib.Path, capfd: pytest.CaptureFixture
     (tmp_path / "bad.exr").write_bytes(b"no picture")
     with pytest.raises(SinkError, match="float32"):
         write_environment(tmp_path / "e.exr", radiance().astype(np.float64))
-    for path in (tmp_path / "folder.exr", tmp_path / "file" / "e.exr"):
-        with pytest.raises(SinkError, match="cannot be written"):
-            write_environment(path, radiance())
+    with pytest.raises(SinkError, match="is a folder"):
+        write_environment(tmp_path / "folder.exr", radiance())
+    with pytest.raises(SinkError, match="cannot be written"):
+        write_environment(tmp_path / "file" / "e.exr", radiance())
     with pytest.raises(SinkError, match="there is no file"):
         read_environment(tmp_path / "none.exr")
     with pytest.raises(SinkError, match="cannot be read"):

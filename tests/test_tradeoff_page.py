@@ -6,7 +6,6 @@ import base64
 import html.parser
 import re
 
-import numpy as np
 import pytest
 
 from tests.accuracy_rig import case, frames, report  # noqa: F401  (fixtures)
@@ -54,14 +53,3 @@ def test_the_page_is_whole_and_needs_nothing_else(report):
     for source in checker.images:
         code = re.fullmatch(r"data:image/webp;base64,(.+)", source).group(1)
         assert base64.b64decode(code)[:4] == b"RIFF"
-
-
-def test_crops_lie_around_what_is_to_be_seen():
-    region = np.zeros((480, 640), bool)
-    region[400:470, 600:630] = True
-    region[0, 0] = True  # one stray pixel
-    rows, columns = tradeoff_page.bounding_box(region, region.shape)
-    assert rows.start <= 400 <= 470 <= rows.stop <= 480
-    assert columns.start <= 600 <= 630 <= columns.stop <= 640
-    assert rows.stop - rows.start < 200
-    assert tradeoff_page.bounding_box(np.zeros((48, 64), bool), (48, 64)) == (slice(0, 48), slice(0, 64))

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.command_line import EXIT_DONE, EXIT_INTERRUPTED, EXIT_USAGE, Parser
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.errors import UsageError
 from warp_ar.input.ball import posed_frames
 from warp_ar.input.ball_outline import locate_ball
 from warp_ar.input.camera_calibration import calibrate_camera, write_camera
@@ -133,13 +133,10 @@ def _run_ball(options: argparse.Namespace) -> None:
             how = f"by the desk in it, +/- {1e3 * report.deviation:.2f} mm"
         print(f"probe {index}: center = [{x:.5f}, {y:.5f}, {z:.5f}]  ({moved:.1f} mm off the scene's; {how})")
         if report.contrast < 0.2:
-            print(
-                f"warp_ar: probe {index}: little contrast at the ball's rim ({report.contrast:.0%}); check the result",
-                file=sys.stderr,
-            )
+            say(f"probe {index}: little contrast at the ball's rim ({report.contrast:.0%}); check the result")
 
 
-def _run(options: argparse.Namespace) -> None:
+def _run(options: argparse.Namespace) -> int:
     if options.command == "card":
         write_card(_marker(options), options.output, options.paper, options.dpi)
         print(f"{options.output}: print at 100 %, without fitting to the page, and check that the bar is 100 mm")
@@ -157,7 +154,7 @@ def _run(options: argparse.Namespace) -> None:
             f"(worst {max(report.view_errors):.3f}), {report.coverage:.0%} of the picture covered"
         )
         for warning in report.warnings:
-            print(f"warp_ar: {warning}", file=sys.stderr)
+            say(warning)
     elif options.command == "response":
         curve = measure_response(list(_pictures(options.pictures)), options.exposures)
         write_response(curve, options.output)
@@ -165,18 +162,12 @@ def _run(options: argparse.Namespace) -> None:
         print(f"{options.output}: code 128 is {middle} of clipping (sRGB: 0.2159)")
     else:
         _run_ball(options)
+    return EXIT_DONE
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    try:
-        _run(make_parser().parse_args(arguments))
-    except WarpArError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
-    return EXIT_DONE
+    return run_command(lambda: _run(make_parser().parse_args(arguments)))
 
 
 if __name__ == "__main__":

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE, Parser
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
-from warp_ar.errors import WarpArError
-from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
 from warp_ar.stages import STAGES
@@ -41,18 +40,19 @@ def make_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    try:
-        options = make_parser().parse_args(arguments)
-        if options.numerics:
-            print_numerics()
-            return EXIT_DONE
-        scene = load_scene(options.scene)
-        size = (scene.camera.width, scene.camera.height)
-        exposures = bracket_ratios((scene.source and scene.source.exposures) or ())
-        print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
-    except WarpArError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_USAGE
+    return run_command(lambda: explain(make_parser().parse_args(arguments)))
+
+
+def explain(options: argparse.Namespace) -> int:
+    """Print what is asked for."""
+    if options.numerics:
+        print_numerics()
+        return EXIT_DONE
+    scene = load_scene(options.scene)
+    size = (scene.camera.width, scene.camera.height)
+    spec = scene.source
+    exposures = plan_bracket(spec.exposures or (), spec.shown).ratios if spec is not None else ()
+    print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
     return EXIT_DONE
 
 

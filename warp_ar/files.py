@@ -203,7 +203,7 @@ def parse_json(text: str, label: str, error: type[WarpArError]) -> Any:
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:
     """Raise ``error`` if a text is nested too deeply for its reader."""
     if depth > limits().nesting:
-        raise error(too_much(label, depth, "levels of nesting", "nesting"))
+        raise error(too_much(f"{label}: it", depth, "levels of nesting", "nesting"))
 
 
 def write_whole(path: str | os.PathLike[str], write: bytes | Callable[[pathlib.Path], object]) -> None:

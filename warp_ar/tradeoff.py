@@ -28,9 +28,9 @@ from warp_ar.accuracy.figures import make_figures
 from warp_ar.accuracy.progress import WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.accuracy.runs import Clock
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.device import resolve_device
-from warp_ar.errors import UsageError, WarpArError
+from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 
 DEFAULT_FRAMES = 12
 
@@ -158,14 +158,8 @@ def tradeoff(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage or scene."""
-    try:
-        return tradeoff(make_parser().parse_args(arguments))
-    except UsageError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    except WarpArError as error:
-        print(f"warp_ar: {error}", file=sys.stderr)
-        return EXIT_FAILED
+    failures = (SceneError, SourceError, SinkError)
+    return run_command(lambda: tradeoff(make_parser().parse_args(arguments)), failures)
 
 
 if __name__ == "__main__":

@@ -117,7 +117,7 @@ def exposed(method, image, scale, device):
     return out.numpy()
 
 
-KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", "box")]
+KERNEL_METHODS = [method for method in METHODS["expose"] if method in ("plain", "paper", "box")]
 
 
 @pytest.mark.atlas(row=11, stage="expose")

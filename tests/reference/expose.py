@@ -21,8 +21,23 @@ def factor(mean, scale):
     return np.minimum(scale + (1.0 - scale) * w, MAX_GAIN * scale)
 
 
-def gains(frame, scale, max_box):
+def paper_factor(mean, scale):
+    """[DH04] section 4.3 without a bound; from a scale of 1e-3 on."""
+    w = np.clip(2.0 * mean / 255.0 - 1.0, 0.0, 1.0)
+    return scale + (1.0 - scale) * w
+
+
+def paper_mean_factor(mean, scale):
+    """The same with the mean itself for w."""
+    return scale + (1.0 - scale) * mean / 255.0
+
+
+FACTORS = {"box": factor, "paper": paper_factor, "paper_mean": paper_mean_factor}
+
+
+def gains(frame, scale, max_box, method="box"):
     """Factor / scale of every pixel."""
+    factor = FACTORS[method]
     values = summed_area.intensity(frame)
     clipped = np.clip((frame.min(-1) - KNEE) / (255.0 - KNEE), 0.0, 1.0)
     out = np.ones(frame.shape[:2])

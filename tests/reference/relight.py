@@ -36,9 +36,23 @@ def point_light(points, light, intensity):
     return wi, np.maximum(wi[..., 2:], 0.0), intensity / d2
 
 
-def printed_response(n_dot_l, m, alpha):
+def shader_response(n_dot_l, m, alpha):
+    return np.maximum((1.0 - alpha) * n_dot_l + alpha * m, 0.0)
+
+
+def text_response(n_dot_l, m, alpha):
     w = np.minimum(np.abs(alpha), 1.0)
     return (1.0 - w) * n_dot_l + w * np.where(alpha > 0.0, m, 1.0 - m)
+
+
+READINGS = {
+    "paper": ("video", text_response, False),
+    "directional": ("linear", text_response, True),
+    "paper_linear": ("linear", text_response, False),
+    "paper_shader": ("video", shader_response, False),
+    "paper_weighted": ("video", text_response, True),
+}
+"""Values of the multiplicative factor, blend, whether alpha is weighted."""
 
 
 def relief_factor(m, alpha):
@@ -71,8 +85,11 @@ def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, sur
     kd = np.full(radiance.shape, 0.5)
     if method == "flat":
         return kd, n_dot_l
-    if method == "paper":
-        return kd, printed_response(n_dot_l, m, alpha * directionality)
+    if method in READINGS:
+        values, response, weighted = READINGS[method]
+        if values == "video":
+            m = (summed_area.intensity(frame) / 255.0)[..., None]
+        return kd, response(n_dot_l, m, alpha * directionality if weighted else alpha)
     relative = m / around[..., None]
     if method == "relief":
         hue = radiance + 0.01

@@ -11,6 +11,8 @@ import zlib
 from collections.abc import Sequence
 from typing import Any
 
+import numpy.typing as npt
+
 from warp_ar.errors import UsageError
 
 SIZE = (5.6, 3.2)
@@ -98,7 +100,7 @@ def scatter(
 
 
 def lines(
-    series: Sequence[tuple[str, Sequence[float], Sequence[float]]],
+    series: Sequence[tuple[str, npt.ArrayLike, npt.ArrayLike]],
     x_title: str,
     y_title: str,
     size: tuple[float, float] = SIZE,
@@ -213,3 +215,18 @@ def to_svg(drawing: Any, title: str, description: str) -> str:
         svg = svg.replace(color, f"var(--{name})")
     label = html.escape(f"{title}: {description}", quote=True)
     return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1).strip()
+
+
+_DARK = {"soft": "#a9acb1", "ink": "#ececea", "line": "#303236", "card": "#1c1e21", "mark": "#7aa7ff"}
+
+
+def stand_alone(svg: str) -> str:
+    """A chart as a file of its own, with the colours that the page would give it."""
+    light = ";".join(f"--{name}:{color}" for name, color in (_COLORS | {"card": "#ffffff"}).items())
+    dark = ";".join(f"--{name}:{color}" for name, color in _DARK.items())
+    style = (
+        f"<style>svg{{{light};background:var(--card);font-family:sans-serif}}"
+        f"@media(prefers-color-scheme:dark){{svg{{{dark}}}}}</style>"
+    )
+    start = svg.index(">") + 1
+    return svg[:start] + style + svg[start:] + "\n"

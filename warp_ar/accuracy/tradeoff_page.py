@@ -11,7 +11,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from warp_ar.accuracy.case_report import SAME_ERROR, SAME_TIME, CaseReport, Whole
 from warp_ar.accuracy.cases import Image
@@ -19,16 +18,11 @@ from warp_ar.accuracy.charts import SIZE, SMALL, Point, scatter
 from warp_ar.accuracy.cost_table import SETTINGS, WORDS
 from warp_ar.accuracy.figures import Figure
 from warp_ar.accuracy.metrics import flip_map
+from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.accuracy.sweep import Row
-
-Box = tuple[slice, slice]
 
 QUALITY = 82
 """Of WebP, for all pictures."""
-CROP_WIDTH = 360
-"""Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
-CROP_ASPECT = 4.0 / 3.0
-"""Width over height of a crop."""
 SHOWN = ("paper", SAME_TIME, "medium", "high")
 """Wholes whose pictures are shown."""
 REAL_TIME = 1e3 / 30.0
@@ -80,42 +74,6 @@ def data_uri(image: Image) -> str:
     if not done:
         raise ValueError(f"a picture of shape {image.shape} cannot be encoded")
     return f"data:image/webp;base64,{base64.b64encode(code.tobytes()).decode('ascii')}"
-
-
-def error_colors(errors: npt.NDArray[Any]) -> Image:
-    """FLIP, 0..1, from black over red to yellow; the root of the error, so that small ones show."""
-    scaled = (np.sqrt(np.clip(errors, 0.0, 1.0)) * 255.0 + 0.5).astype(np.uint8)
-    colors = cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO)
-    return np.ascontiguousarray(colors[..., ::-1], dtype=np.uint8)
-
-
-def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
-    """Where a region lies, a little wider, in the shape of a crop and inside the picture; all of it if it is empty."""
-    height, width = shape
-    rows, columns = np.nonzero(region)
-    if len(rows) == 0:
-        return slice(0, height), slice(0, width)
-    # Outliers of a few pixels would make any box the whole picture.
-    top, bottom = np.quantile(rows, [0.01, 0.99])
-    left, right = np.quantile(columns, [0.01, 0.99])
-    high = max(bottom - top, (right - left) / CROP_ASPECT, 60.0) * 1.15 + 8.0
-    high = min(high, height, width / CROP_ASPECT)
-    wide = high * CROP_ASPECT
-    y = min(max(0.5 * (top + bottom) - 0.5 * high, 0.0), height - high)
-    x = min(max(0.5 * (left + right) - 0.5 * wide, 0.0), width - wide)
-    return slice(int(y), math.ceil(y + high)), slice(int(x), math.ceil(x + wide))
-
-
-def crop(image: Image, box: Box) -> Image:
-    """Part of a picture: small ones scaled up in whole steps so that pixels stay visible, large ones averaged down."""
-    part = image[box]
-    times = max(1, round(CROP_WIDTH / part.shape[1]))
-    if times > 1:
-        return np.ascontiguousarray(np.kron(part, np.ones((times, times, 1), np.uint8)))
-    if part.shape[1] <= CROP_WIDTH:
-        return np.ascontiguousarray(part)
-    size = CROP_WIDTH, max(1, round(part.shape[0] * CROP_WIDTH / part.shape[1]))
-    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def figure(image: Image, caption: str, about: str = "") -> str:

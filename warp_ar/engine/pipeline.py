@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
+import numbers
+import os
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -24,7 +27,7 @@ from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
-from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.ray_scene import skeleton
@@ -54,6 +57,19 @@ def resolve_quality(quality: str | Quality) -> Quality:
     return PRESETS[quality]
 
 
+def _check_number(name: str, value: object, above: float = -math.inf) -> None:
+    """Raise UsageError if an argument is no finite number, or not above a bound."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
+        right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
+        raise UsageError(f"{name} = {value!r}: expected {right}")
+
+
+def _check_exposure(scene: Scene) -> None:
+    scale = scene.exposure.scale
+    if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
+        raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
+
+
 class Pipeline:
     """Lights frames: call it with one frame after another of one camera.
 
@@ -69,9 +85,11 @@ class Pipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
 
@@ -81,24 +99,31 @@ class Pipeline:
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
-            exposures: Exposure times in seconds between which the frames alternate. Frames of the longest are lit and
-                shown; the others tell what clips in it.
+            exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
+                the others tell what clips in it, and what is too dark.
+            shown: Which: seconds; None means the longest.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
             UsageError: An argument that cannot be used.
             SceneError: The scene's camera does not fit ``size``.
         """
+        for exposure in exposures:
+            _check_number("exposures", exposure, above=0.0)
+        _check_exposure(scene)
+        self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
         self.quality = resolve_quality(quality)
-        self._longest = max(exposures, default=1.0)
-        ratios = bracket_ratios(exposures)
+        self.bracket = plan_bracket(exposures, shown)
+        """Which exposures are merged, and which is shown."""
+        ratios = self.bracket.ratios
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
@@ -113,7 +138,9 @@ class Pipeline:
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
-            self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+            self._scheduler = Scheduler(
+                self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
+            )
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.features, self._arrays, self.device)
 
@@ -127,10 +154,22 @@ class Pipeline:
 
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""
+        if self._closed or os.getpid() != self._process:
+            return  # a fork has neither the threads nor the device
+        self._closed = True
         if self._renderer is not None:
             self._renderer.shutdown()
         self.inputs.close()
         self._scheduler.close()
+
+    def _check_usable(self) -> None:
+        if self._closed:
+            raise UsageError("the pipeline is closed; make another one")
+        if os.getpid() != self._process:
+            raise UsageError(
+                f"the pipeline was made in process {self._process}, of which this one is a fork without its "
+                "threads and its device; make another one here, or start processes by spawn"
+            )
 
     @property
     def scheduler(self) -> Scheduler:
@@ -157,7 +196,10 @@ class Pipeline:
 
         Raises:
             SceneError: The scene's camera does not fit the size of the frames.
+            UsageError: The pipeline is closed, or another process's.
         """
+        self._check_usable()
+        _check_exposure(scene)
         self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
         if skeleton(scene) != skeleton(self.scene):
@@ -178,10 +220,12 @@ class Pipeline:
             progress: Called with how many of how many modules are compiled, first with 0, if any must be: kernels are
                 compiled once for a kind of scene and kept. On the caller's thread.
         """
+        self._check_usable()
         self._scheduler.warm_up(progress)
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
+        self._check_usable()
         self._finish()
         other._finish()
         self._start_time, self._last_time, self._lit_time = other._start_time, other._last_time, other._lit_time
@@ -209,10 +253,11 @@ class Pipeline:
                 pipeline's device, which is used without a copy to the host unless the marker must be found.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
             pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
-            exposure_time: Seconds; None means the longest of the pipeline's exposures.
+            exposure_time: Seconds; None means that of the frames that are shown.
 
         Raises:
-            UsageError: The image has another size or type.
+            UsageError: The image has another size or type, a number is not finite, the pipeline is closed, or it is
+                another process's.
         """
         return self._begin(image, time_seconds, pose, exposure_time, ahead=False)
 
@@ -236,15 +281,22 @@ class Pipeline:
         self, image: Any, time_seconds: float | None, pose: Pose | None, exposure_time: float | None, *, ahead: bool
     ) -> Result:
         """Look at a frame and have it rendered, by this thread or, if ``ahead``, by another where it is the host's."""
+        self._check_usable()
+        if time_seconds is not None:
+            _check_number("time_seconds", time_seconds)
+        if exposure_time is not None:
+            _check_number("exposure_time", exposure_time, above=0.0)
+        if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
+            raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         host_image = self._accept(image)
         handed_over = ahead and host_image is not None
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:
             self._start_time = self._last_time = self._lit_time = now
-        exposure = find_exposure(exposure_time, self._longest, self.plan.request.exposures)
-        if not handed_over or exposure > 0:
+        exposure = find_exposure(exposure_time, self.bracket)
+        if not handed_over or exposure != self.bracket.reference:
             self._finish()
-        if exposure > 0:
+        if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
         frame, state = self._look(image if host_image is None else host_image, now, pose)
         if handed_over:
@@ -326,15 +378,18 @@ class Pipeline:
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3)
 
-    def _take_short(self, image: Any, host_image: Image | None, exposure: int, now: float, pose: Pose | None) -> Result:
-        """Let a frame of another exposure tell of the light; the picture stays."""
+    def _take_short(
+        self, image: Any, host_image: Image | None, exposure: int | None, now: float, pose: Pose | None
+    ) -> Result:
+        """Let a frame of another exposure tell of the light, unless that was left out; the picture stays."""
         timings: dict[str, StageTiming] = {}
         bright: Any = image
         if self._shown is None or (self._tracker is not None and pose is None):
             picture = image.numpy() if host_image is None else host_image
-            bright = brightened(picture, self.inputs.decode, self.plan.request.exposures[exposure])
+            ratio = 1.0 if exposure is None else self.bracket.ratios[exposure]
+            bright = brightened(picture, self.inputs.decode, ratio)
         pose, state = self._track(bright, now, pose, timings)
-        if self._short is not None and pose is not None:
+        if self._short is not None and pose is not None and exposure is not None:
             start = time.perf_counter()
             with exclusive(self.device):
                 self._short.take(image, exposure, pose, self.inputs.block.host("params"), now)

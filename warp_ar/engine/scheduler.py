@@ -20,11 +20,12 @@ import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating, usable_cores
 from warp_ar.engine.crew import Crew
+from warp_ar.engine.demand import Demand
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.modules import Progress, load_modules
 from warp_ar.kernels.bands import serve_kernel
 from warp_ar.kernels.launch import Note, noting
-from warp_ar.stages.base import Arrays, Pass, Rows, Stage
+from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
 """A stage and those of its passes that are launched."""
@@ -38,7 +39,9 @@ class StageTiming:
     """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
     profiles, an equal share of the time that launching took the host."""
     skipped: bool
-    """True: nothing that it reads had changed."""
+    """True: nothing that it reads had changed, or it was left out of this frame."""
+    left_out: str | None = None
+    """Why it could change no pixel of this frame; None where that was not so."""
 
 
 SKIPPED = StageTiming(0.0, True)
@@ -48,7 +51,14 @@ class Scheduler:
     """Runs the stages of one plan on one device."""
 
     def __init__(
-        self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None, profile: bool = False
+        self,
+        plan: Plan,
+        arrays: Arrays,
+        device: Any,
+        *,
+        bands: int | None = None,
+        profile: bool = False,
+        culling: bool = True,
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -58,6 +68,7 @@ class Scheduler:
             device: Warp device.
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
+            culling: Whether stages that can change no pixel of a frame are left out of it.
         """
         self.plan = plan
         self.arrays = arrays
@@ -92,6 +103,11 @@ class Scheduler:
                 with noting() as notes:
                     self._stages.append((stage, stage.build(arrays, device)))
                 self._first_launches += notes
+        self._culling = culling
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._unneeded: Mapping[str, str] = {}
+        """Why stages can change no pixel of this frame."""
+        self._passes = {stage.name: passes for stage, passes in self._stages}
         self._readers = _find_readers([stage for stage, _ in self._stages])
         self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
@@ -159,7 +175,7 @@ class Scheduler:
                     self._readers,
                     threads=self._threads,
                     bands_per_pass=self.bands,
-                    decide=self._begin,
+                    decide=self._enter,
                     finish=self._publish,
                 )
         self._prepared = True
@@ -178,6 +194,7 @@ class Scheduler:
             progress: As for ``prepare``.
         """
         self.prepare(progress)
+        self._demand.forget()
         if self.device.is_cpu:
             return
         with exclusive(self.device):
@@ -205,20 +222,45 @@ class Scheduler:
             self._alone, self.clock = before
 
     def run(self) -> Mapping[str, StageTiming]:
-        """Run the stages whose inputs changed since they last ran; returns the time of each."""
+        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each."""
         self.prepare()
+        self._look()
         if not self.device.is_cpu:
             return self._run_captured()
         return self._run_eager() if self._crew is None or self._alone else self._run_side_by_side(self._crew)
 
+    def _look(self) -> None:
+        """Find out what this frame needs."""
+        reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
+        self._unneeded, clearing = self._demand.look(reach)
+        for stage, _ in self._stages:
+            if stage.name in self._unneeded:
+                stage.rest()
+        for name in clearing:
+            self._seen.pop(name, None)
+
+    def _timing_of_skipped(self, stage: Stage) -> StageTiming:
+        reason = self._unneeded.get(stage.name) if self._culling else None
+        return SKIPPED if reason is None else StageTiming(0.0, True, reason)
+
     def _due(self, stage: Stage) -> tuple[int, ...] | None:
-        """Versions of what ``stage`` reads, or None if it has already seen them."""
+        """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
+        if self._culling and stage.name in self._unneeded:
+            return None
         versions = self.arrays.versions(stage.wiring.reads)
         return None if self._seen.get(stage.name) == versions else versions
 
+    def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
+        """Passes of a stage that take part in this frame."""
+        if stage.name not in self._unneeded:
+            stage.begin()
+        return [step for step in passes if step.enabled is None or step.enabled()]
+
     def _publish(self, stage: Stage) -> None:
+        if stage.name in self._unneeded and type(stage).changed is not Stage.changed:
+            return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
-            if self.arrays.version(name) == 0 or stage.changed(name):
+            if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
     def _run_eager(self) -> dict[str, StageTiming]:
@@ -227,10 +269,10 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
             start = self.clock()
-            for step in _enabled_passes(stage, passes):
+            for step in self._begin(stage, passes):
                 # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
                 self._launch(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
@@ -251,7 +293,7 @@ class Scheduler:
             if stage.name in open_ended:
                 crew.ask(stage)
                 open_ended.update(self._readers[stage.name])
-            elif self._begin(stage) and _says_in_the_end(stage):
+            elif self._enter(stage) and _says_in_the_end(stage):
                 open_ended.update(self._readers[stage.name])
         try:
             times = crew.run()
@@ -260,19 +302,21 @@ class Scheduler:
             raise
         whole = (self.clock() - start) * 1e3
         busy = sum(times.values()) or 1.0
-        return {
-            name: StageTiming(whole * spent / busy, False) if name in self._ran else SKIPPED
-            for name, spent in times.items()
-        }
+        timings: dict[str, StageTiming] = {}
+        for stage, _ in self._stages:
+            spent = times[stage.name]
+            ran = stage.name in self._ran
+            timings[stage.name] = StageTiming(whole * spent / busy, False) if ran else self._timing_of_skipped(stage)
+        return timings
 
-    def _begin(self, stage: Stage) -> bool:
+    def _enter(self, stage: Stage) -> bool:
         """Tell the crew what is due of a stage; False if nothing is."""
         versions = self._due(stage)
         if versions is None:
             return False
         assert self._crew is not None
         late = _says_in_the_end(stage)
-        due = [(step, self._rows_of(step)) for step in _enabled_passes(stage, dict(self._stages)[stage])]
+        due = [(step, self._rows_of(step)) for step in self._begin(stage, self._passes[stage.name])]
         self._crew.begin(stage, due, tell=late)
         self._seen[stage.name] = versions
         self._ran.add(stage.name)
@@ -301,9 +345,9 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
-            chosen = _enabled_passes(stage, passes)
+            chosen = self._begin(stage, passes)
             due.append((stage, chosen))
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
@@ -397,12 +441,6 @@ def _make_marks(device: Any) -> tuple[Any, Any]:
 
 def _ids(steps: list[Pass]) -> tuple[int, ...]:
     return tuple(map(id, steps))
-
-
-def _enabled_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
-    """Passes of a stage that take part in this frame."""
-    stage.begin()
-    return [step for step in passes if step.enabled is None or step.enabled()]
 
 
 def _says_in_the_end(stage: Stage) -> bool:

@@ -148,7 +148,7 @@ class VideoSink(ThreadedSink):
             if self._error is None:
                 raise SinkError(f"{self._path} cannot be finished: {reason(error)}") from error
         finally:
-            if self._error is not None or self._broken:
+            if self._broken or (self._file is not None and self._file.error is not None):
                 self.written = _count_frames(self._path)
 
 

@@ -10,10 +10,28 @@ from typing import Any, ClassVar, Literal
 import warp as wp
 
 from warp_ar.kernels import environment_shadow
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.kernels import environment_shadow_filter as filters
+from warp_ar.kernels import environment_shadow_wavefront as wavefront
+from warp_ar.kernels.environment_samples import SampleSets
+from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
+from warp_ar.kernels.launch import count_partials
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import distant_variant
 
@@ -30,8 +48,8 @@ class Method:
     """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
     bounce: Literal["estimated", "traced"]
     """How what objects reflect onto the desk is found."""
-    asking: float = 1.0
-    """Share of the rays that asks for it: light that takes rays to find is smooth, and half of them find it."""
+    secondary: float = 1.0
+    """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 
 
 METHODS: Mapping[str, Method] = {
@@ -99,6 +117,10 @@ class EnvironmentShadow(Stage):
             reads.append("frame")
         return Wiring(tuple(reads), ("shadow_ratio",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Far from objects the environment is as it was."""
+        return None if reach.shadows else "no virtual object is near anything in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
@@ -109,86 +131,71 @@ class EnvironmentShadow(Stage):
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
             "environment_shadow_filtered": ArraySpec(cells, wp.vec3),
             "environment_shadow_surface": ArraySpec(cells, wp.int32, -1),
-            "environment_shadow_shaded": ArraySpec(environment_shadow.shaded_shape(*cells), wp.int32, -1),
-            "environment_shadow_seen": ArraySpec(environment_shadow.shaded_shape(*cells), wp.int32, -1),
+            "environment_shadow_shaded": ArraySpec(shaded_shape(*cells), wp.int32, -1),
+            "environment_shadow_changed": ArraySpec(shaded_shape(*cells), wp.int32, -1),
             "environment_shadow_bounced": ArraySpec(cells, wp.vec3),
         }
         return {**specs, **distant_light_arrays(self.features, self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
-        method = METHODS[self.method]
-        forms = distant_variant(self.features, device)
-        near = self.features.emitters
-        cells = arrays["environment_shadow_ratio"].shape
-        parts = 1 if device.is_cpu else environment_shadow.count_parts(*cells)
-        config = environment_shadow.EnvironmentShadowConfig(
-            forms, method.count, method.side, method.bounce, method.asking, near, parts
-        )
-        steps = None if device.is_cpu else environment_shadow.make_steps(config, *cells, device)
-        sums = None
-        if steps is None:
+        config = self._config(arrays, device)
+        wave = None if device.is_cpu else wavefront.make_wavefront(config, *arrays[f"{self.name}_ratio"].shape, device)
+        if wave is None:
             environment_shadow.make_environment_shadow_kernel(config)
-            if parts > 1:
-                sums = wp.empty(environment_shadow.sums_shape(parts, *cells), dtype=wp.vec3, device=device)
-        environment_shadow.make_filter_ratio_kernel(method.side)
-        environment_shadow.make_spread_ratio_kernel(forms)
+        filters.make_filter_ratio_kernel(config.side)
+        filters.make_spread_ratio_kernel(config.distant)
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
-        ratio, bounced, surface, filtered = (
-            arrays[f"environment_shadow_{name}"] for name in ("ratio", "bounced", "surface", "filtered")
-        )
-        out = arrays["shadow_ratio"]
-        frame = arrays["frame"] if method.bounce == "traced" else None
-        inputs = [arrays["params"], arrays["rays"], frame, arrays["decode"], arrays["ray_scene"]]
-        shadow_rows, stride = arrays["shadow_rows"], cell_size(method, self.request.size[1])
-
-        def cell_rows() -> Rows:
-            start, stop = shadow_rows()
-            reach = method.side  # the filter looks beyond the rows that it writes
-            return max(start // stride - reach, 0), min(-(-stop // stride) + reach, ratio.shape[0])
-
-        params, shaded, seen = arrays["params"], arrays["environment_shadow_shaded"], arrays["environment_shadow_seen"]
-        samples = [arrays[name] for name in sample_names(self.features)]
+        params, scene, cells = arrays["params"], arrays["ray_scene"], self._cells(arrays)
+        picture = find_picture(arrays, frame=config.bounce == "traced")
+        sets = SampleSets()
+        sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
         def estimate(rows: Rows | None) -> None:
             environment_shadow.shade_environment(
-                config,
-                *inputs,
-                distant,
-                *samples,
-                stride,
-                ratio,
-                bounced,
-                surface,
-                shaded_out=shaded,
-                sums_out=sums,
-                steps=steps,
-                rows=rows,
+                config, params, picture, scene, distant, sets, cells, wave=wave, rows=rows
             )
 
         def average(rows: Rows | None) -> None:
-            environment_shadow.filter_ratio(
-                ratio, bounced, surface, method.side, filtered, params=params, shaded=shaded, seen_out=seen, rows=rows
-            )
+            filters.filter_ratio(config, params, cells, rows=rows)
 
         def spread(rows: Rows | None) -> None:
-            environment_shadow.spread_ratio(
-                forms,
-                params,
-                arrays["rays"],
-                arrays["ray_scene"],
-                arrays["probes"],
-                filtered,
-                surface,
-                stride,
-                out,
-                seen=seen,
-                rows=rows,
+            filters.spread_ratio(
+                config, params, arrays["rays"], scene, arrays["probes"], cells, arrays["shadow_ratio"], rows=rows
             )
 
+        shadow_rows, stride, count = arrays["shadow_rows"], int(cells.stride), cells.surface.shape[0]
+
+        def cell_rows() -> Rows:
+            start, stop = shadow_rows()
+            reach = config.side  # the filter looks beyond the rows that it writes
+            return max(start // stride - reach, 0), min(-(-stop // stride) + reach, count)
+
         return [
-            Pass(estimate, rows=ratio.shape[0], extent=cell_rows),
-            Pass(average, rows=ratio.shape[0], extent=cell_rows),
+            Pass(estimate, rows=count, extent=cell_rows),
+            Pass(average, rows=count, extent=cell_rows),
             Pass(spread, rows=self.request.size[1], extent=GrowingRows(shadow_rows)),
         ]
+
+    def _config(self, arrays: Arrays, device: Any) -> EnvironmentShadowConfig:
+        """What the kernels are compiled for."""
+        method = METHODS[self.method]
+        partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
+        return EnvironmentShadowConfig(
+            distant_variant(self.features, device),
+            method.count,
+            method.side,
+            method.bounce,
+            method.secondary,
+            self.features.emitters,
+            partials,
+        )
+
+    def _cells(self, arrays: Arrays) -> ShadowCells:
+        """The stage's own arrays as its kernels read and write them."""
+        cells = ShadowCells()
+        cells.stride = cell_size(METHODS[self.method], self.request.size[1])
+        for name in ("ratio", "bounced", "surface", "shaded", "filtered", "changed"):
+            setattr(cells, name, arrays[f"{self.name}_{name}"])
+        return cells

@@ -21,7 +21,8 @@ class Expose(Stage):
     name: ClassVar[str] = "expose"
     methods: ClassVar[Mapping[str, str]] = {
         "plain": "scaled",
-        "box": "scaled less where surroundings clip too (the paper)",
+        "paper": "scaled less where surroundings clip too (the paper)",
+        "box": "the same, by one stop at most",
         "glow": "from the glow around them",
         "ball": "from the glow and the ball's view of the same lamp",
     }
@@ -69,7 +70,7 @@ class Expose(Stage):
         """The scale, the codes, the picture."""
         composed = composite_variant(composite_config(self.features.layers), device)
         config = expose.ExposeConfig(
-            "box" if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
+            self.method if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
         )
         expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
         params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+from warp_ar.kernels.expose import BOXES
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
 from warp_ar.scene.ray_scene import (
@@ -81,8 +82,8 @@ class Features:
     @property
     def near_names(self) -> tuple[str, ...]:
         """Resources of what surrounds the objects, those that their materials show."""
-        diffuse = () if self.distant.diffuse == "none" else ("object_irradiance",)
-        return (*diffuse, "object_mirrored") if self.distant.specular else diffuse
+        diffuse = () if self.distant.diffuse == "none" else ("near_irradiance",)
+        return (*diffuse, "near_reflected") if self.distant.specular else diffuse
 
 
 def find_features(request: Request) -> Features:
@@ -106,7 +107,7 @@ def find_features(request: Request) -> Features:
         merged=recovered and len(request.exposures) > 1,
         layers=layers,
         exposed=exposed,
-        boxed=darkened and quality.method("expose") == "box",
+        boxed=darkened and quality.method("expose") in BOXES,
         declipped=darkened and quality.method("expose") in ("glow", "ball"),
         declipped_by_ball=quality.method("expose") == "ball" and recovered,
         relight_method=relight_method,
@@ -143,5 +144,5 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLi
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
         specular=environment and any(map(reflects_glossily, materials)),
         probes=environment,
-        lamps=emitters,
+        emitters=emitters,
     )

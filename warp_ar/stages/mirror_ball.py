@@ -13,9 +13,10 @@ from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
@@ -54,12 +55,12 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
 
 def mirrored_shading(features: Features) -> ShadeConfig:
     """How objects look: what a ball shows of one is too small for what surrounds it at close range."""
-    return dataclasses.replace(shade_config(features), near=False, edge_samples=1)
+    return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
     """How the desk that a ball shows responds: cells of the frame say nothing about it."""
-    return dataclasses.replace(relight_config(features), share=False, bounced=False)
+    return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
 class MirrorBall(Stage):
@@ -106,6 +107,13 @@ class MirrorBall(Stage):
             reads.add("shadow_ratio")
         return Wiring(tuple(sorted(reads)), ("mirrored",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """A ball may show what is out of the picture itself."""
+        if not reach.balls:
+            return "no mirror ball is in the picture"
+        dark = not reach.shines and not self.request.scene.objects
+        return "no virtual light has any power" if dark else None
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""
         width, height = self.request.size
@@ -123,25 +131,22 @@ class MirrorBall(Stage):
         relighting = mirrored_relighting(self.features)
         irradiance = self.features.irradiance
         lit = config.relight is not None
-        desk = make_receiver(
+        receiver = make_receiver(
             relighting,
-            arrays["frame"],
-            arrays["decode"],
-            None,
-            arrays["probes"],
-            arrays["key_lights"] if "key_lights" in reads else None,
-            arrays[irradiance] if lit and irradiance in reads else None,
-            arrays["lamps"] if "lamps" in reads else None,
+            find_picture(arrays),
+            probes=arrays["probes"],
+            key_lights=arrays["key_lights"] if "key_lights" in reads else None,
+            irradiance=arrays[irradiance] if lit and irradiance in reads else None,
+            emitters=arrays["lamps"] if "lamps" in reads else None,
         )
         shading = config.shade
         distant = DistantLight() if shading is None else make_distant_light(self.features, arrays, self.name)
         inputs = (
             arrays["params"],
-            arrays["rays"],
             arrays["ray_scene"],
             arrays["light_array"] if "lights" in reads else None,
             distant,
-            desk,
+            receiver,
             arrays["shadow_ratio"] if config.ratio else None,
         )
 

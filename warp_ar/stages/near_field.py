@@ -12,9 +12,23 @@ import warp as wp
 from warp_ar.kernels import near_field
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.picture import find_picture, find_visible
 from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
@@ -64,27 +78,61 @@ class NearField(Stage):
         reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
         return Wiring(tuple(reads), features.near_names)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture nothing shows its surroundings."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
         width, height = self.request.size
         config = self.features.distant
         specs = {}
         if config.diffuse != "none":
-            specs["object_irradiance"] = specs["near_field_irradiance"] = ArraySpec((height, width), wp.vec3)
+            specs["near_irradiance"] = specs["near_field_irradiance"] = ArraySpec((height, width), wp.vec3)
         if config.specular:
-            specs["near_field_passed"] = ArraySpec((height, width), wp.vec4)
-            specs["object_mirrored"] = specs["near_field_mirrored"] = ArraySpec((height, width), wp.vec4)
+            specs["near_reflected"] = specs["near_field_reflected"] = ArraySpec((height, width), wp.vec4)
+            specs["near_field_transmitted"] = ArraySpec((height, width), wp.vec4)
         return {**specs, **distant_light_arrays(self.features, self.name)}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
+        config = self._config(device)
+        near_field.make_near_field_kernel(config)
+        near_field.make_filter_kernel(config)
+        params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
+        picture, layers = find_picture(arrays), near_field.ReceiverLayers()
+        if config.ratio:
+            layers.shadow_ratio = arrays["shadow_ratio"]
+        if config.added:
+            layers.added = arrays["physical_added"]
+        distant = make_distant_light(self.features, arrays, self.name)
+        samples = arrays["environment_samples"] if config.distant.diffuse != "none" else None
+        raw, near = near_field.NearLight(), near_field.NearLight()
+        for light, prefix in ((raw, "near_field_"), (near, "near_")):
+            for name in ("irradiance", "reflected", "transmitted"):
+                if prefix + name in arrays:
+                    setattr(light, name, arrays[prefix + name])
+
+        def estimate(rows: Rows | None) -> None:
+            near_field.estimate_near_field(
+                config, params, picture, layers, scene, distant, samples, visible, raw, rows=rows
+            )
+
+        def average(rows: Rows | None) -> None:
+            near_field.filter_near_field(config, params, scene, visible, raw, near, rows=rows)
+
+        height = self.request.size[1]
+        extent = arrays["object_rows"]
+        return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
+
+    def _config(self, device: Any) -> near_field.NearFieldConfig:
+        """What the kernels are compiled for."""
         layers = self.features.layers
-        forms = self.features.distant
         widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
         # The forms themselves stay the scene's: they are what the kernel writes.
-        variant = distant_variant(self.features, device)
-        config = near_field.NearFieldConfig(
+        forms, variant = self.features.distant, distant_variant(self.features, device)
+        return near_field.NearFieldConfig(
             dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
             COUNT,
             0 if all(sharp) else LOBE_COUNT,
@@ -93,34 +141,3 @@ class NearField(Stage):
             "shadow_ratio" in layers,
             "physical_added" in layers,
         )
-        near_field.make_near_field_kernel(config)
-        near_field.make_filter_kernel(config)
-        distant = make_distant_light(self.features, arrays, self.name)
-        inputs = [arrays[name] for name in ("params", "rays", "frame", "decode")]
-        inputs += [arrays.get("shadow_ratio"), arrays.get("physical_added"), arrays["ray_scene"], distant]
-        inputs += [
-            arrays["environment_samples"] if forms.diffuse != "none" else None,
-            arrays["hit_object"],
-            arrays["hits"],
-        ]
-        raw = [arrays.get(f"near_field_{name}") for name in ("irradiance", "mirrored", "passed")]
-        out = arrays.get("object_irradiance"), arrays.get("object_mirrored")
-
-        def estimate(rows: Rows | None) -> None:
-            near_field.light_objects(config, *inputs, *raw, rows=rows)
-
-        def average(rows: Rows | None) -> None:
-            near_field.filter_near_field(
-                config,
-                arrays["params"],
-                arrays["ray_scene"],
-                arrays["hit_object"],
-                arrays["hits"],
-                *raw,
-                *out,
-                rows=rows,
-            )
-
-        height = self.request.size[1]
-        extent = arrays["object_rows"]
-        return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]

@@ -11,14 +11,15 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
-from warp_ar.kernels.environment_shadow import count_parts
+from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import relight_variant
@@ -29,9 +30,9 @@ class Grain:
     """How finely cells of the desk are estimated."""
 
     samples: int
-    """Of the environment, for its share."""
-    share: int
-    """Pixels per cell of the environment's share, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
+    """Of the environment, for ambient visibility."""
+    ambient: int
+    """Pixels per cell of ambient visibility, in frames of ``STRIDE_ROWS`` rows; 1 is every pixel of any frame."""
     bounced: int
     """The same, of bounced light."""
     patch: int
@@ -50,6 +51,7 @@ class Relight(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "flat": "on a grey desk",
         "paper": "blended by the frame's brightness (the paper)",
+        "directional": "the same, as far as the environment's light has a direction",
         "relief": "the paper's blend, relief told from paint",
         "reflectance": "on the reflectance that frame and environment light give",
         "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
@@ -88,17 +90,23 @@ class Relight(Stage):
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
         return () if self.features.near_field else ("environment_shadow",)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without power, or out of the picture, light adds nothing."""
+        if not reach.shines:
+            return "no virtual light has any power"
+        return None if reach.light else "virtual light falls on nothing in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
         specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
-            specs["relight_seen"] = ArraySpec((height, width), wp.int32)
+            specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
         if self.features.ambient_visibility:
-            cells = _cells(self.request, _grain(self.features).share)
-            specs["relight_share"] = ArraySpec(cells, wp.vec3)
-            specs["relight_share_surface"] = ArraySpec(cells, wp.int32, -1)
+            cells = _cells(self.request, _grain(self.features).ambient)
+            specs["relight_ambient_visibility"] = ArraySpec(cells, wp.vec3)
+            specs["relight_ambient_surface"] = ArraySpec(cells, wp.int32, -1)
         if self.features.bounced:
             grain = _grain(self.features)
             cells, patches = _cells(self.request, grain.bounced), _cells(self.request, grain.patch)
@@ -111,46 +119,49 @@ class Relight(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
-        reads, irradiance = self.wiring.reads, self.features.irradiance
         config = relight_variant(relight_config(self.features), self.features, device)
         relight.make_relight_kernel(config)
-        cells = make_cells(self.features, arrays)
-        distant = arrays[irradiance] if irradiance in reads else None
-        known = (
-            arrays["frame"],
-            arrays["decode"],
-            arrays["summed_area"] if "summed_area" in reads else None,
-            arrays["ray_scene"],
-            arrays["probes"],
-            arrays["light_array"],
-            arrays["key_lights"] if "key_lights" in reads else None,
-            distant,
-        )
-        lamps = arrays["lamps"] if "lamps" in reads else None
-        camera = arrays["params"], arrays["rays"]
-        added, seen = arrays["physical_added"], arrays["relight_seen"] if config.edge_samples > 1 else None
+        receiver = self._receiver(config, arrays)
+        inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
+        added = arrays["physical_added"]
+        visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
         def launch(rows: Rows | None) -> None:
-            relight.relight(config, *camera, *known, added, seen, lamps=lamps, cells=cells, rows=rows)
+            relight.relight(config, *inputs, added, visibility, rows=rows)
 
-        height = self.request.size[1]
-        light_rows = arrays["light_rows"]
-        last = [Pass(launch, rows=height, extent=GrowingRows(light_rows))]
-        frame, decode, table, scene, probes, lights, key_lights, _ = known
-        desk = relight.make_receiver(config, frame, decode, table, probes, key_lights, distant, lamps, cells)
+        height, light_rows = self.request.size[1], arrays["light_rows"]
+        passes = [*self._cell_passes(config, inputs, arrays, device)]
+        passes.append(Pass(launch, rows=height, extent=GrowingRows(light_rows)))
         if config.edge_samples > 1:
             lists = make_edge_lists(arrays, device, self.name)
 
             def smooth(rows: Rows | None) -> None:
-                relight.smooth_edges(config, *camera, scene, lights, desk, seen, added, edge_lists=lists, rows=rows)
+                relight.smooth_edges(config, *inputs, visibility, added, edge_lists=lists, rows=rows)
 
             relight.make_smooth_edges_kernel(config, left=lists is not None)
             if lists is not None:
                 relight.make_sample_edges_kernel(config)
-            last.append(Pass(smooth, rows=height, extent=light_rows))
-        if not (config.share or config.bounced):
-            return last
+            passes.append(Pass(smooth, rows=height, extent=light_rows))
+        return passes
 
+    def _receiver(self, config: relight.RelightConfig, arrays: Arrays) -> relight.Receiver:
+        """What kernels read of the receiver."""
+        names = {
+            "table": "summed_area",
+            "key_lights": "key_lights",
+            "irradiance": self.features.irradiance,
+            "emitters": "lamps",
+        }
+        known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
+        cells = make_cells(self.features, arrays)
+        return relight.make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+
+    def _cell_passes(
+        self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any
+    ) -> list[Pass]:
+        """Ambient visibility and bounced light of cells, where the method knows them."""
+        params, scene, _, receiver = inputs
+        cells, light_rows = receiver.cells, arrays["light_rows"]
         place = receiver_cells.CellConfig(_keep_planes(config, self.request))
         passes: list[Pass] = []
 
@@ -165,47 +176,45 @@ class Relight(Stage):
 
             return extent
 
-        grain = _grain(self.features)
-        if config.share:
-            share, surface, size = arrays["relight_share"], arrays["relight_share_surface"], cells.share_stride
-            parts = 1 if device.is_cpu else count_parts(*share.shape, receiver_cells.SHARE_PARTS)
+        if config.ambient_visibility:
+            shape = cells.ambient_visibility.shape
+            partials = 1 if device.is_cpu else count_partials(*shape, receiver_cells.MAX_PARTIALS)
             sums = None
-            if parts > 1:
-                sums = wp.empty(receiver_cells.share_sums_shape(parts, *share.shape), dtype=wp.vec3, device=device)
+            if partials > 1:
+                sums = wp.empty(receiver_cells.partial_sums_shape(partials, *shape), dtype=wp.vec3, device=device)
+            samples, count = arrays["environment_samples"], _grain(self.features).samples
 
             def estimate(rows: Rows | None, bounced: bool = False) -> None:
-                own = arrays["environment_samples"], grain.samples, size, share, surface
-                more = {"bounced": bounced, "sums_out": sums, "rows": rows}
-                receiver_cells.share_environment(place, *camera, scene, lights, desk, *own, **more)
+                receiver_cells.estimate_ambient_visibility(
+                    place, *inputs, samples, count, cells, bounced=bounced, sums_out=sums, rows=rows
+                )
 
-            receiver_cells.make_share_environment_kernel(place)
-            passes.append(Pass(estimate, rows=len(share), extent=rows_of(size, len(share), 2)))
+            receiver_cells.make_ambient_visibility_kernel(place)
+            ambient_rows = rows_of(int(cells.ambient_stride), shape[0], 2)
+            passes.append(Pass(estimate, rows=shape[0], extent=ambient_rows))
         if config.bounced:
-            patches, listed, count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
-            bounced, lit = arrays["relight_bounced"], arrays["relight_bounced_surface"]
-            step, wide = cells.bounced_stride, _stride(self.request, grain.patch)
+            patches, listed, lit_count = (arrays[f"relight_{name}"] for name in ("patches", "listed", "count"))
+            wide = _stride(self.request, _grain(self.features).patch)
 
             def send(rows: Rows | None) -> None:
-                receiver_cells.send_light(place, *camera, scene, lights, desk, wide, patches, rows=rows)
+                receiver_cells.send_light(place, *inputs, wide, patches, rows=rows)
 
             def arrange(rows: Rows | None) -> None:
-                receiver_cells.list_patches(patches, listed, count, rows=rows)
+                receiver_cells.list_patches(patches, listed, lit_count, rows=rows)
 
             def gather(rows: Rows | None) -> None:
-                receiver_cells.gather_light(
-                    place, *camera, scene, desk, listed, count, wide, step, bounced, lit, rows=rows
-                )
+                receiver_cells.gather_light(place, params, scene, receiver, listed, lit_count, wide, cells, rows=rows)
 
             receiver_cells.make_send_light_kernel(place)
             receiver_cells.make_gather_light_kernel(place)
-            lit_patches = rows_of(wide, len(patches), 0)
+            lit_patches, height = rows_of(wide, len(patches), 0), len(cells.bounced)
             passes.append(Pass(send, rows=len(patches), extent=lit_patches))
             passes.append(Pass(arrange, rows=len(patches), extent=lit_patches))
-            passes.append(Pass(gather, rows=len(bounced), extent=rows_of(step, len(bounced), 2)))
-            if config.share:
+            passes.append(Pass(gather, rows=height, extent=rows_of(int(cells.bounced_stride), height, 2)))
+            if config.ambient_visibility:
                 again = functools.partial(estimate, bounced=True)
-                passes.append(Pass(again, rows=len(share), extent=rows_of(size, len(share), 2)))
-        return passes + last
+                passes.append(Pass(again, rows=shape[0], extent=ambient_rows))
+        return passes
 
 
 def _keep_planes(config: relight.RelightConfig, request: Request) -> relight.RelightConfig:
@@ -236,9 +245,10 @@ def make_cells(features: Features, arrays: Arrays) -> relight.ReceiverCells:
     cells = relight.ReceiverCells()
     if features.relight_method in GRAINS:
         grain, request = _grain(features), features.request
-        cells.share_stride, cells.bounced_stride = _stride(request, grain.share), _stride(request, grain.bounced)
+        cells.ambient_stride, cells.bounced_stride = _stride(request, grain.ambient), _stride(request, grain.bounced)
     if features.ambient_visibility:
-        cells.share, cells.share_surface = arrays["relight_share"], arrays["relight_share_surface"]
+        cells.ambient_visibility = arrays["relight_ambient_visibility"]
+        cells.ambient_surface = arrays["relight_ambient_surface"]
     if features.bounced:
         cells.bounced, cells.bounced_surface = arrays["relight_bounced"], arrays["relight_bounced_surface"]
     return cells

@@ -7,11 +7,25 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.shade import shade
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
 from warp_ar.stages.shared.variants import shade_variant
@@ -50,9 +64,13 @@ class Shade(Stage):
         if config.lights:
             reads.append("lights")
         reads += distant_light_reads(features)
-        if config.near:
+        if config.near_field:
             reads += features.near_names
         return Wiring(tuple(reads), ("virtual",))
+
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture nothing is covered."""
+        return None if reach.objects else OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
@@ -74,17 +92,18 @@ class Shade(Stage):
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
             make_distant_light(self.features, arrays, self.name),
-            arrays["hit_object"],
-            arrays["hits"],
+            find_visible(arrays),
         )
+        near = NearLight()
+        for name in self.features.near_names if config.near_field else ():
+            setattr(near, name.removeprefix("near_"), arrays[name])
 
         def launch(rows: Rows | None) -> None:
             shade(
                 variant,
                 *inputs,
                 arrays["virtual"],
-                near_irradiance=arrays.get("object_irradiance"),
-                near_mirrored=arrays.get("object_mirrored"),
+                near=near,
                 edge_lists=lists,
                 rows=rows,
             )

@@ -9,8 +9,21 @@ import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import trace_variant
 
@@ -33,7 +46,11 @@ class Visibility(Stage):
         """Left out of scenes without virtual objects."""
         if not features.request.scene.objects:
             return LeftOut(NO_OBJECT)
-        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hit_depth", "hits"))
+        return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
+
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture no pixel sees one."""
+        return None if reach.objects else OUT_OF_PICTURE
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
@@ -48,9 +65,9 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        outputs = [arrays[name] for name in ("hit_object", "hit_depth", "hits")]
+        visible = find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
-            trace_pixels(config, *inputs, *outputs, rows=rows)
+            trace_pixels(config, *inputs, visible, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["object_rows"]))]

@@ -1,0 +1,90 @@
+"""Cells of the frame: blocks of ``stride x stride`` pixels of which one, near the middle, is estimated for all."""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def cell_pixel(cell: wp.int32, stride: wp.int32, size: wp.int32) -> wp.int32:
+    """Row or column at which a cell is estimated."""
+    return wp.min(cell * stride + stride / 2, size - 1)
+
+
+@wp.func
+def cell_place(pixel: wp.int32, stride: wp.int32, size: wp.int32) -> wp.float32:
+    """Which cell is estimated at a row or column: whole numbers at ``cell_pixel``, even between, none beyond."""
+    last = (size - 1) / stride
+    low = wp.clamp((pixel - stride / 2) / stride, 0, last)
+    here = cell_pixel(low, stride, size)
+    there = cell_pixel(wp.min(low + 1, last), stride, size)
+    if pixel <= here or there <= here:
+        return wp.float32(low)
+    return wp.float32(low) + wp.min(wp.float32(pixel - here) / wp.float32(there - here), 1.0)
+
+
+@wp.func
+def look_up_cells(
+    values: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    key: wp.int32,
+    size: wp.vec2i,
+    row: wp.int32,
+    col: wp.int32,
+) -> wp.vec4:
+    """Mean of the cells around a pixel that lie on its surface, weighted as bilinear interpolation does, and 1.
+
+    Where none of those is on its surface, the mean of others that touch the pixel; zero where no cell around it shows
+    its surface. ``size`` is that of the frame.
+    """
+    y = cell_place(row, stride, size[0])
+    x = cell_place(col, stride, size[1])
+    i0 = wp.int32(y)
+    j0 = wp.int32(x)
+    total = wp.vec3()
+    weights = float(0.0)
+    beside = wp.vec3()
+    count = float(0.0)
+    for a in range(2):
+        for b in range(2):
+            i = wp.min(i0 + a, values.shape[0] - 1)
+            j = wp.min(j0 + b, values.shape[1] - 1)
+            if surface[i, j] == key:
+                weight = (1.0 - wp.abs(y - wp.float32(i0 + a))) * (1.0 - wp.abs(x - wp.float32(j0 + b)))
+                if weight > 0.0:
+                    total += weight * values[i, j]
+                    weights += weight
+                else:
+                    beside += values[i, j]
+                    count += 1.0
+    if weights <= 0.0:
+        if count <= 0.0:
+            return wp.vec4()
+        total = beside
+        weights = count
+    mean = total / weights
+    return wp.vec4(mean[0], mean[1], mean[2], 1.0)
+
+
+@wp.func
+def any_cell_above_zero(
+    values: wp.array2d[wp.vec3],
+    surface: wp.array2d[wp.int32],
+    stride: wp.int32,
+    size: wp.vec2i,
+    row: wp.int32,
+    col: wp.int32,
+) -> wp.bool:
+    """Whether any cell that ``look_up_cells`` may read for a pixel holds more than zero."""
+    i0 = wp.int32(cell_place(row, stride, size[0]))
+    j0 = wp.int32(cell_place(col, stride, size[1]))
+    for a in range(2):
+        for b in range(2):
+            i = wp.min(i0 + a, values.shape[0] - 1)
+            j = wp.min(j0 + b, values.shape[1] - 1)
+            if surface[i, j] >= 0 and wp.max(values[i, j]) > 0.0:
+                return True
+    return False

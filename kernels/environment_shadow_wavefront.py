@@ -1,0 +1,372 @@
+"""The estimates of cells as a wavefront of kernels, for a CUDA device.
+
+Secondary rays, which ask what an object sends, trace three more each and are rare: in one kernel they stall their warp.
+So rays only stop at objects at first; the light of cells where one did is summed; secondary rays are queued and traced
+side by side; and the partial sums are reduced in the order of the samples, with the same bits in every run.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.cells import cell_pixel
+from warp_ar.kernels.environment_samples import SampleSets, sample_toward
+from warp_ar.kernels.environment_shadow_bounce import caustic_alpha, make_bounced, make_estimated, make_look_before
+from warp_ar.kernels.environment_shadow_cells import (
+    CHUNK,
+    SHADED_TILE,
+    WARP_LANES,
+    EnvironmentShadowConfig,
+    ShadowCells,
+    bounced_of,
+    can_matter,
+    cell_column,
+    first_of_set,
+    ratio_of,
+)
+from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
+from warp_ar.kernels.launch import MOST_REGISTERS, launch
+from warp_ar.kernels.reflect import DistantLight
+from warp_ar.kernels.sampling import pcg3d_hash
+from warp_ar.kernels.structs import FrameParams, Picture, RayScene
+from warp_ar.kernels.visibility import FAR, intersect_sphere, make_trace, make_visible_proxy, offset_origin, surface_key
+
+wp.set_module_options({"enable_backward": False})
+
+WORD = 32
+"""Samples of a partial sum: the bits of a word."""
+MAX_QUEUE = 1 << 24
+"""Secondary rays that may be queued: beyond it the queue takes too much memory, 16 bytes each and more."""
+QUEUE_THREADS = 1 << 17
+"""Threads that trace the queue, each what is left of it when the others have theirs."""
+
+
+@wp.struct
+class Wavefront:
+    """What the kernels hand on; every cell has several partial sums, each over as many samples as a word has bits."""
+
+    occluded: wp.array3d[wp.uint32]  # (partials, rows, columns): samples that an object hides, a bit each
+    queue_starts: wp.array3d[wp.int32]  # (partials, rows, columns): place in the queue of the first secondary ray
+    queue: wp.array[wp.int32]  # number of the cell times CHUNK, plus the sample
+    queue_length: wp.array[wp.int32]  # (1,)
+    sums: wp.array3d[wp.vec3]  # (2 * partials, rows, columns): light without the objects, and what they hide
+    reflected: wp.array2d[wp.vec3]  # (2, queue): what objects send of the environment, and of the receiver
+
+
+@functools.cache
+def make_find_occluded_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of the first pass: samples that objects hide, and the queue of secondary rays."""
+    size = config.count // config.partials
+    secondary_count = config.secondary_count
+    side = config.side
+    mask_objects, mask_physical = make_masks(config, size)
+    trace = make_trace(config.distant.trace)
+    closest_proxy, occluded_by_objects = trace.closest_proxy, trace.occluded_by_objects
+    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def find_occluded_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        sets: SampleSets,
+        # Out:
+        cells_out: ShadowCells,
+        wave_out: Wavefront,
+    ):
+        partial, i, thread = wp.tid()
+        rays = picture.rays
+        stride = cells_out.stride
+        columns = cells_out.surface.shape[1]
+        j = cell_column(thread, columns, side, WARP_LANES)
+        row = cell_pixel(i, stride, rays.shape[0])
+        column = cell_pixel(j, stride, rays.shape[1])
+        key = wp.int32(-1)
+        found = wp.uint32(0)
+        if can_matter(row, column, stride * side, params[0].shadow_rect):
+            hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
+            if hit.shape >= 0:
+                key = surface_key(scene.proxies[hit.shape], hit.shape, hit.geometric_normal)
+                if partial == 0:
+                    cells_out.ratio[i, j] = wp.vec4(1.0, 1.0, 1.0, hit.t)
+                    cells_out.bounced[i, j] = wp.vec3(0.0)
+                begin = partial * size
+                at = first_of_set(i, j, side, sets.samples.shape[0]) + begin
+                virtual_mask = mask_objects(scene, sets, at, hit.point)
+                if virtual_mask != wp.uint64(0):
+                    physical = mask_physical(scene, distant, sets, at, hit.point, hit.shape)
+                    count = wp.int32(0)
+                    # Its end is no constant: unrolled, the kernel would hold its rays many times over.
+                    for k in range(begin, begin + size):
+                        bit = wp.uint64(1) << wp.uint64(k - begin)
+                        if (virtual_mask & bit) == wp.uint64(0):
+                            continue
+                        direction = sets.directions[at + k - begin]
+                        reach = float(FAR)
+                        if wp.static(config.emitters):
+                            toward = sample_toward(sets.samples[at + k - begin], hit.point)
+                            direction = toward.direction
+                            reach = toward.distance
+                        if wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction)) <= 0.0:
+                            continue
+                        origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                        if (physical.proxies & bit) != wp.uint64(0):
+                            proxy = closest_proxy(scene, origin, direction, reach)
+                            reach = wp.min(reach, proxy.t)
+                        if wp.static(config.distant.probes):
+                            if (physical.balls & bit) != wp.uint64(0):
+                                for index in range(distant.probes.shape[0]):
+                                    probe = distant.probes[index]
+                                    t = intersect_sphere(probe.radius, origin - probe.center, direction, reach)
+                                    reach = wp.min(reach, t)
+                        if occluded_by_objects(scene, origin, direction, reach):
+                            found = found | (wp.uint32(1) << wp.uint32(k - begin))
+                            if k < secondary_count:
+                                count += 1
+                    if count > 0:
+                        start = wp.atomic_add(wave_out.queue_length, 0, count)
+                        wave_out.queue_starts[partial, i, j] = start
+                        for k in range(begin, wp.min(begin + size, secondary_count)):
+                            if (found & (wp.uint32(1) << wp.uint32(k - begin))) != wp.uint32(0):
+                                wave_out.queue[start] = (i * columns + j) * CHUNK + k
+                                start += 1
+        if partial == 0:
+            cells_out.surface[i, j] = key
+        wave_out.occluded[partial, i, j] = found
+
+    return find_occluded_kernel
+
+
+@wp.func
+def any_occluded(occluded: wp.array3d[wp.uint32], i: wp.int32, j: wp.int32) -> wp.bool:
+    """Whether an object hides any sample from a cell."""
+    found = wp.uint32(0)
+    for partial in range(occluded.shape[0]):
+        found = found | occluded[partial, i, j]
+    return found != wp.uint32(0)
+
+
+@functools.cache
+def make_sum_light_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of the second pass: light of the environment, and how much of it is hidden, where something is."""
+    size = config.count // config.partials
+    side = config.side
+    _, mask_physical = make_masks(config, size)
+    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    find_sender = make_find_sender(config)
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def sum_light_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        sets: SampleSets,
+        cells: ShadowCells,
+        # Out:
+        wave_out: Wavefront,
+    ):
+        partial, i, thread = wp.tid()
+        j = cell_column(thread, cells.surface.shape[1], side, WARP_LANES)
+        if not any_occluded(wave_out.occluded, i, j):
+            return
+        rays = picture.rays
+        stride = cells.stride
+        pixel = rays[cell_pixel(i, stride, rays.shape[0]), cell_pixel(j, stride, rays.shape[1])]
+        hit = visible_proxy(params[0], pixel, scene, distant.probes)
+        begin = partial * size
+        at = first_of_set(i, j, side, sets.samples.shape[0]) + begin
+        physical = mask_physical(scene, distant, sets, at, hit.point, hit.shape)
+        met = physical.proxies | physical.balls
+        found = wp.uint64(wave_out.occluded[partial, i, j])
+        without = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        for k in range(at, at + size):
+            bit = wp.uint64(1) << wp.uint64(k - at)
+            direction = sets.directions[k]
+            reach = float(FAR)
+            grown = float(1.0)
+            if wp.static(config.emitters):
+                toward = sample_toward(sets.samples[k], hit.point)
+                direction = toward.direction
+                reach = toward.distance
+                grown = toward.measure / sets.samples[k].measure
+            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
+            if cosine > 0.0:
+                light = cosine * grown * sets.flux[k]
+                if (met & bit) != wp.uint64(0):
+                    origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+                    by_proxy = (physical.proxies & bit) != wp.uint64(0)
+                    by_ball = (physical.balls & bit) != wp.uint64(0)
+                    sender = find_sender(
+                        params, picture, scene, distant, sets, k, origin, direction, reach, by_proxy, by_ball
+                    )
+                    light = cosine * grown * sets.samples[k].measure * sender.radiance
+                without += light
+                if (found & bit) != wp.uint64(0):
+                    hidden += light
+        wave_out.sums[2 * partial, i, j] = without
+        wave_out.sums[2 * partial + 1, i, j] = hidden
+
+    return sum_light_kernel
+
+
+@functools.cache
+def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of the third pass: what objects send along the queued rays."""
+    secondary_count = config.secondary_count
+    side = config.side
+    closest_object = make_trace(config.distant.trace).closest_object
+    visible_proxy = make_visible_proxy(config.distant.trace, config.distant.probes)
+    traced = config.bounce == "traced"
+    bounced = make_bounced(config.distant) if traced else None
+    estimated, look_before = (
+        (None, None) if traced else (make_estimated(config.distant), make_look_before(config.distant))
+    )
+
+    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    def trace_secondary_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        picture: Picture,
+        scene: RayScene,
+        distant: DistantLight,
+        sets: SampleSets,
+        cells: ShadowCells,
+        threads: wp.int32,
+        # Out:
+        wave_out: Wavefront,
+    ):
+        rays = picture.rays
+        stride = cells.stride
+        columns = cells.surface.shape[1]
+        for place in range(wp.tid(), wave_out.queue_length[0], threads):
+            item = wave_out.queue[place]
+            i = item / CHUNK / columns
+            j = item / CHUNK % columns
+            index = first_of_set(i, j, side, sets.samples.shape[0]) + item % CHUNK
+            row = cell_pixel(i, stride, rays.shape[0])
+            column = cell_pixel(j, stride, rays.shape[1])
+            hit = visible_proxy(params[0], rays[row, column], scene, distant.probes)
+            direction = sets.directions[index]
+            measure = sets.samples[index].measure
+            if wp.static(config.emitters):
+                toward = sample_toward(sets.samples[index], hit.point)
+                direction = toward.direction
+                measure = toward.measure
+            cosine = wp.min(wp.dot(hit.normal, direction), wp.dot(hit.geometric_normal, direction))
+            origin = offset_origin(hit.point, hit.geometric_normal, direction, hit.error)
+            sent = wp.vec3(0.0)
+            returned = wp.vec3(0.0)
+            # What is nearer than all that is physical is nearest.
+            other = closest_object(scene, origin, direction, FAR)
+            if other.shape >= 0:
+                stands_for = cosine * measure * wp.static(config.count / secondary_count)
+                alpha = caustic_alpha(scene.objects[other.shape], hit.point)
+                if wp.static(traced):
+                    seed = pcg3d_hash(wp.uint32(index), wp.uint32(row), wp.uint32(column))
+                    sent = stands_for * bounced(params[0], picture, scene, distant, other, direction, alpha, seed)
+                else:
+                    before = look_before(distant, hit.geometric_normal, direction)
+                    light = estimated(scene, distant, other, direction, alpha, before.up, before.from_receiver)
+                    brightness = wp.max(light.distant + light.receiver)
+                    stands_for *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
+                    sent = stands_for * light.distant
+                    returned = stands_for * light.receiver
+            wave_out.reflected[0, place] = sent
+            if wp.static(not traced):
+                wave_out.reflected[1, place] = returned
+
+    return trace_secondary_kernel
+
+
+@functools.cache
+def make_reduce_partials_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
+    """Kernel of the last pass: estimates of the cells from which something is hidden."""
+    size = config.count // config.partials
+    secondary_count = config.secondary_count
+    traced = config.bounce == "traced"
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def reduce_partials_kernel(
+        # In:
+        params: wp.array[FrameParams],
+        wave: Wavefront,
+        # Out:
+        cells_out: ShadowCells,
+    ):
+        """Sums in the order of the samples, wherever their threads put them: the same bits in every run."""
+        i, j = wp.tid()
+        if not any_occluded(wave.occluded, i, j):
+            return
+        without = wp.vec3(0.0)
+        hidden = wp.vec3(0.0)
+        sent = wp.vec3(0.0)
+        returned = wp.vec3(0.0)
+        for partial in range(wave.occluded.shape[0]):
+            without += wave.sums[2 * partial, i, j]
+            hidden += wave.sums[2 * partial + 1, i, j]
+            found = wave.occluded[partial, i, j]
+            place = wave.queue_starts[partial, i, j]
+            for k in range(partial * size, wp.min((partial + 1) * size, secondary_count)):
+                if (found & (wp.uint32(1) << wp.uint32(k - partial * size))) != wp.uint32(0):
+                    sent += wave.reflected[0, place]
+                    if wp.static(not traced):
+                        returned += wave.reflected[1, place]
+                    place += 1
+        unchanged = hidden + sent == wp.vec3(0.0, 0.0, 0.0)
+        if cells_out.shaded.shape[0] > 0 and not unchanged:
+            cells_out.shaded[i / SHADED_TILE, j / SHADED_TILE] = params[0].frame_index
+        cells_out.ratio[i, j] = ratio_of(without, hidden, cells_out.ratio[i, j][3])
+        cells_out.bounced[i, j] = bounced_of(without, hidden, sent, returned)
+
+    return reduce_partials_kernel
+
+
+def make_wavefront(config: EnvironmentShadowConfig, rows: int, columns: int, device: wp.DeviceLike) -> Wavefront | None:
+    """Scratch of ``shade_wavefront``; None where a cell has more than a set of samples, or it would take too much.
+
+    Args:
+        config: As for ``shade_wavefront``; the samples of a partial sum are the bits of a word: 32 at most.
+        rows: Rows of cells.
+        columns: Cells in a row.
+        device: Where.
+    """
+    queue = rows * columns * config.secondary_count
+    if config.count > CHUNK or config.count // config.partials > WORD or queue > MAX_QUEUE:
+        return None
+    cells = config.partials, rows, columns
+    wave = Wavefront()
+    wave.occluded, wave.queue_starts = (wp.empty(cells, dtype=kind, device=device) for kind in (wp.uint32, wp.int32))
+    wave.queue, wave.queue_length = wp.empty(queue, dtype=wp.int32, device=device), wp.zeros(1, wp.int32, device=device)
+    wave.sums = wp.empty((2 * cells[0], *cells[1:]), dtype=wp.vec3, device=device)
+    wave.reflected = wp.empty((1 if config.bounce == "traced" else 2, queue), dtype=wp.vec3, device=device)
+    return wave
+
+
+def shade_wavefront(
+    config: EnvironmentShadowConfig,
+    params: wp.array[FrameParams],
+    picture: Picture,
+    scene: RayScene,
+    distant: DistantLight,
+    sets: SampleSets,
+    cells_out: ShadowCells,
+    wave: Wavefront,
+) -> None:
+    """Estimate all cells; arguments as those of ``shade_environment``, and the scratch of ``make_wavefront``."""
+    device = picture.rays.device
+    inputs = [params, picture, scene, distant, sets]
+    threads = min(wave.queue.shape[0], QUEUE_THREADS)
+    size = wave.occluded.shape
+    wave.queue_length.zero_()
+    launch(make_find_occluded_kernel(config), size, inputs, [cells_out, wave], device=device)
+    launch(make_sum_light_kernel(config), size, [*inputs, cells_out], [wave], device=device)
+    secondary = [*inputs, cells_out, threads]
+    launch(make_trace_secondary_kernel(config), threads, secondary, [wave], device=device)
+    launch(make_reduce_partials_kernel(config), size[1:], [params, wave], [cells_out], device=device)

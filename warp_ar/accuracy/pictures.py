@@ -1,0 +1,85 @@
+"""Crops of pictures around what is to be seen, error maps, and sheets of both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.accuracy.cases import Image
+from warp_ar.accuracy.metrics import flip_map
+
+Box = tuple[slice, slice]
+"""Rows and columns of a crop."""
+CROP_WIDTH = 360
+"""Crops are about this many pixels wide: fewer are shown as they are, more are averaged."""
+CROP_ASPECT = 4.0 / 3.0
+"""Width over height of a crop."""
+GAP = 6
+"""Pixels between the pictures of a sheet."""
+
+
+def error_colors(errors: npt.NDArray[Any]) -> Image:
+    """FLIP, 0..1, from black over red to yellow; the root of the error, so that small ones show."""
+    scaled = (np.sqrt(np.clip(errors, 0.0, 1.0)) * 255.0 + 0.5).astype(np.uint8)
+    colors = cv2.applyColorMap(scaled, cv2.COLORMAP_INFERNO)
+    return np.ascontiguousarray(colors[..., ::-1], dtype=np.uint8)
+
+
+def bounding_box(region: npt.NDArray[np.bool_], shape: tuple[int, int]) -> Box:
+    """Where a region lies, a little wider, in the shape of a crop and inside the picture; all of it if it is empty."""
+    height, width = shape
+    rows, columns = np.nonzero(region)
+    if len(rows) == 0:
+        return slice(0, height), slice(0, width)
+    # Outliers of a few pixels would make any box the whole picture.
+    top, bottom = np.quantile(rows, [0.01, 0.99])
+    left, right = np.quantile(columns, [0.01, 0.99])
+    high = max(bottom - top, (right - left) / CROP_ASPECT, 60.0) * 1.15 + 8.0
+    high = min(high, height, width / CROP_ASPECT)
+    wide = high * CROP_ASPECT
+    y = min(max(0.5 * (top + bottom) - 0.5 * high, 0.0), height - high)
+    x = min(max(0.5 * (left + right) - 0.5 * wide, 0.0), width - wide)
+    return slice(int(y), math.ceil(y + high)), slice(int(x), math.ceil(x + wide))
+
+
+def crop(image: Image, box: Box) -> Image:
+    """Part of a picture: small ones scaled up in whole steps so that pixels stay visible, large ones averaged down."""
+    part = image[box]
+    times = max(1, round(CROP_WIDTH / part.shape[1]))
+    if times > 1:
+        return np.ascontiguousarray(np.kron(part, np.ones((times, times, 1), np.uint8)))
+    if part.shape[1] <= CROP_WIDTH:
+        return np.ascontiguousarray(part)
+    size = CROP_WIDTH, max(1, round(part.shape[0] * CROP_WIDTH / part.shape[1]))
+    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def sheet(columns: Sequence[Image], reference: Image | None, box: Box) -> Image:
+    """Crops side by side, and below each its FLIP to ``reference`` where that is known; one picture."""
+    rows = [[crop(image, box) for image in columns]]
+    if reference is not None:
+        errors = [error_colors(flip_map(reference, image)) for image in columns]
+        rows.append([crop(error, box) for error in errors])
+    tall, wide = rows[0][0].shape[:2]
+    size = len(rows) * (tall + GAP) - GAP, len(columns) * (wide + GAP) - GAP
+    out = np.full((*size, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, image in enumerate(row):
+            out[i * (tall + GAP) :, j * (wide + GAP) :][:tall, :wide] = image
+    return out
+
+
+def halves(first: Image, second: Image, box: Box, *, above: bool) -> Image:
+    """One picture of two: ``first`` above, or on the left, ``second`` in the other half of the box."""
+    out = second.copy()
+    rows, columns = box
+    if above:
+        out[: (rows.start + rows.stop) // 2] = first[: (rows.start + rows.stop) // 2]
+    else:
+        out[:, : (columns.start + columns.stop) // 2] = first[:, : (columns.start + columns.stop) // 2]
+    return out

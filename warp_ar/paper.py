@@ -1,0 +1,148 @@
+"""``python -m warp_ar.paper [FIGURE ...]`` makes the paper's figures again, and compares readings of its open text.
+
+FIGURE is 1 or 3 to 9, or ``readings``; without any all are made. Each figure is a picture, a table of numbers and a
+plot, from bundled clips, the preset ``paper`` beside ours and the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+from rich.console import Console
+from rich.table import Table
+
+from warp_ar.accuracy.charts import require_plots, stand_alone
+from warp_ar.accuracy.paper_figures import FIGURES, READING_SCENES, Context, PaperFigure, compare_readings
+from warp_ar.accuracy.progress import WorkProgress
+from warp_ar.accuracy.report import MIN_COLUMNS
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
+from warp_ar.device import resolve_device
+from warp_ar.errors import UsageError, WarpArError
+
+READINGS = "readings"
+QUALITY = 88
+"""Of WebP."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(prog="python -m warp_ar.paper", description="The paper's figures, made again beside ours.")
+    add = parser.add_argument
+    names = ", ".join(map(str, FIGURES))
+    add("figures", nargs="*", metavar="FIGURE", help=f"{names} or {READINGS} (default: all)")
+    add("--frames", type=int, default=12, metavar="N", help="frames per run, the last is shown (default: 12)")
+    add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
+    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
+    add("--out", type=Path, metavar="DIR", help="write figureN.webp, figureN.svg and figures.md here")
+    return parser
+
+
+def asked_figures(names: Sequence[str]) -> list[str]:
+    """Names of figures, checked."""
+    known = [*map(str, FIGURES), READINGS]
+    for name in names:
+        if name not in known:
+            raise UsageError(f"figure {name}: expected {', '.join(known)}")
+    return list(names) or known
+
+
+def as_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---", *["--:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def print_table(console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table in the terminal."""
+    table = Table(title=title)
+    for index, column in enumerate(head):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def write_figure(figure: PaperFigure, out: Path) -> str:
+    """Write a figure's picture and plots; returns its section of the Markdown page."""
+    name = f"figure{figure.number}"
+    path = out / f"{name}.webp"
+    if not cv2.imwrite(str(path), figure.picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, QUALITY]):
+        raise WarpArError(f"--out {out}: cannot write {path.name}")
+    parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({out.name}/{name}.webp)"]
+    below = "; below each its FLIP to the truth" if "truth" in figure.labels and figure.number not in (5, 6) else ""
+    parts += [f"From left to right: {', '.join(figure.labels)}{below}.", as_markdown(figure.head, figure.rows)]
+    for index, plot in enumerate(figure.plots):
+        file = f"{name}{'ab'[index] if len(figure.plots) > 1 else ''}.svg"
+        (out / file).write_text(stand_alone(plot), encoding="utf-8")
+        parts.append(f"![{figure.head[-1]}]({out.name}/{file})")
+    return "\n\n".join(parts)
+
+
+def reading_rows(context: Context, progress: WorkProgress) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """The table of readings."""
+    found = compare_readings(context, advance=lambda text: progress.advance(text, 0.3))
+    head = ("section", "open", "reading", *(f"`{scene}`" for scene in READING_SCENES))
+    rows = [
+        (
+            reading.section,
+            reading.question,
+            reading.answer,
+            *(f"{errors[scene]:.3f}" if scene in errors else "" for scene in READING_SCENES),
+        )
+        for reading, errors in found
+    ]
+    return head, rows
+
+
+def make_all(options: argparse.Namespace) -> int:
+    """Make, print and write what was asked for."""
+    names = asked_figures(options.figures)
+    if options.frames < 1:
+        raise UsageError(f"--frames {options.frames}: expected 1 or more")
+    if options.shrink < 1:
+        raise UsageError(f"--shrink {options.shrink}: expected 1 or more")
+    require_plots()
+    context = Context(str(resolve_device(options.device)), options.frames, options.shrink)
+    console = Console()
+    console.width = max(console.width, MIN_COLUMNS)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+    sections = []
+    units = sum(5.0 if name == READINGS else 1.0 for name in names)
+    with WorkProgress(console, units) as progress:
+        for name in names:
+            if name == READINGS:
+                head, rows = reading_rows(context, progress)
+                title = "Readings of the open text"
+                print_table(console, f"{title}: FLIP of the preset paper to the truth", head, rows)
+                sections.append(f"## {title}\n\n{as_markdown(head, rows)}")
+                continue
+            figure = FIGURES[int(name)](context)
+            progress.advance(f"figure {name}", 1.0)
+            print_table(console, f"Figure {name}: {figure.title}", figure.head, figure.rows)
+            if options.out is not None:
+                sections.append(write_figure(figure, options.out))
+    if options.out is not None:
+        (options.out / "figures.md").write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+        console.print(f"written to {options.out}", highlight=False)
+    return EXIT_DONE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code: 0 done, 1 failed while running, 2 bad usage."""
+    try:
+        return make_all(make_parser().parse_args(arguments))
+    except UsageError as error:
+        print(f"warp_ar: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except WarpArError as error:
+        print(f"warp_ar: {error}", file=sys.stderr)
+        return EXIT_FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
