@@ -172,6 +172,12 @@ METHODS: dict[str, tuple[str, ...]] = {
     for stage in STAGES
 }
 """Every method on which a stage does something, by stage; ``none`` of a stage is that it is left out."""
+EXACT = tuple(method for method in METHODS["unwrap"] if method != "sphere_map")
+"""Methods of ``unwrap`` that know where the ball's points are; the paper's has its tests beside its kernel."""
+FILTERS = [
+    (stage, method) for stage in ("irradiance", "prefilter") for method in METHODS[stage] if method != "sphere_mip"
+]
+"""Filters of the environment's map; the paper's filters the frame, and has its tests beside its kernel."""
 STAGE_METHODS = [(stage, method) for stage, methods in METHODS.items() for method in methods]
 
 

@@ -16,7 +16,8 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.kernels.color import decode_table, encode_table
+from warp_ar.input.saturation import SaturationLevels, ball_discs
+from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
@@ -70,6 +71,9 @@ class FrameInputs:
         self.transfers = None if device.is_cpu else Transfers(shape, device)
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
+        self.saturation = SaturationLevels()
+        """Codes at which channels saturate, as frames have told so far."""
+        self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
         values = self.block.host("params")
@@ -89,7 +93,7 @@ class FrameInputs:
         add("light_array", self.block.device_array("lights"))
         add("ray_scene", self.host_scene.ray_scene)
         add("probes", wp.array(_probe_values(scene), dtype=Probe, device=device))
-        add("decode", wp.array(self.decode, dtype=wp.vec3, device=device))
+        add("decode", wp.array(camera_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
         for name in RECTS:
@@ -139,10 +143,19 @@ class FrameInputs:
         params["frame_index"][0] = frame.index
         params["environment_reset"][0] = reset
         self.block.upload()
+        self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
         for name in touched:
             self._arrays.touch(name)
+
+    def _note_saturation(self, frame: SeenFrame) -> None:
+        """Look where channels saturate, if the frame is on the host and shows a ball."""
+        if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
+            return
+        if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
+            table = camera_table(self._camera.transfer, self.saturation.levels)
+            self._arrays["decode"].assign(table)
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
         """Move lights and objects to where they are now; gives the inputs that changed."""

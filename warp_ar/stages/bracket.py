@@ -57,7 +57,8 @@ class Bracket(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The reference joins the others; what clips nearby; their mean."""
         height = self.request.quality.environment_height
-        own = [(arrays[f"bracket_{part}"][0], arrays[f"probe_{part}"]) for part in UNWRAPPED]
+        reference = self.request.exposures.index(1.0)
+        own = [(arrays[f"bracket_{part}"][reference], arrays[f"probe_{part}"]) for part in UNWRAPPED]
 
         def store(rows: Rows | None) -> None:
             for target, source in own:

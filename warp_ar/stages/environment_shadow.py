@@ -31,7 +31,7 @@ from warp_ar.stages.base import (
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -147,7 +147,7 @@ class EnvironmentShadow(Stage):
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         params, scene, cells = arrays["params"], arrays["ray_scene"], self._cells(arrays)
-        picture = make_picture(arrays, frame=config.bounce == "traced")
+        picture = find_picture(arrays, frame=config.bounce == "traced")
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 

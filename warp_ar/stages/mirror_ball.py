@@ -15,7 +15,7 @@ from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
@@ -126,7 +126,7 @@ class MirrorBall(Stage):
         lit = config.relight is not None
         receiver = make_receiver(
             relighting,
-            make_picture(arrays),
+            find_picture(arrays),
             probes=arrays["probes"],
             key_lights=arrays["key_lights"] if "key_lights" in reads else None,
             irradiance=arrays[irradiance] if lit and irradiance in reads else None,

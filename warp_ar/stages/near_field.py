@@ -27,7 +27,7 @@ from warp_ar.stages.base import (
 )
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture, make_visible
+from warp_ar.stages.shared.picture import find_picture, find_visible
 
 SIDE = 4
 """Pixels along a tile."""
@@ -97,8 +97,8 @@ class NearField(Stage):
         config = self._config()
         near_field.make_near_field_kernel(config)
         near_field.make_filter_kernel(config)
-        params, scene, visible = arrays["params"], arrays["ray_scene"], make_visible(arrays)
-        picture, layers = make_picture(arrays), near_field.ReceiverLayers()
+        params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
+        picture, layers = find_picture(arrays), near_field.ReceiverLayers()
         if config.ratio:
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:

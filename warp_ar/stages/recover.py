@@ -348,4 +348,15 @@ class Recover(Stage):
             }
             for lamp in estimate.lamps
         ]
-        return {"lower_bound": list(estimate.lower_bound), "lamps": lamps}
+        report: dict[str, Any] = {
+            "method": estimate.method,
+            "factor": round(estimate.factor, 3),
+            "card_contrast": round(estimate.card.contrast, 2),
+            "lower_bound": list(estimate.lower_bound),
+            "lamps": lamps,
+        }
+        if estimate.irradiance is not None:
+            for name in ("low", "value", "high"):
+                axes = getattr(estimate.irradiance, name)
+                report[f"irradiance_{name}"] = [[round(float(x), 4) for x in axis] for axis in axes]
+        return report

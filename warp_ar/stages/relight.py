@@ -17,7 +17,7 @@ from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 
@@ -151,7 +151,7 @@ class Relight(Stage):
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)
-        return relight.make_receiver(config, make_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+        return relight.make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
 
     def _cell_passes(
         self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any

@@ -25,7 +25,7 @@ from warp_ar.stages.base import (
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
 
@@ -90,7 +90,7 @@ class Shade(Stage):
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
             make_distant_light(self.features, arrays, self.name),
-            make_visible(arrays),
+            find_visible(arrays),
         )
         near = NearLight()
         for name in self.features.near_names if config.near_field else ():

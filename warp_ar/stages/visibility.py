@@ -23,7 +23,7 @@ from warp_ar.stages.base import (
     Wiring,
 )
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -64,7 +64,7 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        visible = make_visible(arrays)
+        visible = find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
             trace_pixels(config, *inputs, visible, rows=rows)
