@@ -6,6 +6,7 @@ A page says ``<!-- made: NAME -->`` where the part belongs.
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import pathlib
 import re
@@ -65,7 +66,26 @@ def stages() -> str:
     return "\n".join(rows)
 
 
-PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages, "paper-figures": paper_figures}
+def example(name: str) -> str:
+    """A worked example as the changes that it makes."""
+    text = (pathlib.Path(__file__).parent / "examples" / f"{name}.diff").read_text(encoding="utf-8")
+    parts = re.split(r"^diff --git a/(\S+) b/\S+\n", text, flags=re.M)[1:]
+    shown = []
+    for path, change in zip(parts[::2], parts[1::2], strict=True):
+        lines = [line for line in change.splitlines() if not line.startswith(("index ", "--- ", "+++ ", "new file"))]
+        shown += [f'??? example "`{path}`"', "", "    ```diff", *(f"    {line}" for line in lines), "    ```", ""]
+    return "\n".join(shown)
+
+
+_FIXED = {
+    "scene-keys": scene_keys,
+    "command-line": command_line,
+    "stages": stages,
+    "paper-figures": paper_figures,
+}
+PARTS = _FIXED | {
+    f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

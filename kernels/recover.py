@@ -30,7 +30,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import (
     PI,
     direction_from_latlong,
@@ -521,6 +521,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         point = points[index]
         seen = Observation()
         across = wp.cross(point.normal, point.tangent)
+        saturation = saturation_codes(table)
         if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
             squares = wp.vec3(0.0, 0.0, 0.0)
             count = wp.float32(0.0)
@@ -551,7 +552,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                         before = value - seen.radiance
                         seen.radiance += before / count
                         squares += wp.cw_mul(before, value - seen.radiance)
-                        seen.clipped += is_clipped(code)
+                        seen.clipped += is_saturated(code, saturation)
             if count > 0.0:
                 seen.clipped /= count
                 seen.visible = count / wp.float32(PATCH * PATCH)

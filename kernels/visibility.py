@@ -540,6 +540,13 @@ def make_sample_direction(count: int) -> wp.Function:
     return sample_direction
 
 
+def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
+    """The arrays of ``trace_pixels`` together."""
+    visible = VisibleObjects()
+    visible.objects, visible.hits = objects, hits
+    return visible
+
+
 @functools.cache
 def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""

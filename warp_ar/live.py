@@ -17,16 +17,16 @@ import time
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
 from warp_ar.command_line import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
+    EXIT_USAGE,
     Parser,
     Terminated,
     handling,
@@ -36,12 +36,15 @@ from warp_ar.command_line import (
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
 from warp_ar.output.places import PROGRAM, check_places, check_replaceable, files_of
-from warp_ar.output.report import RunLog, print_plan
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
-from warp_ar.session import Session
-from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
+
+if TYPE_CHECKING:
+    from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.output.report import RunLog
+    from warp_ar.session import Session
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -248,13 +251,17 @@ def serve_page(options: argparse.Namespace) -> int:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
     except KeyboardInterrupt as error:
         code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
-    finally:
-        if not server.ended:
-            # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped: threads
-            # would be waited for at the end of Python. All files are closed and temporary folders gone by now.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+    except WarpArError as error:
+        if server.ended:
+            raise
+        say(error)
+        code = EXIT_USAGE
+    if not server.ended:
+        # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
+        # would wait for its thread. All files are closed and temporary folders gone by now.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     return code
 
 
@@ -311,6 +318,10 @@ def run(options: argparse.Namespace) -> int:
 
 def light_clip(options: argparse.Namespace) -> int:
     """Light a source's frames without a page, and write what options name."""
+    # Here, for they load Warp: the page is to be there before.
+    from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.output.report import RunLog, print_plan
+
     scene = load_scene(options.scene)
     _check_places(options, scene)
     outputs, replaced = ["image"], []
@@ -338,7 +349,7 @@ def light_clip(options: argparse.Namespace) -> int:
                 say(words)
         log = RunLog(session.pipeline)
         try:
-            with lights or NullSink(), sink, handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"):
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
                 _light_frames(options, session, log, sink, lights, stop)
             if log.count < MARKER_PATIENCE and stop.code is None:
                 _check_marker(log, session.scene, live=source.live)
@@ -363,6 +374,8 @@ def light_clip(options: argparse.Namespace) -> int:
 
 
 def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str, ...]) -> Session:
+    from warp_ar.session import Session
+
     return Session(
         scene,
         source=options.source,

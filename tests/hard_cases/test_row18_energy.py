@@ -172,10 +172,10 @@ def test_what_surrounds_a_white_object_is_white(furnace_for, name):
     rig = furnace_for("near_field", "default", WHITE[name])
     outputs = rig.run("near_field")
     seen = rig.get("hit_object") >= 0
-    mirrored = outputs["object_mirrored"][seen]
+    mirrored = outputs["near_reflected"][seen]
     np.testing.assert_allclose(mirrored[:, :3], mirrored[:, 3:].repeat(3, 1), atol=TABLES)
     if name == "lambert":
-        received = outputs["object_irradiance"][seen]
+        received = outputs["near_irradiance"][seen]
         np.testing.assert_allclose(received.mean(0) / np.pi, 1.0, atol=SAMPLED_MEAN)
         np.testing.assert_allclose(received / np.pi, 1.0, atol=SAMPLED)
 

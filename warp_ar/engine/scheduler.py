@@ -24,8 +24,9 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import capturing, exclusive, translating
+from warp_ar.engine.demand import Demand
 from warp_ar.engine.graph import Plan
-from warp_ar.stages.base import Arrays, Pass, Rows, Stage
+from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
 """A stage and those of its passes that are launched."""
@@ -44,7 +45,9 @@ class StageTiming:
     """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
     profiles, an equal share of the time that launching took the host."""
     skipped: bool
-    """True: nothing that it reads had changed."""
+    """True: nothing that it reads had changed, or it was left out of this frame."""
+    left_out: str | None = None
+    """Why it could change no pixel of this frame; None where that was not so."""
 
 
 SKIPPED = StageTiming(0.0, True)
@@ -54,7 +57,14 @@ class Scheduler:
     """Runs the stages of one plan on one device."""
 
     def __init__(
-        self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None, profile: bool = False
+        self,
+        plan: Plan,
+        arrays: Arrays,
+        device: Any,
+        *,
+        bands: int | None = None,
+        profile: bool = False,
+        culling: bool = True,
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -64,6 +74,7 @@ class Scheduler:
             device: Warp device.
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
+            culling: Whether stages that can change no pixel of a frame are left out of it.
         """
         self.plan = plan
         self.arrays = arrays
@@ -91,6 +102,10 @@ class Scheduler:
                     arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
                     self._fills[name] = spec.fill
                 self._stages.append((stage, stage.build(arrays, device)))
+        self._culling = culling
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._unneeded: Mapping[str, str] = {}
+        """Why stages can change no pixel of this frame."""
         self._readers = _find_readers([stage for stage, _ in self._stages])
         self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
@@ -131,6 +146,7 @@ class Scheduler:
         its steps.
         """
         stream = None
+        self._demand.forget()
         if self.device.is_cuda:
             with exclusive(self.device):
                 stream = wp.Stream(self.device)
@@ -158,19 +174,44 @@ class Scheduler:
             self._pool, self.clock = before
 
     def run(self) -> Mapping[str, StageTiming]:
-        """Run the stages whose inputs changed since they last ran; returns the time of each."""
+        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each."""
+        self._look()
         if self.device.is_cpu:
             return self._run_eager()
         return self._run_captured()
 
+    def _look(self) -> None:
+        """Find out what this frame needs."""
+        reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
+        self._unneeded, clearing = self._demand.look(reach)
+        for stage, _ in self._stages:
+            if stage.name in self._unneeded:
+                stage.rest()
+        for name in clearing:
+            self._seen.pop(name, None)
+
+    def _timing_of_skipped(self, stage: Stage) -> StageTiming:
+        reason = self._unneeded.get(stage.name) if self._culling else None
+        return SKIPPED if reason is None else StageTiming(0.0, True, reason)
+
     def _due(self, stage: Stage) -> tuple[int, ...] | None:
-        """Versions of what ``stage`` reads, or None if it has already seen them."""
+        """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
+        if self._culling and stage.name in self._unneeded:
+            return None
         versions = self.arrays.versions(stage.wiring.reads)
         return None if self._seen.get(stage.name) == versions else versions
 
+    def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
+        """Passes of a stage that take part in this frame."""
+        if stage.name not in self._unneeded:
+            stage.begin()
+        return [step for step in passes if step.enabled is None or step.enabled()]
+
     def _publish(self, stage: Stage) -> None:
+        if stage.name in self._unneeded and type(stage).changed is not Stage.changed:
+            return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
-            if self.arrays.version(name) == 0 or stage.changed(name):
+            if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
     def _run_eager(self) -> dict[str, StageTiming]:
@@ -181,10 +222,10 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
             start = self.clock()
-            for step in _enabled_passes(stage, passes):
+            for step in self._begin(stage, passes):
                 # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
                 self._launch_band(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
@@ -220,9 +261,9 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
-            chosen = _enabled_passes(stage, passes)
+            chosen = self._begin(stage, passes)
             due.append((stage, chosen))
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
@@ -364,11 +405,11 @@ class SideBySide:
         """All inputs are there: ready, or done at once where none of them changed."""
         versions = self._scheduler._due(running.stage)
         if versions is None:
-            self._timings[running.stage.name] = SKIPPED
+            self._timings[running.stage.name] = self._scheduler._timing_of_skipped(running.stage)
             self._end(running)
             return
         running.versions = versions
-        running.left.extend(_enabled_passes(running.stage, running.steps))
+        running.left.extend(self._scheduler._begin(running.stage, running.steps))
         order = self._scheduler._order
         bisect.insort(self._ready, running, key=lambda other: order[other.stage.name])
         self._advance(running)
@@ -433,12 +474,6 @@ def _make_marks(device: Any) -> tuple[Any, Any]:
 
 def _ids(steps: list[Pass]) -> tuple[int, ...]:
     return tuple(map(id, steps))
-
-
-def _enabled_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
-    """Passes of a stage that take part in this frame."""
-    stage.begin()
-    return [step for step in passes if step.enabled is None or step.enabled()]
 
 
 def _in_launch_order(part: list[Step]) -> list[Step]:

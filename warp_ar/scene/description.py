@@ -98,6 +98,8 @@ class SourceSpec:
     """Frames per second; the source's own if left out."""
     exposures: tuple[float, ...] | None = None
     """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
+    shown: float | None = None
+    """Exposure time in seconds of the frames that are lit and shown; the longest if left out."""
 
 
 @dataclasses.dataclass(frozen=True)

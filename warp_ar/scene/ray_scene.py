@@ -387,13 +387,18 @@ class HostScene:
         """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
             faces = [box_faces(record) for record in self._proxies]
-            self._lit = Outline([part for light in self._lights for own in faces for part in lit_faces(light, own)])
+            shining = self._shining()
+            self._lit = Outline([part for light in shining for own in faces for part in lit_faces(light, own)])
             self._bounced = None
         if not bounced:
             return self._lit
         if self._bounced is None:
-            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._lights, self._proxies)])
+            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), self._proxies)])
         return self._bounced
+
+    def _shining(self) -> npt.NDArray[Any]:
+        """Records of the lights that have power: no other falls anywhere."""
+        return self._lights[self._lights["intensity"].any(axis=1)]
 
     def ball_outline(self) -> Outline:
         """Where mirror balls are."""

@@ -256,6 +256,7 @@ def _read_source(table: _Table) -> SourceSpec:
         exposures=table.vector("exposures", sizes=range(2, 9), low=1e-6, high=1e3, unit="seconds")
         if "exposures" in table
         else None,
+        shown=table.number("shown", low=1e-6, high=1e3, unit="seconds") if "shown" in table else None,
     )
 
 

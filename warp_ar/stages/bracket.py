@@ -19,6 +19,7 @@ class Bracket(Stage):
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
     unread: ClassVar[str] = "nothing asks for the environment"
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=2e-6,
@@ -56,7 +57,8 @@ class Bracket(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The reference joins the others; what clips nearby; their mean."""
         height = self.request.quality.environment_height
-        own = [(arrays[f"bracket_{part}"][0], arrays[f"probe_{part}"]) for part in UNWRAPPED]
+        reference = self.request.exposures.index(1.0)
+        own = [(arrays[f"bracket_{part}"][reference], arrays[f"probe_{part}"]) for part in UNWRAPPED]
 
         def store(rows: Rows | None) -> None:
             for target, source in own:

@@ -11,6 +11,7 @@ import warp as wp
 from warp_ar.kernels import irradiance, pyramid, sphere_map
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
 TOP_MIP_SIZE = (4, 8)  # the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
@@ -87,7 +88,7 @@ class Irradiance(Stage):
             return [
                 Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
             ]
-        environment = arrays["environment"]
+        environment = settled_environment(arrays, device)
         if self.method == "top_mip":
             top = arrays["irradiance_map"]
             return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]

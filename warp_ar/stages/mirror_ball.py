@@ -12,10 +12,10 @@ from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
@@ -90,6 +90,13 @@ class MirrorBall(Stage):
             reads.add("shadow_ratio")
         return Wiring(tuple(sorted(reads)), ("mirrored",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """A ball may show what is out of the picture itself."""
+        if not reach.balls:
+            return "no mirror ball is in the picture"
+        dark = not reach.shines and not self.request.scene.objects
+        return "no virtual light has any power" if dark else None
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""
         width, height = self.request.size
@@ -108,7 +115,7 @@ class MirrorBall(Stage):
         lit = config.relight is not None
         receiver = make_receiver(
             relighting,
-            make_picture(arrays),
+            find_picture(arrays),
             probes=arrays["probes"],
             key_lights=arrays["key_lights"] if "key_lights" in reads else None,
             irradiance=arrays[irradiance] if lit and irradiance in reads else None,

@@ -11,10 +11,23 @@ import warp as wp
 from warp_ar.kernels import near_field
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture, make_visible
+from warp_ar.stages.shared.picture import find_picture, find_visible
 
 SIDE = 4
 """Pixels along a tile."""
@@ -63,6 +76,10 @@ class NearField(Stage):
         reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
         return Wiring(tuple(reads), features.near_names)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture nothing shows its surroundings."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
         width, height = self.request.size
@@ -80,8 +97,8 @@ class NearField(Stage):
         config = self._config()
         near_field.make_near_field_kernel(config)
         near_field.make_filter_kernel(config)
-        params, scene, visible = arrays["params"], arrays["ray_scene"], make_visible(arrays)
-        picture, layers = make_picture(arrays), near_field.ReceiverLayers()
+        params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
+        picture, layers = find_picture(arrays), near_field.ReceiverLayers()
         if config.ratio:
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:

@@ -14,6 +14,7 @@ from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.ray_scene import reflects_glossily
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -87,7 +88,7 @@ class Prefilter(Stage):
         lobe = scene_lobe(self.request.scene)
         if self.method == "sphere_mip":
             return self._look_up(arrays)
-        environment, levels = arrays["environment"], arrays["prefilter_levels"]
+        environment, levels = settled_environment(arrays, device), arrays["prefilter_levels"]
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]

@@ -47,6 +47,8 @@ class _Progress:
     """Frames since the last estimate was begun."""
     last: float = 0.0
     """When that was, seconds."""
+    rested: bool = False
+    """Whether nothing has read the environment since."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,11 +225,17 @@ class Recover(Stage):
         now, seconds = self._progress, self._arrays["seconds"]()
         now.frames += 1
         now.waited += 1
+        rested, now.rested = now.rested, False
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
-        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and now.waited >= EVERY_FRAME)
+        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and (rested or now.waited >= EVERY_FRAME))
         if self._asks:
             now.waited, now.last = 0, seconds
+
+    def rest(self) -> None:
+        """No estimate is begun or takes effect; the first frame that needs one begins it at once."""
+        self._asks = self._arrives = False
+        self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
         """Begin to solve, and wait for it where it takes effect at once."""
@@ -340,4 +348,15 @@ class Recover(Stage):
             }
             for lamp in estimate.lamps
         ]
-        return {"lower_bound": list(estimate.lower_bound), "lamps": lamps}
+        report: dict[str, Any] = {
+            "method": estimate.method,
+            "factor": round(estimate.factor, 3),
+            "card_contrast": round(estimate.card.contrast, 2),
+            "lower_bound": list(estimate.lower_bound),
+            "lamps": lamps,
+        }
+        if estimate.irradiance is not None:
+            for name in ("low", "value", "high"):
+                axes = getattr(estimate.irradiance, name)
+                report[f"irradiance_{name}"] = [[round(float(x), 4) for x in axis] for axis in axes]
+        return report

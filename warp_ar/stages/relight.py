@@ -12,12 +12,12 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 
@@ -87,6 +87,12 @@ class Relight(Stage):
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
         return () if self.features.near_field else ("environment_shadow",)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without power, or out of the picture, light adds nothing."""
+        if not reach.shines:
+            return "no virtual light has any power"
+        return None if reach.light else "virtual light falls on nothing in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
@@ -145,7 +151,7 @@ class Relight(Stage):
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)
-        return relight.make_receiver(config, make_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+        return relight.make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
 
     def _cell_passes(
         self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any

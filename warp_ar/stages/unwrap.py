@@ -29,6 +29,7 @@ class Unwrap(Stage):
     unread: ClassVar[str] = "nothing asks for the environment"
     converges: ClassVar[bool] = True
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=1e-4,

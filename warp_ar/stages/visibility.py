@@ -9,9 +9,21 @@ import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 
 
@@ -35,6 +47,10 @@ class Visibility(Stage):
             return LeftOut(NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture no pixel sees one."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
         width, height = self.request.size
@@ -48,7 +64,7 @@ class Visibility(Stage):
         """One pass over the rows where objects are or were."""
         config = trace_config(self.request.scene)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        visible = make_visible(arrays)
+        visible = find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
             trace_pixels(config, *inputs, visible, rows=rows)
