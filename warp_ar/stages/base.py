@@ -216,6 +216,10 @@ class Stage(abc.ABC):
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
 
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Kernels that its steps on the host launch: they are compiled with the others."""
+        return ()
+
     def idle(self, reach: Reach) -> str | None:
         """Why what the stage writes is as if it did nothing in a frame; None where it may do something.
 
