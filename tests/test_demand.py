@@ -171,7 +171,7 @@ def run(path: Sequence[Frame], device: str, preset: str, *, culling: bool, synch
         scene_of(True, "on"),
         device=device,
         quality=QUALITIES[preset],
-        bands=1,
+        bands=2,
         synchronous=synchronous,
         culling=culling,
     ) as pipeline:
@@ -252,7 +252,7 @@ def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.Monk
     number_estimates(monkeypatch)
     asked, now = [], 0.0
     with Pipeline(
-        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=1, synchronous=True
+        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, synchronous=True
     ) as pipeline:
         for pose, objects, lights, picture, step in PATHS["long"]:
             pipeline.update(scene_of(objects, lights))
