@@ -77,13 +77,7 @@ def example(name: str) -> str:
     return "\n".join(shown)
 
 
-_FIXED = {
-    "scene-keys": scene_keys,
-    "command-line": command_line,
-    "stages": stages,
-    "paper-figures": paper_figures,
-}
-PARTS = _FIXED | {
+PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages, "paper-figures": paper_figures} | {
     f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")
 }
 
