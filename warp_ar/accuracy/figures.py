@@ -48,9 +48,9 @@ _FIGURES = (
         (),
         "relight",
         ("flat", "paper", "reflectance"),
-        "A virtual spotlight from where the environment's own light comes, over wires that no model knows. Flat light; the "
-        "paper's blend, which takes the frame's brightness for relief; ours, which divides the frame by the light that "
-        "falls there and lights the reflectance that remains.",
+        "A virtual spotlight from where the environment's own light comes, over wires that no model knows. Flat light; "
+        "the paper's blend, which takes the frame's brightness for relief; ours, which divides the frame by the light "
+        "that falls there and lights the reflectance that remains.",
     ),
     (
         "Figure 9",
