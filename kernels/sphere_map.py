@@ -22,7 +22,7 @@ import warp as wp
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.kernels.unwrap import mix
 
@@ -248,7 +248,7 @@ def halve_levels(sphere_map: wp.array) -> None:
     for level in range(1, level_count()):
         size = level_size(level)
         inputs = [level_offset(level - 1), level_offset(level), size]
-        wp.launch(halve_level_kernel, (size, size), inputs, [sphere_map], device=sphere_map.device)
+        launch(halve_level_kernel, (size, size), inputs, [sphere_map], device=sphere_map.device)
 
 
 def look_up_level(

@@ -37,6 +37,8 @@ from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
 
+ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
+"""Of shapes."""
 FACES = wp.constant(8)
 """Numbers of ``surface_key`` per shape."""
 MESH_KEY = wp.constant(7)
@@ -292,6 +294,10 @@ class TraceConfig:
     """Kinds among the virtual objects."""
     proxies: tuple[int, ...]
     """Kinds among the proxies."""
+
+    def general(self) -> TraceConfig:
+        """For any scene: each shape's kind is asked for as it is met."""
+        return TraceConfig(ALL_KINDS, ALL_KINDS)
 
 
 @functools.cache

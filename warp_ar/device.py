@@ -20,6 +20,11 @@ _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
 
 
+def usable_cores() -> int:
+    """Cores of the host that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
     """Keeps other threads off a CUDA device for as long as it is entered; on CPU it does nothing.
 
@@ -30,12 +35,19 @@ def exclusive(device: Any) -> contextlib.AbstractContextManager[Any]:
     return _CUDA if device.is_cuda else contextlib.nullcontext()
 
 
-def translating(device: Any) -> contextlib.AbstractContextManager[Any]:
-    """Held by who declares kernels or launches them for the first time.
+@contextlib.contextmanager
+def translating(device: Any) -> Iterator[None]:
+    """Held by who declares kernels or launches them for the first time; to be entered before ``exclusive``.
 
     Python 3.11's parser is not safe in two threads (seen: "AST constructor recursion depth mismatch").
     """
-    return _CUDA if device.is_cuda else _TRANSLATION
+    with _TRANSLATION, exclusive(device):
+        yield
+
+
+def compiling() -> contextlib.AbstractContextManager[Any]:
+    """Held by who has kernels compiled, in threads of its own: nobody else translates, frames go on."""
+    return _TRANSLATION
 
 
 class _Captures:

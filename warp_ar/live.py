@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from warp_ar.command_line import (
     EXIT_DONE,
@@ -300,6 +300,25 @@ def _ball_report(scene: Scene, session: Session) -> dict[str, Any]:
     return {"balls": found} if found else {}
 
 
+def _compile(session: Session, *, shown: bool) -> None:
+    """Have the kernels ready, with a bar where some must be compiled."""
+    words = TextColumn("compiling kernels, once for this kind of scene")
+    bar = Progress(words, BarColumn(), MofNCompleteColumn(), disable=not shown)
+    task: TaskID | None = None
+
+    def tell(done: int, total: int) -> None:
+        nonlocal task
+        if task is None:
+            bar.start()
+            task = bar.add_task("compile", total=total)
+        bar.update(task, completed=done)
+
+    try:
+        session.warm_up(tell)
+    finally:
+        bar.stop()
+
+
 def _has_display() -> bool:
     """Whether a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -345,6 +364,7 @@ def light_clip(options: argparse.Namespace) -> int:
             stack.enter_context(lights)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
+        _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()
         if options.output is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 
 from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
@@ -151,6 +152,14 @@ class Session:
         pipeline = self._switcher.follow(target, wait=True)
         assert pipeline is not None
         self._target, self.scene, self.pipeline = target, target.scene, pipeline
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Compile and load what the frames need; left out, the first frame does it.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be.
+        """
+        self.pipeline.warm_up(progress)
 
     def _frames(self) -> Iterator[Frame]:
         """The source's frames; notes what they are waited for."""

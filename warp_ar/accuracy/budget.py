@@ -49,7 +49,6 @@ from warp_ar.accuracy.cost_table import (
 from warp_ar.accuracy.costs import (
     BASE,
     Costs,
-    cache_folder,
     cost_key,
     make_method_costs,
     measure_costs,
@@ -57,6 +56,8 @@ from warp_ar.accuracy.costs import (
     time_alone,
     write_costs,
 )
+from warp_ar.cache_folder import cache_folder
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
@@ -420,6 +421,10 @@ class AutoPipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """As ``Pipeline.warm_up``, for the settings of the first frame."""
+        self.pipeline.warm_up(progress)
 
     def close(self) -> None:
         """Stop the threads; arrays go when the last result that refers to them does."""

@@ -202,7 +202,8 @@ class FrameInputs:
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         shines = bool(self.block.host("lights")["intensity"].any())
-        return Reach(objects=objects, shines=shines, light=light, shadows=shadows, balls=balls)
+        falls = bool(self.host_scene.light_outline().polygons)
+        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

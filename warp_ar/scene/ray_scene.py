@@ -23,7 +23,8 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.mesh_files import load_mesh, load_texture
+from warp_ar.scene.mesh_cache import load_kept_mesh
+from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
 
@@ -311,7 +312,7 @@ class HostScene:
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
-            mesh = load_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
+            mesh = load_kept_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
             ray_mesh = make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)

@@ -55,6 +55,8 @@ class Reach:
     """A virtual object may be in the picture."""
     shines: bool = True
     """A virtual light has power."""
+    falls: bool = True
+    """Virtual light may fall on the receiver, in the picture or beside it."""
     light: bool = True
     """Virtual light may fall on the receiver in the picture."""
     shadows: bool = True
@@ -214,6 +216,10 @@ class Stage(abc.ABC):
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
 
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Kernels that its steps on the host launch: they are compiled with the others."""
+        return ()
+
     def idle(self, reach: Reach) -> str | None:
         """Why what the stage writes is as if it did nothing in a frame; None where it may do something.
 
@@ -221,6 +227,10 @@ class Stage(abc.ABC):
         reads does.
         """
         return None
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        """Those of the resources that it reads on which what it writes may depend in a frame; as ``idle``."""
+        return self.wiring.reads
 
     def rest(self) -> None:  # noqa: B027
         """Called instead of ``begin`` in a frame in which nothing reads what the stage writes."""

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import bracket as kernels
+from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
@@ -62,7 +63,7 @@ class Bracket(Stage):
 
         def store(rows: Rows | None) -> None:
             for target, source in own:
-                wp.copy(target, source)
+                copy(target, source)
 
         def spread(rows: Rows | None) -> None:
             kernels.spread_clipping(

@@ -33,6 +33,7 @@ from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_li
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
 from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import distant_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,7 +183,7 @@ class EnvironmentShadow(Stage):
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
         return EnvironmentShadowConfig(
-            self.features.distant,
+            distant_variant(self.features, device),
             method.count,
             method.side,
             method.bounce,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -28,6 +29,7 @@ from warp_ar.stages.base import (
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.picture import find_picture, find_visible
+from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
 """Pixels along a tile."""
@@ -94,7 +96,7 @@ class NearField(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
-        config = self._config()
+        config = self._config(device)
         near_field.make_near_field_kernel(config)
         near_field.make_filter_kernel(config)
         params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
@@ -123,13 +125,15 @@ class NearField(Stage):
         extent = arrays["object_rows"]
         return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
 
-    def _config(self) -> near_field.NearFieldConfig:
+    def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
         layers = self.features.layers
         widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
+        # The forms themselves stay the scene's: they are what the kernel writes.
+        forms, variant = self.features.distant, distant_variant(self.features, device)
         return near_field.NearFieldConfig(
-            self.features.distant,
+            dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
             COUNT,
             0 if all(sharp) else LOBE_COUNT,
             MIRROR_SAMPLES if any(sharp) else 0,

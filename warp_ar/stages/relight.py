@@ -12,6 +12,8 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.structs import PLANE
+from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
@@ -20,6 +22,7 @@ from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import relight_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +119,7 @@ class Relight(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
-        config = relight_config(self.features)
+        config = relight_variant(relight_config(self.features), self.features, device)
         relight.make_relight_kernel(config)
         receiver = self._receiver(config, arrays)
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
@@ -159,7 +162,7 @@ class Relight(Stage):
         """Ambient visibility and bounced light of cells, where the method knows them."""
         params, scene, _, receiver = inputs
         cells, light_rows = receiver.cells, arrays["light_rows"]
-        place = receiver_cells.CellConfig(config)
+        place = receiver_cells.CellConfig(_keep_planes(config, self.request))
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
@@ -212,6 +215,14 @@ class Relight(Stage):
                 again = functools.partial(estimate, bounced=True)
                 passes.append(Pass(again, rows=shape[0], extent=ambient_rows))
         return passes
+
+
+def _keep_planes(config: relight.RelightConfig, request: Request) -> relight.RelightConfig:
+    """Where all proxies are planes, cells know that: most of their rays are then left out."""
+    proxies = trace_config(request.scene).proxies
+    if not set(proxies) <= {int(PLANE)}:
+        return config
+    return dataclasses.replace(config, trace=dataclasses.replace(config.trace, proxies=proxies))
 
 
 def _grain(features: Features) -> Grain:

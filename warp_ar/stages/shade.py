@@ -28,6 +28,7 @@ from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
+from warp_ar.stages.shared.variants import shade_variant
 
 
 class Shade(Stage):
@@ -83,6 +84,7 @@ class Shade(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
         config = shade_config(self.features)
+        variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)
         inputs = (
             arrays["params"],
@@ -98,7 +100,7 @@ class Shade(Stage):
 
         def launch(rows: Rows | None) -> None:
             shade(
-                config,
+                variant,
                 *inputs,
                 arrays["virtual"],
                 near=near,

@@ -11,6 +11,7 @@ from warp_ar.kernels import sphere_map, unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
 
@@ -76,6 +77,7 @@ class Unwrap(Stage):
             return self._look_up(arrays)
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
         config = unwrap.ProjectConfig(tuple(kinds))
+        config = config.general() if shares_kernels(device) else config
         method = self.method
         height = self.request.quality.environment_height
 

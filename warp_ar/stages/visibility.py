@@ -25,6 +25,7 @@ from warp_ar.stages.base import (
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Visibility(Stage):
@@ -56,13 +57,12 @@ class Visibility(Stage):
         width, height = self.request.size
         return {
             "hit_object": ArraySpec((height, width), wp.int32, -1),
-            "hit_depth": ArraySpec((height, width), wp.float32, float("inf")),
             "hits": ArraySpec((height, width), Hit, Hit()),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
-        config = trace_config(self.request.scene)
+        config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
         visible = find_visible(arrays)
 
