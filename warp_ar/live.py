@@ -226,8 +226,10 @@ def serve_page(options: argparse.Namespace) -> int:
 
     def make_host(**callbacks: Any) -> Any:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
+        from warp_ar.device import bound_arenas
         from warp_ar.viewer.host import Host
 
+        bound_arenas()
         # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
         gc.collect()
         gc.freeze()
