@@ -53,7 +53,7 @@ class PhotoInfo:
 
     @property
     def exposure(self) -> float | None:
-        """t ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
+        """T ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
         if self.seconds is None:
             return None
         return self.seconds * (self.iso or 100.0) / 100.0 / (self.f_number or 1.0) ** 2
