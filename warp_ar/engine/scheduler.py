@@ -117,8 +117,14 @@ class Scheduler:
         """Stop the worker threads."""
         if self._crew is not None:
             self._crew.close()
+            self._crew = None
         for stage, _ in self._stages:
             stage.close()
+
+    @property
+    def crew(self) -> Crew | None:
+        """The native threads that it has; None until it is prepared, and on CUDA."""
+        return self._crew
 
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
