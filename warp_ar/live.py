@@ -36,10 +36,11 @@ from warp_ar.command_line import (
 )
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
-from warp_ar.output.places import PROGRAM, check_places, check_replaceable, files_of
+from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
+from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 
 if TYPE_CHECKING:

@@ -314,10 +314,14 @@ class Crew:
         return dict(zip(self._names, times.tolist(), strict=True))
 
     def close(self) -> None:
-        """Let the threads end."""
+        """Let the threads end, and go of all that the tables refer to: of the scheduler, and so of this, too."""
         self._end()
         for thread in self._threads:
             thread.join()
+        self._threads.clear()
+        self._packed.clear()
+        self._host_steps.clear()
+        del self._called, self._decide, self._finish, self._caller, self._helpers
 
 
 def _stop(state: _Table, system: _System, count: int) -> None:

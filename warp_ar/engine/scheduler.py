@@ -117,6 +117,7 @@ class Scheduler:
         """Stop the worker threads."""
         if self._crew is not None:
             self._crew.close()
+            self._crew = None
         for stage, _ in self._stages:
             stage.close()
 

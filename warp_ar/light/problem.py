@@ -137,7 +137,11 @@ class Problem:
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > CONFIG.surfaces.dark) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
-        self.noise = measured_noise(surfaces.points[seen], self.surface, self.kinds, self.light, self.exact)
+        points = surfaces.points[seen]
+        self.noise, scatter = measured_noise(points, self.surface, self.kinds, self.light, self.exact)
+        told = self.surface[self.exact.all(axis=1) & (self.kind >= Kind.PLANE)]
+        self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
+        """How much more than ``noise`` surfaces beside the card scatter: at least 1."""
 
     def _aim_transfer(
         self,

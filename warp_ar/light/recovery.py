@@ -197,7 +197,7 @@ class Recovery:
         # The channel that surfaces show best.
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
-        solution = _solve_channels(problem, best, means, bounds)
+        solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         # A lamp that gives nothing in any channel has gone out, or never was.
         powers = solution[problem.parts :]
         self._peaks = [peak for peak, power in zip(problem.peaks, powers, strict=True) if power.any()]
@@ -303,6 +303,25 @@ def _weigh(
         factor = allowed_factor(added, missing)
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
     return max(found, key=lambda one: one[0])[1]
+
+
+def tie_channels(problem: Problem, solution: Array) -> Array:
+    """A solution without light of one channel only, unless that channel clips where others do not, (parts + peaks, 3).
+
+    What lamps look like in one channel is told by surfaces that show that channel: texture, or another response in it,
+    makes lamps of one colour. Where all channels lack light, none is more than some times the median of the three.
+
+    Args:
+        problem: The equations.
+        solution: Radiance of parts, then power of peaks, (parts + peaks, 3).
+    """
+    config = CONFIG.priors
+    cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
+    cells += [np.array([peak.cell]) for peak in problem.peaks]
+    lacking = np.array([problem.solid_angle[own] @ problem.lacking[own] for own in cells]).reshape(-1, 3)
+    most = config.colour * np.median(solution, axis=1, keepdims=True)
+    alone = lacking > config.own_clipping * np.median(lacking, axis=1, keepdims=True)
+    return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:
