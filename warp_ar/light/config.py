@@ -176,6 +176,9 @@ class EvidenceConfig:
     """Of draws that an estimate may be too much for."""
     safety: float = 1.0
     """Of what the others allow."""
+    lever: float = 2.0
+    """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
+    lights the card is hardly known by it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     capture: float = 0.15

@@ -60,6 +60,7 @@ from warp_ar.light.evidence import (
     irradiance_form,
     irradiance_interval,
     likely_gain,
+    most_by_card,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -136,6 +137,7 @@ class Recovery:
         self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[Peak] = []
+        self._estimates = 0
         self._frames = 0
         self._stillness = Stillness()
         self._blocks = blocks_of(surfaces)
@@ -152,7 +154,7 @@ class Recovery:
             cells: As for ``update``.
             observations: As for ``update``.
         """
-        return self._stillness.holds(cells, observations, settled=self._frames >= CONFIG.solver.settled)
+        return self._stillness.holds(cells, observations, settled=self._estimates >= CONFIG.solver.settled)
 
     def update(
         self,
@@ -182,6 +184,7 @@ class Recovery:
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
+        self._estimates += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
             return self._without_card(problem, card)
@@ -209,7 +212,9 @@ class Recovery:
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
         if is_turn or self._evidence is None:
             start = fit_channel(problem, best, problem.start(means[best]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(problem, best, start, (excess, by_card), self._blocks, doubt_of(card.contrast))
+            self._evidence = _weigh(
+                problem, best, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast)
+            )
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
@@ -290,17 +295,24 @@ class _Evidence:
 
 
 def _weigh(
-    problem: Problem, c: int, z: Array, solutions: tuple[Array, Array], blocks: NDArray[np.int64], doubt: float
+    problem: Problem,
+    c: int,
+    z: Array,
+    bounds: tuple[bool, bool, bool],
+    solutions: tuple[Array, Array],
+    blocks: NDArray[np.int64],
+    doubt: float,
 ) -> _Evidence:
     """Which of two solutions, by shading and by the card alone, to take, and how much of it."""
     form = irradiance_form(problem, spread_directions(CONFIG.evidence.directions))
+    share = 1.0 if bounds[c] else problem.card_share(c, is_bound=False) + doubt
     missing = draw_missing(problem, c, z, blocks, doubt) @ form.T
     total = missing.sum(axis=1)
     spread = float(total.std() / max(total.mean(), 1e-9))
     found = []
     for method, excess in zip(("shading", "white_card"), solutions, strict=True):
         added = form @ (excess[:, c] * problem.lacking[:, c])
-        factor = allowed_factor(added, missing)
+        factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
     return max(found, key=lambda one: one[0])[1]
 
