@@ -12,7 +12,7 @@ import pathlib
 import re
 from typing import Any
 
-COMMANDS = ("live", "explain", "calibrate", "tradeoff")
+COMMANDS = ("init", "live", "doctor", "calibrate", "explain", "tradeoff", "paper")
 """Commands whose options are listed, in the order of the page."""
 
 
@@ -50,6 +50,11 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
     return [*rows, ""] if len(rows) > 2 else []
 
 
+def paper_figures() -> str:
+    """The paper's figures as ``python -m warp_ar.paper --out docs/paper`` wrote them."""
+    return (pathlib.Path(__file__).parent / "paper" / "figures.md").read_text(encoding="utf-8")
+
+
 def stages() -> str:
     """Every stage: what it does, its methods, and the file of its kernels."""
     from warp_ar.stages import STAGES
@@ -72,7 +77,7 @@ def example(name: str) -> str:
     return "\n".join(shown)
 
 
-PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages} | {
+PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages, "paper-figures": paper_figures} | {
     f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")
 }
 

@@ -32,6 +32,9 @@ class Step:
         self.name, self.needs, self.follows = name, needs, follows
         self.wiring = Wiring(tuple(reads.split()), tuple(writes.split()))
 
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        return tuple(name for name in self.wiring.reads if reach.falls or name != "response")
+
     def idle(self, reach: Reach) -> str | None:
         return None if not self.needs or getattr(reach, self.needs) else f"no {self.needs}"
 
@@ -72,6 +75,13 @@ def test_an_output_is_needed_in_every_frame() -> None:
     demand = Demand(STEPS, ("image", "environment"))  # type: ignore[arg-type]
     demand.look(NOTHING)
     assert set(demand.look(NOTHING)[0]) == {"filter", "shade", "relight"}
+
+
+def test_what_a_stage_does_not_depend_on_in_a_frame_is_not_needed_for_it() -> None:
+    steps = (Step("respond", "frame", "response"), Step("mirror", "frame response", "image"))
+    demand = Demand(steps, ("image",))  # type: ignore[arg-type]
+    assert not demand.look(Reach())[0]
+    assert set(demand.look(Reach(falls=False))[0]) == {"respond"}
 
 
 def test_after_a_launch_of_everything_nothing_is_clear() -> None:
@@ -161,7 +171,7 @@ def run(path: Sequence[Frame], device: str, preset: str, *, culling: bool, synch
         scene_of(True, "on"),
         device=device,
         quality=QUALITIES[preset],
-        bands=1,
+        bands=2,
         synchronous=synchronous,
         culling=culling,
     ) as pipeline:
@@ -186,10 +196,16 @@ def assert_equal(path: Sequence[Frame], device: str, preset: str, **more: Any) -
 
 
 @pytest.mark.parametrize("preset", QUALITIES)
-@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=5,
+    deadline=None,
+    derandomize=True,
+    # The fixture is the device's name, the same for every path.
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
 @given(path=st.lists(FRAMES, min_size=3, max_size=7))
-def test_pictures_are_those_of_a_pipeline_that_leaves_nothing_out(path: list[Frame], preset: str) -> None:
-    assert_equal(path, "cpu", preset)
+def test_pictures_are_those_of_a_pipeline_that_leaves_nothing_out(path: list[Frame], device: str, preset: str) -> None:
+    assert_equal(path, device, preset)
 
 
 SHORT = 1 / 30
@@ -236,7 +252,7 @@ def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.Monk
     number_estimates(monkeypatch)
     asked, now = [], 0.0
     with Pipeline(
-        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=1, synchronous=True
+        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, synchronous=True
     ) as pipeline:
         for pose, objects, lights, picture, step in PATHS["long"]:
             pipeline.update(scene_of(objects, lights))
@@ -258,4 +274,5 @@ def test_reasons_are_those_of_the_frame() -> None:
     assert {"unwrap", "accumulate", "expose"}.isdisjoint(reasons)
     off = run(PATHS["light"][:4], "cpu", "every", culling=True)[-1]
     assert off.stages["relight"].left_out == "no virtual light has any power"
+    assert off.stages["key_lights"].left_out == "nothing reads its key_lights in this frame"
     assert off.stages["shade"].left_out is None

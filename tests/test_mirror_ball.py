@@ -682,7 +682,7 @@ def test_config_holds_what_the_scene_calls_for():
     assert whole.ratio
     assert whole.relight is not None
     assert whole.shade is not None
-    assert not whole.shade.near
+    assert not whole.shade.near_field
     assert config(dataclasses.replace(desk, lights=()), mirror_ball="single").relight is None
     bare = config(dataclasses.replace(desk, objects=()), mirror_ball="single")
     assert bare.shade is None

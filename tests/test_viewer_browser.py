@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.test_budget import even_costs
 from warp_ar.accuracy.cost_table import relevant_settings
@@ -129,7 +130,12 @@ def url(scene_file: Path, cache: Path, options: list[str]) -> Iterator[str]:
     """The page of a server of its own."""
     command = [sys.executable, "-c", LIVE, str(scene_file), "--device", "cpu", "--quality", "low"]
     command += ["--port", "0", "--no-browser", *options]
-    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+    # Costs of its own, but the kernels that are compiled already.
+    environment = {
+        **os.environ,
+        "XDG_CACHE_HOME": str(cache),
+        "WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent),
+    }
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:

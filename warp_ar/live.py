@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import dataclasses
 import faulthandler
+import gc
 import itertools
 import json
 import os
@@ -35,10 +36,11 @@ from warp_ar.command_line import (
 )
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
-from warp_ar.output.places import PROGRAM, check_places, check_replaceable, files_of
+from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
+from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 
 if TYPE_CHECKING:
@@ -70,7 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="?",
         default="desk",
         metavar="SCENE",
-        help="a scene file or a bundled scene's name (default: desk)",
+        help="a scene file, a folder with one, or a bundled scene's name (default: desk)",
     )
     add("--list", action="store_true", help="list the bundled scenes and stop")
     add(
@@ -224,8 +226,13 @@ def serve_page(options: argparse.Namespace) -> int:
 
     def make_host(**callbacks: Any) -> Any:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
+        from warp_ar.device import bound_arenas
         from warp_ar.viewer.host import Host
 
+        bound_arenas()
+        # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+        gc.collect()
+        gc.freeze()
         return Host(
             scene,
             source=options.source,

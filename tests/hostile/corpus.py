@@ -15,6 +15,7 @@ from warp_ar.input.sources import FrameFolder, Synthetic, open_source
 from warp_ar.kernels.color import decode_table
 from warp_ar.output.sinks import open_sink, read_environment, write_environment
 from warp_ar.scene import load_calibration, load_scene
+from warp_ar.scene.exif import read_exif
 from warp_ar.scene.mesh_files import load_mesh, load_texture
 from warp_ar.scene.shapes import torus_mesh
 
@@ -81,6 +82,17 @@ def picture(size: tuple[int, int] = (24, 16)) -> np.ndarray:
 
 def _image(path: pathlib.Path) -> None:
     assert cv2.imwrite(str(path), picture())
+
+
+def _photograph(path: pathlib.Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0110] = "A camera"
+    exif[0x0112] = 6
+    inner = exif.get_ifd(0x8769)
+    inner.update({0x829A: (1, 125), 0x829D: (28, 10), 0x8827: 200, 0xA405: 28, 0x920A: (43, 10)})
+    Image.fromarray(picture()).save(path, exif=exif)
 
 
 def _video(path: pathlib.Path) -> None:
@@ -177,6 +189,8 @@ READERS = (
     Reader("OBJ's texture", "wood.png", lambda path: load_mesh(path.parent / "a.obj"), _material),
     Reader("glTF's buffer", "a.bin", lambda path: load_mesh(path.parent / "a.gltf"), _buffer),
     Reader("glTF's texture", "a.png", lambda path: load_mesh(path.parent / "a.gltf"), _texture_of_gltf),
+    Reader("photograph with EXIF", "a.jpg", read_exif, _photograph),
+    Reader("photograph with EXIF, TIFF", "a.tiff", read_exif, _photograph),
     Reader("environment, EXR", "a.exr", read_environment, _environment),
 )
 

@@ -56,5 +56,5 @@ class Demand:
             else:
                 self._clear.add(name)
                 clearing.add(name)
-            wanted |= set(stage.wiring.reads)
+            wanted |= set(stage.reads_for(reach))
         return resting, clearing

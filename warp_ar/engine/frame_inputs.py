@@ -16,7 +16,7 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.input.saturation import SaturationLevels, ball_discs
+from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Camera, Pose, Scene
@@ -153,6 +153,8 @@ class FrameInputs:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
         if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
             return
+        if frame.index >= WATCHED and frame.index % PERIOD:
+            return
         if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
             table = camera_table(self._camera.transfer, self.saturation.levels)
             self._arrays["decode"].assign(table)
@@ -202,7 +204,8 @@ class FrameInputs:
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         shines = bool(self.block.host("lights")["intensity"].any())
-        return Reach(objects=objects, shines=shines, light=light, shadows=shadows, balls=balls)
+        falls = bool(self.host_scene.light_outline().polygons)
+        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

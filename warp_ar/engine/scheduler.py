@@ -121,6 +121,11 @@ class Scheduler:
         for stage, _ in self._stages:
             stage.close()
 
+    @property
+    def crew(self) -> Crew | None:
+        """The native threads that it has; None until it is prepared, and on CUDA."""
+        return self._crew
+
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
         self._seen.clear()

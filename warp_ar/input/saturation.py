@@ -15,8 +15,8 @@ Compression throws the channels' codes to both sides of a plateau, up to some te
 in full resolution. So a plateau of luma counts for all channels where its pixels are neutral: lamps drive all channels
 to the end, and few surfaces are so neutral.
 
-Nothing in the whole picture may be much higher either, then or later: one bright frame takes a level back. A level that
-was seen holds for all frames after it, for the camera is the same.
+A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
+255 anywhere in the picture takes it back for good.
 """
 
 from __future__ import annotations
@@ -51,10 +51,14 @@ LUMA = np.array([0.299, 0.587, 0.114])
 """Of JPEG and most video: ITU-R BT.601."""
 RINGING = 17
 """Codes by which compression exceeds a plateau."""
-BEYOND = 2e-5
-"""Share of the whole picture that may be higher than that."""
+LEAST_HEAP = 2e-4
+"""Share of the whole picture that has codes 254 and 255 where a channel saturates at them."""
 INSIDE = 0.95
 """Share of the ball's radius within which pixels are the ball's for certain."""
+WATCHED = 24
+"""First frames of a camera, each of which is looked at."""
+PERIOD = 12
+"""Of later frames one of so many is."""
 WIDTH = 1
 """Codes to either side of a plateau's own that belong to it."""
 
@@ -66,7 +70,7 @@ class SaturationLevels:
         """Take every channel to saturate at 255."""
         self.levels: NDArray[np.int64] = np.full(3, FULL)
         """Code at which each channel saturates, (3,)."""
-        self._highest = np.zeros(3, np.int64)
+        self._is_full = np.zeros(3, bool)
 
     def observe(self, image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> bool:
         """Look at one picture; returns whether a level has changed.
@@ -75,19 +79,22 @@ class SaturationLevels:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
         """
+        if self._is_full.all():
+            return False
         before = self.levels.copy()
         codes = ball_codes(image, balls)
         found = luma_plateau(codes)
         for c in range(3):
-            counts = np.bincount(image[::2, ::2, c].ravel(), minlength=256)
-            beyond = np.flatnonzero(np.cumsum(counts[::-1])[::-1] > max(BEYOND * counts.sum(), 1.0))
-            self._highest[c] = max(self._highest[c], int(beyond.max(initial=0)))
+            part = np.ascontiguousarray(image[::2, ::2, c])
+            heap = int(np.count_nonzero(part >= 254))
+            before_it = int(np.count_nonzero(part >= 252)) - heap
+            self._is_full[c] |= heap >= max(LEAST_PIXELS, LEAST_HEAP * part.size) and heap > 2 * before_it
             level = find_plateau(np.bincount(codes[:, c], minlength=256), STEEP, ABOVE)
             if level is None:
                 level = found
             if level is not None:
                 self.levels[c] = level
-            if self._highest[c] > self.levels[c] + RINGING:
+            if self._is_full[c]:
                 self.levels[c] = FULL
         return bool((before != self.levels).any())
 

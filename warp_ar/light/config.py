@@ -65,6 +65,10 @@ class PriorConfig:
     """Relative standard deviation of regions about their component's mean."""
     hue: float = 0.5
     """Relative standard deviation of one channel's distribution about that of all."""
+    colour: float = 3.0
+    """Ratio of one channel to the median of all that light which all of them lack may have: lamps are nearly white."""
+    own_clipping: float = 3.0
+    """Ratio of what a channel lacks to what the others do from which it clips for itself, as a blue sky does."""
     least: float = 0.3
     """Radiance below which relative deviations are no longer relative."""
     surface_excess: float = 0.5
@@ -77,6 +81,10 @@ class SearchConfig:
 
     evidence: float = 7.0
     """Fall of the cost (twice a log likelihood) that a peak must be worth."""
+    even: float = 1.6
+    """Ratio of how far surfaces scatter to what is expected of them above which they are textured."""
+    textured: float = 4.0
+    """Exponent of what exceeds it, in the fall that is asked for there."""
     better: float = 0.1
     """Fall of the cost for which a peak that is being added goes to a neighbouring place."""
     worth_moving: float = 1.0
@@ -162,12 +170,15 @@ class EvidenceConfig:
     """The same of the ball's."""
     usual_contrast: float = 30.0
     """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
-    doubt: float = 1.0
+    doubt: float = 2.0
     """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
     share: float = 0.1
     """Of draws that an estimate may be too much for."""
     safety: float = 1.0
     """Of what the others allow."""
+    lever: float = 2.0
+    """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
+    lights the card is hardly known by it."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     capture: float = 0.15

@@ -122,6 +122,24 @@ def allowed_factor(added: Array, missing: Array) -> float:
     return float(np.clip(config.safety * np.quantile(2.0 * (missing @ added) / squared, config.share), 0.0, 1.0))
 
 
+def most_by_card(captured: Array, added: Array, share: float) -> float:
+    """What an estimate may be multiplied by, 0 to 1, for its share of all light to be in keeping with the card's.
+
+    Light from the side, or from below, hardly lights the card; surfaces that say it is there are textured and of
+    unknown reflectance. Where the card shows little missing, it is little elsewhere, within ``lever``.
+
+    Args:
+        captured: Irradiance as captured, (directions,).
+        added: Irradiance that the estimate adds, (directions,).
+        share: Of the card's irradiance that is missing.
+    """
+    most = CONFIG.evidence.lever * share
+    size = float(np.linalg.norm(added))
+    if most >= 1.0 or size <= 0.0:
+        return 1.0
+    return min(most / (1.0 - most) * float(np.linalg.norm(captured)) / size, 1.0)
+
+
 def likely_gain(added: Array, missing: Array) -> float:
     """By how much an estimate lowers the squared error of irradiance in nearly all draws."""
     gain = (missing**2).sum(axis=1) - ((missing - added) ** 2).sum(axis=1)

@@ -60,6 +60,7 @@ from warp_ar.light.evidence import (
     irradiance_form,
     irradiance_interval,
     likely_gain,
+    most_by_card,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -136,6 +137,7 @@ class Recovery:
         self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[Peak] = []
+        self._estimates = 0
         self._frames = 0
         self._stillness = Stillness()
         self._blocks = blocks_of(surfaces)
@@ -152,7 +154,7 @@ class Recovery:
             cells: As for ``update``.
             observations: As for ``update``.
         """
-        return self._stillness.holds(cells, observations, settled=self._frames >= CONFIG.solver.settled)
+        return self._stillness.holds(cells, observations, settled=self._estimates >= CONFIG.solver.settled)
 
     def update(
         self,
@@ -182,6 +184,7 @@ class Recovery:
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
+        self._estimates += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
             return self._without_card(problem, card)
@@ -197,7 +200,7 @@ class Recovery:
         # The channel that surfaces show best.
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
-        solution = _solve_channels(problem, best, means, bounds)
+        solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         # A lamp that gives nothing in any channel has gone out, or never was.
         powers = solution[problem.parts :]
         self._peaks = [peak for peak, power in zip(problem.peaks, powers, strict=True) if power.any()]
@@ -209,7 +212,9 @@ class Recovery:
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
         if is_turn or self._evidence is None:
             start = fit_channel(problem, best, problem.start(means[best]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(problem, best, start, (excess, by_card), self._blocks, doubt_of(card.contrast))
+            self._evidence = _weigh(
+                problem, best, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast)
+            )
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
@@ -290,19 +295,45 @@ class _Evidence:
 
 
 def _weigh(
-    problem: Problem, c: int, z: Array, solutions: tuple[Array, Array], blocks: NDArray[np.int64], doubt: float
+    problem: Problem,
+    c: int,
+    z: Array,
+    bounds: tuple[bool, bool, bool],
+    solutions: tuple[Array, Array],
+    blocks: NDArray[np.int64],
+    doubt: float,
 ) -> _Evidence:
     """Which of two solutions, by shading and by the card alone, to take, and how much of it."""
     form = irradiance_form(problem, spread_directions(CONFIG.evidence.directions))
+    share = 1.0 if bounds[c] else problem.card_share(c, is_bound=False) + doubt
     missing = draw_missing(problem, c, z, blocks, doubt) @ form.T
     total = missing.sum(axis=1)
     spread = float(total.std() / max(total.mean(), 1e-9))
     found = []
     for method, excess in zip(("shading", "white_card"), solutions, strict=True):
         added = form @ (excess[:, c] * problem.lacking[:, c])
-        factor = allowed_factor(added, missing)
+        factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
     return max(found, key=lambda one: one[0])[1]
+
+
+def tie_channels(problem: Problem, solution: Array) -> Array:
+    """A solution without light of one channel only, unless that channel clips where others do not, (parts + peaks, 3).
+
+    What lamps look like in one channel is told by surfaces that show that channel: texture, or another response in it,
+    makes lamps of one colour. Where all channels lack light, none is more than some times the median of the three.
+
+    Args:
+        problem: The equations.
+        solution: Radiance of parts, then power of peaks, (parts + peaks, 3).
+    """
+    config = CONFIG.priors
+    cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
+    cells += [np.array([peak.cell]) for peak in problem.peaks]
+    lacking = np.array([problem.solid_angle[own] @ problem.lacking[own] for own in cells]).reshape(-1, 3)
+    most = config.colour * np.median(solution, axis=1, keepdims=True)
+    alone = lacking > config.own_clipping * np.median(lacking, axis=1, keepdims=True)
+    return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:

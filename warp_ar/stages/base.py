@@ -55,6 +55,8 @@ class Reach:
     """A virtual object may be in the picture."""
     shines: bool = True
     """A virtual light has power."""
+    falls: bool = True
+    """Virtual light may fall on the receiver, in the picture or beside it."""
     light: bool = True
     """Virtual light may fall on the receiver in the picture."""
     shadows: bool = True
@@ -225,6 +227,10 @@ class Stage(abc.ABC):
         reads does.
         """
         return None
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        """Those of the resources that it reads on which what it writes may depend in a frame; as ``idle``."""
+        return self.wiring.reads
 
     def rest(self) -> None:  # noqa: B027
         """Called instead of ``begin`` in a frame in which nothing reads what the stage writes."""

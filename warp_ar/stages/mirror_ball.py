@@ -63,6 +63,20 @@ def mirrored_relighting(features: Features) -> RelightConfig:
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
+def _reads(features: Features, *, lit: bool) -> set[str]:
+    """What objects and, if ``lit``, the receiver are lit by."""
+    reads = {"pose", "frame"}
+    if "virtual" in features.layers:
+        reads |= {"objects", *distant_light_reads(features)}
+        reads |= {"lights"} if shade_config(features).lights else set()
+    if lit:
+        # The ball shows the receiver too small for a pixel's surroundings to mean anything.
+        reads |= set(relight_reads(features)) - {"summed_area", "environment_samples"}
+    if features.shadowed:
+        reads.add("shadow_ratio")
+    return reads
+
+
 class MirrorBall(Stage):
     """Virtual objects, light and shadow as the mirror balls of the frame show them."""
 
@@ -93,26 +107,23 @@ class MirrorBall(Stage):
             return LeftOut("the scene has no mirror ball")
         if quality.method(cls.name) not in SAMPLES:
             return LeftOut(f"the quality {quality.name!r} leaves the ball as the camera saw it")
-        layers = features.layers
-        if "mirrored" not in layers:
+        if "mirrored" not in features.layers:
             return LeftOut("the scene has nothing virtual that a ball could mirror")
-        reads = {"pose", "frame"}
-        if "virtual" in layers:
-            reads |= {"objects", *distant_light_reads(features)}
-            reads |= {"lights"} if shade_config(features).lights else set()
-        if "physical_added" in layers:
-            # The ball shows the desk too small for a pixel's surroundings to mean anything.
-            reads |= set(relight_reads(features)) - {"summed_area", "environment_samples"}
-        if "shadow_ratio" in layers:
-            reads.add("shadow_ratio")
-        return Wiring(tuple(sorted(reads)), ("mirrored",))
+        return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirrored",))
 
     def idle(self, reach: Reach) -> str | None:
         """A ball may show what is out of the picture itself."""
         if not reach.balls:
             return "no mirror ball is in the picture"
-        dark = not reach.shines and not self.request.scene.objects
-        return "no virtual light has any power" if dark else None
+        dark = not reach.falls and not self.request.scene.objects
+        return "virtual light falls on nothing" if dark else None
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        """How the receiver responds matters only where virtual light falls on it."""
+        if reach.falls:
+            return self.wiring.reads
+        unlit = _reads(self.features, lit=False)
+        return tuple(name for name in self.wiring.reads if name in unlit)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""

@@ -57,7 +57,6 @@ class Visibility(Stage):
         width, height = self.request.size
         return {
             "hit_object": ArraySpec((height, width), wp.int32, -1),
-            "hit_depth": ArraySpec((height, width), wp.float32, float("inf")),
             "hits": ArraySpec((height, width), Hit, Hit()),
         }
 
