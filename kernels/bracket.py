@@ -180,7 +180,7 @@ def merge_exposures(
     """Merge the latest unwrapped frame of every exposure.
 
     Args:
-        exposures: ``BracketExposure`` (K), the reference first, then ever shorter ones.
+        exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
         radiance: ``wp.vec3`` (K, h, w), in camera values of the exposure over the ball's reflectance.
         confidence: ``wp.float32`` (K, h, w); 0 or NaN: not seen.
         clipped: Share at clipping per channel, ``wp.vec3`` (K, h, w).

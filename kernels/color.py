@@ -207,10 +207,9 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
             f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
         )
     text = read_text(path, SceneError, expected="256 lines of three linear values")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
-        values = np.array(
-            [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
-        )
+        values = np.array([[float(word) for word in line.replace(",", " ").split()] for line in lines])
     except ValueError as error:
         raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None
     if values.shape != (256, 3):

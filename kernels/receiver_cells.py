@@ -36,7 +36,7 @@ from warp_ar.kernels.cells import cell_pixel, look_up_cells
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.relight import (
     DEFAULT_REFLECTANCE,
     Receiver,
@@ -67,7 +67,7 @@ MIN_FACING = wp.constant(wp.float32(0.02))
 MAX_PARTIALS = 16
 """Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
 KINDS = wp.constant(2)
-"""Sums per part of a cell: the environment, and what is lost of it."""
+"""Values of a partial sum: the environment, and what is lost of it."""
 PENDING = wp.constant(-2)
 """What ``surface_out`` holds less the cell's surface while partials of its share are not yet added."""
 
@@ -178,7 +178,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
         surface_out = cells_out.ambient_surface
         partial = ci / share_out.shape[0]
         ci = ci % share_out.shape[0]
-        # One part of a cell writes its surface, and no surface that another partial may still read as found before.
+        # One thread of a cell writes its surface, and no surface that another may still read as found before.
         if not bounced:
             if partial == 0:
                 surface_out[ci, cj] = -1
@@ -449,7 +449,7 @@ def estimate_ambient_visibility(
         device=device,
     )
     if partials > 1:
-        wp.launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
+        launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
 
 
 def partial_sums_shape(partials: int, rows: int, columns: int) -> tuple[int, int, int]:

@@ -525,8 +525,9 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
             squares = wp.vec3(0.0, 0.0, 0.0)
             count = wp.float32(0.0)
-            for a in range(PATCH):
-                for b in range(PATCH):
+            side = wp.int32(PATCH)  # a variable: the loops stay loops, and the kernel a seventh of its size
+            for a in range(side):
+                for b in range(side):
                     u = (2.0 * wp.float32(a) + 1.0) / wp.float32(PATCH) - 1.0
                     v = (2.0 * wp.float32(b) + 1.0) / wp.float32(PATCH) - 1.0
                     place = point.position + point.half * (u * point.tangent + v * across)

@@ -14,7 +14,6 @@ PLANE = 0
 BOX = 1
 MESH = 2
 SPHERE = 3
-TORUS = 4
 
 # Kinds of light.
 POINT = 0
@@ -76,7 +75,7 @@ class Light:
 class Shape:
     """A proxy or a virtual object: point_world = rotation (scale point_local) + position."""
 
-    kind: wp.int32  # PLANE, BOX, MESH, SPHERE or TORUS
+    kind: wp.int32  # PLANE, BOX, MESH or SPHERE
     rotation: wp.mat33
     position: wp.vec3
     scale: wp.float32
@@ -133,6 +132,15 @@ class Picture:
     frame: wp.array2d[wp.vec3ub]  # RGB
     decode_table: wp.array[wp.vec3]  # (256,) of ``color.decode_table``
     rays: wp.array2d[wp.vec2]  # undistorted (x / z, y / z) of each pixel's centre
+
+
+def make_picture(frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None) -> Picture:
+    """The arrays of a picture together; None for what a kernel does not read."""
+    picture = Picture()
+    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays)):
+        if value is not None:
+            setattr(picture, name, value)
+    return picture
 
 
 @wp.struct

@@ -106,6 +106,10 @@ class ProjectConfig:
     occluders: tuple[int, ...] = ()
     """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
 
+    def general(self) -> ProjectConfig:
+        """For any scene."""
+        return ProjectConfig(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
+
 
 @functools.cache
 def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:

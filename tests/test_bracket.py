@@ -16,8 +16,8 @@ from tests.reference import bracket as reference
 from tests.reference import latlong as latlong_reference
 from tests.reference import unwrap as probe_reference
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError
-from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.errors import SceneError, UsageError
+from warp_ar.input.exposures import MOST_EXPOSURES, brightened, find_exposure, plan_bracket
 from warp_ar.input.sources import Synthetic
 from warp_ar.kernels import bracket
 from warp_ar.kernels.color import decode_table
@@ -351,6 +351,10 @@ def test_a_folder_of_alternating_exposures(tmp_path, device):
 # ---- which exposures make a bracket ----
 
 
+THIRDS = [1 / 125, 1 / 100, 1 / 80, 1 / 60, 1 / 50, 1 / 40]
+"""As cameras round thirds of a stop."""
+
+
 @pytest.mark.parametrize(
     ("exposures", "ratios"),
     [
@@ -358,17 +362,56 @@ def test_a_folder_of_alternating_exposures(tmp_path, device):
         ([0.02], ()),
         ([0.01, 0.08, 0.02, 0.0805], (1.0, 0.02 / 0.0805, 0.01 / 0.0805)),  # a camera wavers
         ([0.02, 0.018, 0.016, 0.014, 0.012], ()),  # adapts to the light
-        ([2.0**-k for k in range(9)], ()),
+        (THIRDS, tuple(40 * t for t in sorted(THIRDS, reverse=True))),
+        ([0.1, 0.072, 0.01], (1.0, 0.72, 0.1)),  # 1.39 apart: both count
     ],
 )
 def test_brackets_are_told_from_adaption(exposures, ratios):
-    assert bracket_ratios(exposures) == pytest.approx(ratios)
+    plan = plan_bracket(exposures)
+    assert plan.ratios == pytest.approx(ratios)
+    assert bool(plan.notes) == (len(plan.ratios) < len(set(exposures)) and len(set(exposures)) > 1)
+
+
+def test_exposures_that_are_too_many_are_thinned_and_said():
+    plan = plan_bracket([2.0**-k for k in range(12)], shown=0.25)
+    assert len(plan.ratios) == MOST_EXPOSURES
+    assert {1.0, 4.0, 2.0**-9} <= set(plan.ratios)  # the shown one, the longest, the shortest
+    assert len(plan.left_out) == 4
+    assert "left out" in plan.notes[0]
+    for ratio in plan.left_out:
+        assert find_exposure(0.25 * ratio, plan) is None
 
 
 def test_frames_are_told_apart_by_ratio():
-    ratios = (1.0, 0.25, 0.01)
-    assert [find_exposure(s, 0.04, ratios) for s in (None, 0.04, 0.03, 0.012, 0.009, 0.0005)] == [0, 0, 0, 1, 1, 2]
-    assert find_exposure(0.01, 0.04, ()) == 0
+    plan = plan_bracket([0.04, 0.01, 0.0004])
+    assert [find_exposure(s, plan) for s in (None, 0.04, 0.03, 0.012, 0.009, 0.0005)] == [0, 0, 0, 1, 1, 2]
+    assert find_exposure(0.01, plan_bracket([])) == 0
+    shown = plan_bracket([0.04, 0.01, 0.0004], shown=0.01)
+    assert shown.ratios == pytest.approx((4.0, 1.0, 0.04))
+    assert [find_exposure(s, shown) for s in (None, 0.04, 0.0004)] == [1, 0, 2]
+    with pytest.raises(UsageError, match=r"shown = 0.02 s.*0.04, 0.01"):
+        plan_bracket([0.04, 0.01], shown=0.02)
+
+
+@pytest.mark.parametrize("shown", [0, 1, 2])
+def test_any_exposure_can_be_the_shown_one(clip, device, shown):
+    times = tuple(0.02 * ratio for ratio in RATIOS)
+    found = []
+    for choice in (0, shown):
+        with Pipeline(
+            make_scene(),
+            device=device,
+            quality="low",
+            outputs=("environment", "image"),
+            exposures=times,
+            shown=times[choice],
+        ) as pipe:
+            for index, (image, pose, seconds) in enumerate(clip * 2):
+                result = pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)
+                assert result.shown == (index % len(RATIOS) == choice)
+            found.append(irradiance(np.array(result.environment, np.float64)) / RATIOS[choice])
+    # The card is no part of these frames, so both rest on the bracket alone; the poses err by a third of a pixel.
+    assert np.linalg.norm(found[1] - found[0]) < 0.1 * np.linalg.norm(found[0])
 
 
 def test_brightening_undoes_a_shorter_exposure():
@@ -384,5 +427,7 @@ def test_brightening_undoes_a_shorter_exposure():
 def test_scene_names_exposures():
     text = dumps_scene(make_scene(source=SourceSpec(camera=0, exposures=(0.01, 0.001))))
     assert loads_scene(text).source.exposures == (0.01, 0.001)
+    shown = dumps_scene(make_scene(source=SourceSpec(camera=0, exposures=(0.01, 0.001), shown=0.001)))
+    assert loads_scene(shown).source.shown == 0.001
     with pytest.raises(SceneError, match="exposures"):
         loads_scene(text.replace("exposures = [0.01, 0.001]", "exposures = [0.01, -1]"))

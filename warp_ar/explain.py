@@ -15,7 +15,7 @@ from rich.table import Table
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
-from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.output.report import print_plan
 from warp_ar.scene import load_scene
 from warp_ar.stages import STAGES
@@ -50,7 +50,8 @@ def explain(options: argparse.Namespace) -> int:
         return EXIT_DONE
     scene = load_scene(options.scene)
     size = (scene.camera.width, scene.camera.height)
-    exposures = bracket_ratios((scene.source and scene.source.exposures) or ())
+    spec = scene.source
+    exposures = plan_bracket(spec.exposures or (), spec.shown).ratios if spec is not None else ()
     print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
     return EXIT_DONE
 

@@ -49,7 +49,6 @@ from warp_ar.accuracy.cost_table import (
 from warp_ar.accuracy.costs import (
     BASE,
     Costs,
-    cache_folder,
     cost_key,
     make_method_costs,
     measure_costs,
@@ -57,16 +56,13 @@ from warp_ar.accuracy.costs import (
     time_alone,
     write_costs,
 )
+from warp_ar.cache_folder import cache_folder
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
-from warp_ar.stages.quality import Quality
-
-AUTO = "auto"
-"""Name of the quality that this file is about."""
-DEFAULT_BUDGET_MS = 33.0
-"""Thirty frames per second."""
+from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 
 AIM = 0.9
 """Share of the budget that is planned for at first, and when there is too much to do."""
@@ -375,6 +371,7 @@ class AutoPipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         costs: Costs | None = None,
         folder: Path | None = None,
@@ -389,6 +386,7 @@ class AutoPipeline:
             size: Width and height of the frames; None means the scene's.
             outputs: What results shall hold.
             exposures: As for ``Pipeline``.
+            shown: As for ``Pipeline``.
             bands: Bands of rows per CPU pass; None means one per core.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
@@ -406,7 +404,7 @@ class AutoPipeline:
         self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
         self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
         self._switcher = PipelineSwitcher(device=device, bands=bands, keep=_KEPT_PIPELINES - 1)
-        self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures))
+        self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures), shown)
         self.pipeline = self._switcher.open(self._target)
         """The one that lights the next frame."""
         self._costs = costs
@@ -423,6 +421,10 @@ class AutoPipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """As ``Pipeline.warm_up``, for the settings of the first frame."""
+        self.pipeline.warm_up(progress)
 
     def close(self) -> None:
         """Stop the threads; arrays go when the last result that refers to them does."""

@@ -16,14 +16,14 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.input.saturation import SaturationLevels, ball_discs
+from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
-from warp_ar.stages.base import Arrays, Rows
+from warp_ar.stages.base import Arrays, Reach, Rows
 
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
@@ -98,6 +98,7 @@ class FrameInputs:
         add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
         for name in RECTS:
             add(f"{name}_rows", functools.partial(self._rows, name))
+        add("reach", self.reach)
         add("seconds", lambda: float(params["time"][0]))
 
     def close(self) -> None:
@@ -152,6 +153,8 @@ class FrameInputs:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
         if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
             return
+        if frame.index >= WATCHED and frame.index % PERIOD:
+            return
         if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
             table = camera_table(self._camera.transfer, self.saturation.levels)
             self._arrays["decode"].assign(table)
@@ -195,6 +198,14 @@ class FrameInputs:
     def _rows(self, name: str) -> Rows:
         """Rows of one of ``RECTS`` in this frame."""
         return self.rects[name][:2]
+
+    def reach(self) -> Reach:
+        """What of this frame virtual things can reach."""
+        rects = (self.rects[name] for name in RECTS)
+        objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
+        shines = bool(self.block.host("lights")["intensity"].any())
+        falls = bool(self.host_scene.light_outline().polygons)
+        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

@@ -17,16 +17,17 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import exclusive, resolve_device
+from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
-from warp_ar.input.exposures import bracket_ratios, brightened, find_exposure
+from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.ray_scene import skeleton
@@ -84,9 +85,11 @@ class Pipeline:
         size: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("image",),
         exposures: Sequence[float] = (),
+        shown: float | None = None,
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
 
@@ -96,12 +99,14 @@ class Pipeline:
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
             outputs: What results shall hold: ``image``, ``environment``, ``pose``.
-            exposures: Exposure times in seconds between which the frames alternate. Frames of the longest are lit and
-                shown; the others tell what clips in it.
+            exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
+                the others tell what clips in it, and what is too dark.
+            shown: Which: seconds; None means the longest.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -116,8 +121,9 @@ class Pipeline:
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
         self.quality = resolve_quality(quality)
-        self._longest = max(exposures, default=1.0)
-        ratios = bracket_ratios(exposures)
+        self.bracket = plan_bracket(exposures, shown)
+        """Which exposures are merged, and which is shown."""
+        ratios = self.bracket.ratios
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
         self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
         self._start_time: float | None = None
@@ -130,9 +136,11 @@ class Pipeline:
         self._short: ShortFrames | None = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
-        with exclusive(self.device), wp.ScopedDevice(self.device):
+        with translating(self.device), wp.ScopedDevice(self.device):
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
-            self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+            self._scheduler = Scheduler(
+                self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
+            )
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.features, self._arrays, self.device)
 
@@ -205,10 +213,15 @@ class Pipeline:
         self.scene, self.plan = scene, plan
         return True
 
-    def warm_up(self) -> None:
-        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline."""
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be: kernels are
+                compiled once for a kind of scene and kept. On the caller's thread.
+        """
         self._check_usable()
-        self._scheduler.warm_up()
+        self._scheduler.warm_up(progress)
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
@@ -240,7 +253,7 @@ class Pipeline:
                 pipeline's device, which is used without a copy to the host unless the marker must be found.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
             pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
-            exposure_time: Seconds; None means the longest of the pipeline's exposures.
+            exposure_time: Seconds; None means that of the frames that are shown.
 
         Raises:
             UsageError: The image has another size or type, a number is not finite, the pipeline is closed, or it is
@@ -280,10 +293,10 @@ class Pipeline:
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:
             self._start_time = self._last_time = self._lit_time = now
-        exposure = find_exposure(exposure_time, self._longest, self.plan.request.exposures)
-        if not handed_over or exposure > 0:
+        exposure = find_exposure(exposure_time, self.bracket)
+        if not handed_over or exposure != self.bracket.reference:
             self._finish()
-        if exposure > 0:
+        if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
         frame, state = self._look(image if host_image is None else host_image, now, pose)
         if handed_over:
@@ -354,6 +367,7 @@ class Pipeline:
         timings: Mapping[str, StageTiming] = frame.timings
         start = time.perf_counter()
         if not frame.lost:
+            self._scheduler.prepare()
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._light.known = False
@@ -364,15 +378,18 @@ class Pipeline:
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3)
 
-    def _take_short(self, image: Any, host_image: Image | None, exposure: int, now: float, pose: Pose | None) -> Result:
-        """Let a frame of another exposure tell of the light; the picture stays."""
+    def _take_short(
+        self, image: Any, host_image: Image | None, exposure: int | None, now: float, pose: Pose | None
+    ) -> Result:
+        """Let a frame of another exposure tell of the light, unless that was left out; the picture stays."""
         timings: dict[str, StageTiming] = {}
         bright: Any = image
         if self._shown is None or (self._tracker is not None and pose is None):
             picture = image.numpy() if host_image is None else host_image
-            bright = brightened(picture, self.inputs.decode, self.plan.request.exposures[exposure])
+            ratio = 1.0 if exposure is None else self.bracket.ratios[exposure]
+            bright = brightened(picture, self.inputs.decode, ratio)
         pose, state = self._track(bright, now, pose, timings)
-        if self._short is not None and pose is not None:
+        if self._short is not None and pose is not None and exposure is not None:
             start = time.perf_counter()
             with exclusive(self.device):
                 self._short.take(image, exposure, pose, self.inputs.block.host("params"), now)

@@ -1,8 +1,8 @@
 """Frames of other exposures than the one that is shown: what they say of the environment, and nothing else of them.
 
 A source that alternates between exposures gives pictures that must not be shown in turn: they would flicker. The
-longest exposure is the reference: its frames are lit and shown, and all radiance is in its camera values. From the
-others the ball is unwrapped; stage ``bracket`` merges what they say.
+longest exposure, or the one that was chosen, is the reference: its frames are lit and shown, and all radiance is in its
+camera values. From the others the ball is unwrapped; stage ``bracket`` merges what they say.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ class ShortFrames:
             device: Warp device.
         """
         self._ratios = features.request.exposures
+        self._reference = self._ratios.index(1.0)
         self._arrays = arrays
         self._own = Arrays()
         self._taken = [-math.inf] * len(self._ratios)
@@ -87,7 +88,9 @@ class ShortFrames:
             Whether one has come in that was not there before: what was accumulated until then had clipped without it,
             and is no mean to start from.
         """
-        told = tuple(index == 0 or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken))
+        told = tuple(
+            index == self._reference or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken)
+        )
         if told == self._told:
             return False
         self._told = told

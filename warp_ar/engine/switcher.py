@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from warp_ar.device import exclusive, release_memory
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError, WarpArError
-from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.scene import Scene
 from warp_ar.stages.quality import Quality
 
@@ -37,6 +37,8 @@ class Target:
     outputs: tuple[str, ...] = ("image",)
     exposures: tuple[float, ...] = ()
     """Exposure times in seconds between which the frames alternate."""
+    shown: float | None = None
+    """That of the frames that are shown; None means the longest."""
 
 
 class PipelineSwitcher:
@@ -136,8 +138,12 @@ class PipelineSwitcher:
         if wait and target is not self._shown:
             self._drop_building()
             self._wanted = target
-            ready = self._ready()
-            self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            try:
+                ready = self._ready()
+                self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            except WarpArError:
+                self._wanted = self._shown
+                raise
             return self.pipeline
         self.want(target, prepare)
         return self.take()
@@ -174,6 +180,7 @@ class PipelineSwitcher:
                 size=target.size,
                 outputs=target.outputs,
                 exposures=target.exposures,
+                shown=target.shown,
                 **self._arguments,
             )
             return pipeline, prepare(pipeline)
@@ -242,7 +249,7 @@ def _fits(pipeline: Pipeline, target: Target) -> bool:
     camera = target.scene.camera
     size = (camera.width, camera.height) if target.size is None else target.size
     same = (request.quality, pipeline.size, request.outputs) == (target.quality, size, target.outputs)
-    return same and request.exposures == bracket_ratios(target.exposures) and pipeline.update(target.scene)
+    return same and pipeline.bracket == plan_bracket(target.exposures, target.shown) and pipeline.update(target.scene)
 
 
 def let_go(pipeline: Pipeline) -> None:
@@ -251,10 +258,11 @@ def let_go(pipeline: Pipeline) -> None:
     Its arrays, stages and scheduler refer to each other, so they would wait for the garbage collector, which counts
     objects: a pipeline is few objects and many megabytes. Results that refer to arrays keep those.
     """
-    device, owners = pipeline.device, (pipeline.arrays, pipeline.scheduler, pipeline)
+    device, scheduler = pipeline.device, pipeline.scheduler
     pipeline.close()
+    crew = scheduler.crew
     with exclusive(device):
-        for owner in owners:
+        for owner in (pipeline.arrays, scheduler, pipeline, *([] if crew is None else [crew])):
             vars(owner).clear()
     release_memory()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -10,41 +11,110 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-LEAST_STEP = 1.4
-"""Least ratio of neighbouring exposures: less than that brings little."""
+from warp_ar.errors import UsageError
+
 WAVERING = 1.1
-"""Ratio within which exposures are one."""
+"""Ratio within which exposures are one; steps of a third of a stop are 1.26, as rounded by cameras 1.15 and more."""
+ADAPTING = 1.2
+"""Steps that are smaller than this in the middle, of four exposures or more, are a camera that adapts to the light."""
 MOST_EXPOSURES = 8
-"""More than this is a camera that adapts to the light, not one that alternates."""
+"""Exposures that are merged at most: what lies between others adds little."""
 
 
-def bracket_ratios(exposures: Sequence[float]) -> tuple[float, ...]:
-    """Exposure times of a source as ratios to the longest: 1 first, then ever shorter ones; empty if no bracket.
+@dataclasses.dataclass(frozen=True)
+class BracketPlan:
+    """Which exposures of a source are merged, and which is shown."""
 
-    A camera that adapts to the light gives many times, near one another: no bracket either.
+    ratios: tuple[float, ...]
+    """Exposures over the shown one, longest first; empty if there is no bracket."""
+    shown: float
+    """Exposure in seconds of the frames that are lit and shown."""
+    left_out: tuple[float, ...] = ()
+    """Exposures over the shown one that frames have and that are not merged."""
+    notes: tuple[str, ...] = ()
+    """What was merged or left out, a line each."""
+
+    @property
+    def reference(self) -> int:
+        """Which of ``ratios`` the shown frames have."""
+        return self.ratios.index(1.0) if self.ratios else 0
+
+
+def plan_bracket(exposures: Sequence[float], shown: float | None = None) -> BracketPlan:
+    """Exposures of a source as a bracket, said what is left out.
+
+    Exposures within ``WAVERING`` of each other count as one. A camera that adapts to the light gives many, one beside
+    the other over a wide range: no bracket. Of more than ``MOST_EXPOSURES`` the most evenly spread are merged.
+
+    Args:
+        exposures: Seconds, of all frames or each once.
+        shown: Seconds of the frames to show; the longest if None.
+
+    Raises:
+        UsageError: ``shown`` is none of the exposures.
     """
-    times: list[float] = []
-    for time in sorted(exposures, reverse=True):
-        if not times or time * WAVERING < times[-1]:
-            times.append(time)
-    apart = all(longer >= LEAST_STEP * shorter for longer, shorter in itertools.pairwise(times))
-    if not 2 <= len(times) <= MOST_EXPOSURES or not apart:
-        return ()
-    return tuple(time / times[0] for time in times)
+    if not exposures:
+        return BracketPlan((), 1.0)
+    groups: list[list[float]] = []
+    for time in sorted(set(exposures), reverse=True):
+        if groups and time * WAVERING >= groups[-1][-1]:
+            groups[-1].append(time)
+        else:
+            groups.append([time])
+    wide = max(group[0] / group[-1] for group in groups)
+    steps = sorted(longer[-1] / shorter[0] for longer, shorter in itertools.pairwise(groups))
+    adapts = len(groups) >= 4 and steps[len(steps) // 2] < ADAPTING
+    longest = max(exposures)
+    if shown is not None and not any(1 / WAVERING < shown / time < WAVERING for time in exposures):
+        told = ", ".join(f"{group[0]:g}" for group in groups)
+        raise UsageError(f"shown = {shown:g} s: no frame has this exposure; expected one of {told}")
+    if wide > WAVERING * WAVERING or adapts:
+        note = f"exposures drift from {longest:g} to {min(exposures):g} s instead of alternating: no bracket"
+        return BracketPlan((), shown or longest, notes=(note,))
+    notes = [
+        f"exposures {', '.join(f'{time:g}' for time in group)} s are taken for one: within {group[0] / group[-1]:.2f} times"
+        for group in groups
+        if len(group) > 1
+    ]
+    times = [group[0] for group in groups]
+    kept = times if len(times) <= MOST_EXPOSURES else _spread(times, shown or longest)
+    if len(kept) < len(times):
+        gone = ", ".join(f"{time:g}" for time in times if time not in kept)
+        notes.append(f"exposures {gone} s are left out: {MOST_EXPOSURES} of {len(times)} are merged")
+    reference = min(kept, key=lambda time: abs(math.log(time / (shown or longest))))
+    if len(kept) < 2:
+        return BracketPlan((), reference, notes=tuple(notes))
+    left_out = tuple(time / reference for time in times if time not in kept)
+    return BracketPlan(tuple(time / reference for time in kept), reference, left_out, tuple(notes))
 
 
-def find_exposure(exposure_time: float | None, longest: float, ratios: Sequence[float]) -> int:
-    """Which of the exposures a frame has: the nearest by ratio; the reference, 0, if it does not tell.
+def _spread(times: Sequence[float], shown: float) -> list[float]:
+    """The ``MOST_EXPOSURES`` times nearest to even steps from the longest to the shortest, the shown one among them."""
+    logs = [math.log(time) for time in times]
+    chosen = {min(range(len(times)), key=lambda k: abs(logs[k] - math.log(shown)))}
+    for step in range(MOST_EXPOSURES):
+        wanted = logs[0] + (logs[-1] - logs[0]) * step / (MOST_EXPOSURES - 1)
+        if len(chosen) < MOST_EXPOSURES or step == MOST_EXPOSURES - 1:
+            chosen.add(min(range(len(times)), key=lambda k: abs(logs[k] - wanted)))
+    return [times[k] for k in sorted(chosen)][:MOST_EXPOSURES]
+
+
+def find_exposure(exposure_time: float | None, plan: BracketPlan) -> int | None:
+    """Which of a bracket's exposures a frame has: the nearest by ratio; the shown one if it does not tell.
 
     Args:
         exposure_time: Seconds.
-        longest: The reference's, seconds.
-        ratios: From ``bracket_ratios``.
+        plan: The bracket.
+
+    Returns:
+        Index into ``plan.ratios``; None for an exposure that was left out.
     """
-    if exposure_time is None or not ratios:
-        return 0
-    ratio = exposure_time / longest
-    return min(range(len(ratios)), key=lambda index: abs(math.log(ratios[index] / ratio)))
+    if exposure_time is None or not plan.ratios:
+        return plan.reference
+    ratio = exposure_time / plan.shown
+    every = (*plan.ratios, *plan.left_out)
+    index = min(range(len(every)), key=lambda k: abs(math.log(every[k] / ratio)))
+    return index if index < len(plan.ratios) else None
 
 
 def brightened(image: npt.NDArray[np.uint8], decode: npt.NDArray[Any], ratio: float) -> npt.NDArray[np.uint8]:

@@ -80,18 +80,18 @@ class FrameFolder(RecordedSource):
             self._cycle = self._cycle or told
         shown = [self._exposures[path.name] for path in self._paths if path.name in self._exposures]
         self.exposures = distinct(self._cycle or shown)
-        height, width, _ = _read_image(self._paths[0]).shape
+        height, width, _ = read_image(self._paths[0]).shape
         self.size, self.fps, self.length = (width, height), fps, len(self._paths)
         self.description = f"{path} ({self.length} images, {width}x{height})"
 
     def _decode(self) -> Generator[Frame, None, None]:
         for index, path in enumerate(self._paths):
-            image = _read_image(path)
+            image = read_image(path)
             check_size(image, self.size, str(path), index)
             yield Frame(index, index / self.fps, image, self._exposures.get(path.name))
 
 
-def _read_image(path: pathlib.Path) -> Image:
+def read_image(path: pathlib.Path) -> Image:
     """8-bit RGB of an image file, as the module's docstring says."""
     label = f"frame {path}"
     picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)

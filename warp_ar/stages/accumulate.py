@@ -20,6 +20,7 @@ class Accumulate(Stage):
     summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; m + a (x - m), exact where x = m",
         bound=1e-5,

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import bracket as kernels
+from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
@@ -19,6 +20,7 @@ class Bracket(Stage):
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
     unread: ClassVar[str] = "nothing asks for the environment"
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=2e-6,
@@ -56,11 +58,12 @@ class Bracket(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The reference joins the others; what clips nearby; their mean."""
         height = self.request.quality.environment_height
-        own = [(arrays[f"bracket_{part}"][0], arrays[f"probe_{part}"]) for part in UNWRAPPED]
+        reference = self.request.exposures.index(1.0)
+        own = [(arrays[f"bracket_{part}"][reference], arrays[f"probe_{part}"]) for part in UNWRAPPED]
 
         def store(rows: Rows | None) -> None:
             for target, source in own:
-                wp.copy(target, source)
+                copy(target, source)
 
         def spread(rows: Rows | None) -> None:
             kernels.spread_clipping(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -12,15 +11,29 @@ import warp as wp
 from warp_ar.kernels import environment_shadow
 from warp_ar.kernels import environment_shadow_filter as filters
 from warp_ar.kernels import environment_shadow_wavefront as wavefront
+from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import distant_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,16 +60,9 @@ METHODS: Mapping[str, Method] = {
 """Cheapest first, after ``none``."""
 
 
-STRIDE_ROWS = 480
-"""Rows of a frame for which the strides of ``METHODS`` are."""
-
-
-def cell_size(method: Method, rows: int) -> int:
-    """Pixels from one estimate to the next, growing as the root of the frame's rows.
-
-    So estimates grow in number as the rows, not as the pixels, and larger pictures still have finer shadows.
-    """
-    return method.stride if method.stride == 1 else max(1, round(method.stride * math.sqrt(rows / STRIDE_ROWS)))
+def find_stride(method: Method, rows: int) -> int:
+    """Pixels from one estimate to the next, growing as the root of the frame's rows."""
+    return int(cell_stride(method.stride, rows, slowly=True))
 
 
 class EnvironmentShadow(Stage):
@@ -104,11 +110,14 @@ class EnvironmentShadow(Stage):
             reads.append("frame")
         return Wiring(tuple(reads), ("shadow_ratio",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Far from objects the environment is as it was."""
+        return None if reach.shadows else "no virtual object is near anything in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
-        stride = cell_size(METHODS[self.method], height)
-        cells = -(-height // stride), -(-width // stride)
+        cells = cell_shape(self.request.size, find_stride(METHODS[self.method], height))
         specs = {
             "shadow_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
@@ -131,7 +140,7 @@ class EnvironmentShadow(Stage):
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         params, scene, cells = arrays["params"], arrays["ray_scene"], self._cells(arrays)
-        picture = make_picture(arrays, frame=config.bounce == "traced")
+        picture = find_picture(arrays, frame=config.bounce == "traced")
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
@@ -166,7 +175,7 @@ class EnvironmentShadow(Stage):
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
         return EnvironmentShadowConfig(
-            self.features.distant,
+            distant_variant(self.features, device),
             method.count,
             method.side,
             method.bounce,
@@ -178,7 +187,7 @@ class EnvironmentShadow(Stage):
     def _cells(self, arrays: Arrays) -> ShadowCells:
         """The stage's own arrays as its kernels read and write them."""
         cells = ShadowCells()
-        cells.stride = cell_size(METHODS[self.method], self.request.size[1])
+        cells.stride = find_stride(METHODS[self.method], self.request.size[1])
         for name in ("ratio", "bounced", "surface", "shaded", "filtered", "changed"):
             setattr(cells, name, arrays[f"{self.name}_{name}"])
         return cells

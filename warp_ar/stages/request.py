@@ -21,6 +21,6 @@ class Request:
     outputs: tuple[str, ...] = ("image",)
     """Names of the resources that the caller wants: ``image``, ``environment``, ``pose``."""
     exposures: tuple[float, ...] = ()
-    """Exposures between which frames alternate, as ratios to the longest, which comes first; empty: only one."""
+    """Exposures between which frames alternate, longest first, over the one that is shown; empty: only one."""
     synchronous: bool = False
     """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""

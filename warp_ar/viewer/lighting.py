@@ -14,7 +14,7 @@ from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import WarpArError
-from warp_ar.input.exposures import bracket_ratios
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.input.sources import Frame
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
@@ -59,7 +59,8 @@ class Lighting:
         target = make_target(controls.wanted, controls.feed)
         assert target.size is not None
         camera = target.scene.camera.scaled_to(*target.size)
-        scene, ratios = dataclasses.replace(target.scene, camera=camera), bracket_ratios(target.exposures)
+        scene = dataclasses.replace(target.scene, camera=camera)
+        ratios = plan_bracket(target.exposures, target.shown).ratios
         make_plan(Request(scene, target.quality, target.size, target.outputs, ratios))
         self.builder = ThreadPoolExecutor(1, "warp-ar-build")
         """Builds pipelines and does other work beside the frames."""
@@ -101,7 +102,8 @@ class Lighting:
         """What is being built, for a line on the page; None while nothing is."""
         if not self.busy:
             return None
-        name, done, count = self._progress or (self._now.quality.name, 0, 0)
+        target = self._then if self._then is not None and not self.changing else self._first or self._now
+        name, done, count = self._progress or (target.quality.name, 0, 0)
         return {"quality": name, "done": done, "count": count}
 
     def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
@@ -159,9 +161,15 @@ class Lighting:
     def _warm_up(self, pipeline: Pipeline) -> None:
         """Load the kernels of a new pipeline; viewers are told how far that is."""
         name = pipeline.quality.name
-        self._progress = (name, 0, 0)
-        pipeline.warm_up()
-        self._progress = None
+
+        def tell(done: int, count: int) -> None:
+            self._progress = (name, done, count)
+
+        tell(0, 0)
+        try:
+            pipeline.warm_up(tell)
+        finally:
+            self._progress = None
 
     def other(self, frame: Frame, now: float) -> Image | None:
         """What the picture is compared with; None without a comparison, or until it is built."""

@@ -1,0 +1,364 @@
+"""The outline of a mirror ball in a photograph, to a fraction of a pixel, with its uncertainty.
+
+From coarse to fine: a rough circle, given or looked for, is corrected in a reduced picture whose ball is
+``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of a
+sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
+
+How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
+spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
+independent.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.input.ball_rim import (
+    MOST_COST,
+    RimEvidence,
+    descend,
+    gather_evidence,
+    gather_steps,
+    gradients,
+    radial_compression,
+)
+from warp_ar.scene import Camera
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+COARSE_RADIUS = 48.0
+"""Pixels of the ball in the smallest picture that is looked at."""
+ROUGH_ERROR = 0.22
+"""Share of the radius by which a rough circle may be off."""
+BLURS = (0.45, 0.6, 0.75, 0.95, 1.3, 1.8)
+"""Standard deviations, pixels, of the picture's blur that are tried at full size."""
+STARTS = 4
+"""Places from which a search descends: a mirrored edge makes a circle of its own, often a stronger one."""
+PROPOSALS = 3
+"""Circles of a Hough transform that are followed."""
+LARGEST_RADIUS = 700.0
+"""Pixels: a larger ball is measured in a reduced picture; a fifth of a pixel is more than a lens is good for then."""
+ALIKE = 0.06
+"""Difference of mean log likelihoods of a piece within which two blurs explain a rim alike."""
+LEAST_DEVIATION = 0.08
+"""Pixels that leaving sectors out does not tell of: what is mirrored at the rim is not quite what the model says."""
+PIECES = 240
+"""Pieces that a rim is cut into."""
+COMPRESSION = 1.0
+"""Weight of the radial compression inside a rim against the steps across it."""
+SECTORS = 12
+"""Sectors of the rim that are left out in turn."""
+LEAST_SUPPORT = 0.2
+"""Share of the rim that must be seen to be one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BallOutline:
+    """A ball's silhouette in a picture."""
+
+    center: tuple[float, float]
+    """Centre of the ellipse, pixels (column, row)."""
+    axes: tuple[float, float]
+    """Half axes of the ellipse in pixels, the longer first."""
+    angle: float
+    """Direction of the longer axis in degrees, from the picture's x to its y."""
+    deviation: tuple[float, float, float]
+    """Standard deviations of column, row and radius, pixels."""
+    support: float
+    """Share of the rim in view that speaks for it."""
+    sphere: tuple[float, float, float]
+    """The ball's centre in the camera's frame over its radius."""
+
+    @property
+    def radius(self) -> float:
+        """Mean radius in pixels."""
+        return math.sqrt(self.axes[0] * self.axes[1])
+
+    def points(self, count: int = PIECES) -> Array:
+        """The outline, (count, 2) pixels."""
+        angle = 2 * np.pi * np.arange(count) / count
+        c, s = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
+        local = np.column_stack([self.axes[0] * np.cos(angle), self.axes[1] * np.sin(angle)])
+        return np.asarray(local @ np.array([[c, s], [-s, c]]) + self.center, float)
+
+
+def far_camera(width: int, height: int) -> Camera:
+    """A camera whose perspective is not known: so far away that a ball is a circle."""
+    focal = 30.0 * max(width, height)
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Array, Array]:
+    """Outline (count, 2) in pixels and outward unit normals of a ball at ``sphere`` (centre over radius)."""
+    d = float(np.linalg.norm(sphere))
+    if d <= 1.0 or sphere[2] <= 1.0:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    n = sphere / d
+    u = np.cross(n, [0.0, 1.0, 0.0] if abs(n[1]) < 0.9 else [1.0, 0.0, 0.0])
+    u /= np.linalg.norm(u)
+    angle = 2 * np.pi * np.arange(count) / count
+    spokes = np.outer(np.cos(angle), u) + np.outer(np.sin(angle), np.cross(n, u))
+    # Rays that touch the ball touch it on a circle: centre c - n / d, radius sqrt(1 - 1 / d^2).
+    rim = sphere - n / d + math.sqrt(1.0 - 1.0 / (d * d)) * spokes
+    zero = np.zeros(3)
+    pixels = cv2.projectPoints(rim, zero, zero, camera.matrix(), np.array(camera.distortion))[0].reshape(-1, 2)
+    tangent = np.roll(pixels, -1, 0) - np.roll(pixels, 1, 0)
+    normal = np.stack([tangent[:, 1], -tangent[:, 0]], 1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+    sign = np.sign(((pixels - pixels.mean(0)) * normal).sum(1))
+    return pixels, normal * sign[:, None]
+
+
+def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
+    """Centre over radius, (3,), of the ball whose silhouette is about a circle in the picture."""
+    distortion = np.array(camera.distortion)
+    circle = np.array([[[x + dx * radius, y + dy * radius]] for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+    flat = cv2.undistortPoints(circle, camera.matrix(), distortion)[:, 0]
+    rays = np.column_stack([flat, np.ones(4)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    # Opposite rays of the cone: its axis halves them.
+    axis = rays[:2].sum(0) / np.linalg.norm(rays[:2].sum(0)) + rays[2:].sum(0) / np.linalg.norm(rays[2:].sum(0))
+    axis /= np.linalg.norm(axis)
+    half = float(np.arccos(np.clip(rays @ axis, -1.0, 1.0)).mean())
+    return np.asarray(axis / math.sin(max(half, 1e-6)), float)
+
+
+def _steps(camera: Camera, sphere: Array) -> Array:
+    """Columns: changes of a sphere (3, 3) that move its outline by a pixel right, down and outward."""
+    scale = 1.0 / math.hypot(*sphere)
+    pixels, _ = silhouette(camera, sphere, 16)
+    columns = []
+    for axis in np.eye(3):
+        ahead, _ = silhouette(camera, sphere + 1e-3 / scale * axis, 16)
+        shift = (ahead - pixels) / (1e-3 / scale)
+        out = pixels - pixels.mean(0)
+        columns.append([*shift.mean(0), float((shift * out).sum() / np.linalg.norm(out, axis=1).sum())])
+    return np.linalg.inv(np.array(columns).T)
+
+
+class _Fit:
+    """A ball's sphere against one picture's evidence about a base outline."""
+
+    def __init__(self, image: Image, camera: Camera, base: Array, shift: float, blur: float | None = None) -> None:
+        """Look at the picture; without a ``blur`` only for steps, to find the right one of several."""
+        self.base = base
+        self.steps = _steps(camera, base)
+        self.points, self.normals = silhouette(camera, base)
+        self.radius = float(np.linalg.norm(self.points - self.points.mean(0), axis=1).mean())
+        if blur is None:
+            self.evidence = gather_steps(image, self.points, self.normals, self.radius, shift=shift)
+        else:
+            self.evidence = gather_evidence(image, self.points, self.normals, self.radius, shift=shift, blur=blur)
+
+    def shifts(self, move: Array) -> Array:
+        """Along the normals, pixels, when the outline moves by (right, down, outward)."""
+        return np.asarray(self.normals @ move[:2] + move[2])
+
+    def cost(self, move: Array, evidence: RimEvidence | None = None) -> float:
+        return (evidence or self.evidence).total(self.shifts(move))
+
+    def sphere(self, move: Array) -> Array:
+        return np.asarray(self.base + self.steps @ move)
+
+
+def _reduced(image: Image, camera: Camera, share: float) -> tuple[Image, Camera]:
+    """Picture and camera at a share of their size, with whole pixels."""
+    if share >= 1.0:
+        return image, camera
+    height, width = image.shape[:2]
+    w, h = max(round(width * share), 8), max(round(height * share), 8)
+    sx, sy = w / width, h / height
+    small = dataclasses.replace(
+        camera, width=w, height=h, fx=camera.fx * sx, fy=camera.fy * sy,
+        cx=(camera.cx + 0.5) * sx - 0.5, cy=(camera.cy + 0.5) * sy - 0.5,
+    )  # fmt: skip
+    return np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA)), small
+
+
+def _search(image: Image, camera: Camera, sphere: Array, shift: float, step: float) -> Array:
+    """The sphere with the most rim among all whose outline is within ``shift`` pixels in every unknown."""
+    slopes, fit = gradients(image), _Fit(image, camera, sphere, math.ceil(2.0 * shift))
+
+    def compression(move: Array) -> float:
+        points, normals = silhouette(camera, fit.sphere(move), PIECES // 3)
+        if len(points) == 0:
+            return -4.0
+        return radial_compression(slopes, points, normals, fit.radius + move[2])
+
+    def cost(move: Array) -> float:
+        return fit.cost(move) - COMPRESSION * compression(move)
+
+    grid = np.arange(-math.ceil(shift / step), math.ceil(shift / step) + 1.0) * step
+    moves = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
+    costs = np.array([cost(move) for move in moves])
+    found = [descend(cost, moves[k], 0.5 * step, 0.2) for k in _apart(moves, costs, 2.5 * step)]
+    return fit.sphere(min(found, key=lambda item: item[1])[0])
+
+
+def _apart(places: Array, costs: Array, distance: float) -> list[int]:
+    """The cheapest ``STARTS`` places that are further than ``distance`` from each other."""
+    chosen: list[int] = []
+    for k in np.argsort(costs):
+        if all(np.abs(places[k] - places[other]).max() > distance for other in chosen):
+            chosen.append(int(k))
+            if len(chosen) == STARTS:
+                break
+    return chosen
+
+
+def _radius(camera: Camera, sphere: Array) -> float:
+    points, _ = silhouette(camera, sphere, 16)
+    return float(np.linalg.norm(points - points.mean(0), axis=1).mean()) if len(points) else math.inf
+
+
+def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> Array:
+    """The best sphere within ``rough_error`` of a rough one, looked for everywhere in a small picture."""
+    radius = _radius(camera, sphere)
+    small, view = _reduced(image, camera, COARSE_RADIUS / radius)
+    return _search(small, view, sphere, rough_error * min(radius, COARSE_RADIUS), 2.0)
+
+
+def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
+    """The outline near a sphere that is within some percent of right, with its uncertainty."""
+    radius = _radius(camera, sphere)
+    share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, LARGEST_RADIUS / radius)
+    while share < finest:
+        share = min(2.0 * share, finest)
+        picture, view = _reduced(image, camera, share)
+        sphere = _search(picture, view, sphere, 2.0, 1.0)
+    picture, view = _reduced(image, camera, finest)
+    if radius <= COARSE_RADIUS:
+        sphere = _search(picture, view, sphere, 2.0, 1.0)
+    # A wider blur moves the rim inward by as much as it is wider: what the picture cannot tell apart is uncertainty.
+    tried = []
+    for blur in BLURS:
+        fit = _Fit(picture, view, sphere, 1.5, blur)
+        move, value = descend(fit.cost, np.zeros(3), 0.4, 0.02)
+        tried.append((value + fit.evidence.least, fit.shifts(move), fit.sphere(move), blur))
+    least = min(item[0] for item in tried)
+    likely = [item for item in tried if item[0] < least + ALIKE]
+    unsure = np.std([item[1].mean() for item in likely])
+    # Once more about what was found, so that normals and window are those of the outline itself.
+    middle = likely[(len(likely) - 1) // 2]
+    fit = _Fit(picture, view, middle[2], 1.5, middle[3])
+    move, _ = descend(fit.cost, np.zeros(3), 0.2, 0.01)
+    sector = np.arange(PIECES) * SECTORS // PIECES
+
+    def without(k: int) -> Array:
+        evidence = fit.evidence.without(sector == k)
+        return descend(lambda m: fit.cost(m, evidence), move, 0.1, 0.01)[0]
+
+    left = np.stack([without(k) for k in range(SECTORS)])
+    spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
+    spread = np.hypot(spread, [0.0, 0.0, unsure]) / finest
+    steps = _Fit(picture, view, fit.sphere(move), 1.0).evidence
+    return _describe(camera, fit.sphere(move), spread, steps.support(np.zeros(PIECES)))
+
+
+def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> BallOutline:
+    points, _ = silhouette(camera, sphere)
+    if len(points) == 0:
+        raise UsageError("the ball's outline does not fit a ball before the camera; give a rough circle")
+    (x, y), (a, b), angle = cv2.fitEllipseDirect(points.astype(np.float32)[:, None])
+    if a < b:
+        a, b, angle = b, a, angle + 90.0
+    # OpenCV's fit is in single precision: the centre by the points' mean over equal angles is no better than it.
+    dx, dy, dr = map(float, spread)
+    cx, cy, cz = map(float, sphere)
+    return BallOutline((float(x), float(y)), (a / 2, b / 2), angle % 180.0, (dx, dy, dr), support, (cx, cy, cz))
+
+
+def propose_circles(image: Image, most: int = 8) -> list[tuple[float, float, float]]:
+    """Circles (x, y, radius) in pixels that a picture may show, by Hough transforms of a reduced one."""
+    height, width = image.shape[:2]
+    share = min(1.0, 480.0 / max(height, width))
+    small, _ = _reduced(image, far_camera(width, height), share)
+    gray = cv2.medianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), 3)
+    side = min(gray.shape)
+    found: list[tuple[float, float, float]] = []
+    for way, edge, votes in (
+        (cv2.HOUGH_GRADIENT_ALT, 120, 0.6),
+        (cv2.HOUGH_GRADIENT_ALT, 60, 0.3),
+        (cv2.HOUGH_GRADIENT, 80, 30),
+    ):
+        circles = cv2.HoughCircles(
+            gray,
+            way,
+            1.5,
+            max(side / 20, 4),
+            param1=edge,
+            param2=votes,
+            minRadius=max(side // 40, 5),
+            maxRadius=side * 6 // 10,
+        )
+        if circles is not None:
+            for x, y, r, *_ in circles.reshape(-1, circles.shape[-1])[:most]:
+                found.append((float((x + 0.5) / share - 0.5), float((y + 0.5) / share - 0.5), float(r) / share))
+    # A crop of a ball alone: as wide as the picture.
+    found.append(((width - 1) / 2, (height - 1) / 2, 0.48 * min(width, height)))
+    return found
+
+
+def find_ball(
+    image: Image, camera: Camera | None = None, rough: Sequence[float] | None = None, rough_error: float = ROUGH_ERROR
+) -> BallOutline:
+    """Find the outline of a mirror ball in a photograph.
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        camera: The camera, if known; else the ball is taken for a circle.
+        rough: Column, row and radius in pixels of a circle that is about right; None: look for the ball.
+        rough_error: Share of the radius by which ``rough`` may be off.
+
+    Raises:
+        UsageError: No ball is found.
+    """
+    height, width = image.shape[:2]
+    camera = camera or far_camera(width, height)
+    if rough is not None and (len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0):
+        raise UsageError(
+            f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
+        )
+    starts = [
+        sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))
+    ]
+    starts = [start for start in starts if start[2] > 1.0]
+    # Of what a Hough transform proposes, those that look most like a ball; a mirrored edge may be one inside it.
+    starts.sort(key=lambda start: -_strength(image, camera, start))
+    found = []
+    for start in starts[:PROPOSALS]:
+        sphere = _coarse(image, camera, start, rough_error)
+        found.append((_strength(image, camera, sphere), sphere))
+    if not found:
+        raise UsageError("no ball was found in the picture; give a rough circle: column, row, radius in pixels")
+    _, sphere = max(found, key=lambda item: item[0])
+    outline = refine_outline(image, camera, sphere)
+    if outline.support < LEAST_SUPPORT:
+        raise UsageError(
+            f"no ball was found in the picture: only {outline.support:.0%} of the best outline, about "
+            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is seen; "
+            "give a rough circle: column, row, radius in pixels"
+        )
+    return outline
+
+
+def _strength(image: Image, camera: Camera, sphere: Array) -> float:
+    """How much of a mirror ball is seen at a sphere: steps at its rim, compression inside, more for larger balls."""
+    radius = _radius(camera, sphere)
+    if not math.isfinite(radius):
+        return -math.inf
+    small, view = _reduced(image, camera, COARSE_RADIUS / radius)
+    fit = _Fit(small, view, sphere, 1.0)
+    if not fit.evidence.known.any():
+        return -math.inf
+    compression = radial_compression(gradients(small), fit.points, fit.normals, fit.radius)
+    seen = MOST_COST - fit.cost(np.zeros(3)) + COMPRESSION * compression
+    return seen * float(fit.evidence.known.mean()) * math.log(max(radius, 4.0))

@@ -1,0 +1,253 @@
+"""What the picture says of a mirror ball's rim: how well each piece of an outline explains what is seen across it.
+
+At its rim a mirror shows what lies behind it, so the step across the outline is often weak, and the reflections that
+crowd inside it are stronger. They crowd by a known law. With t pixels outward from the rim of a ball of r pixels, the
+ray that is mirrored at t < 0 is deflected by
+
+    q(t) = 2 acos(1 + t / r),
+
+which rises like a square root: whatever lies behind, it is blurred away within the first pixel or two, and from there
+on changes slowly in q. So a profile across the rim is modelled, before the picture's own blur, as
+
+    I(t) = a0 + a1 t  outside,    b0 + b1 q(t) + b2 q(t)^2  inside,
+
+linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains, C(s),
+makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen it is
+flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.kernels.color import decode_table
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+STEP = 0.5
+"""Pixels between samples of a profile: finer ones say nothing new."""
+SHIFT_STEP = 0.1
+"""Pixels between shifts that are tried; costs between them are interpolated."""
+MOST_COST = 4.5
+"""Most that a profile may cost above its best: that of three standard deviations."""
+STEP_WINDOW = (3.0, 5.0)
+"""Pixels inside and outside the rim in which a step is looked for."""
+FINE_WINDOW = (2.0, 3.0)
+"""The same where it is measured: other reflections follow soon."""
+INNER_BAND, OUTER_BAND = (-0.16, -0.02), (0.03, 0.18)
+"""Shares of the radius inside and outside a rim whose gradients are compared."""
+FLAT = 1e-6
+"""Squared gradient, per pixel of codes from 0 to 1, below which a picture is flat."""
+NOISE = 1.5 / 255.0
+"""Standard deviation, as a share of the codes' range, that even a clean profile is expected to have."""
+
+
+def _bases(t: Array, shifts: Array, radius: float, blur: float) -> Array:
+    """The model's columns (k, n, 5) at samples ``t`` (n,) for each shift of the rim (k,)."""
+    fine = 0.05
+    edge = np.abs(t).max() + np.abs(shifts).max() + 4 * blur + 1
+    u = np.arange(-edge, edge, fine)
+    inside = u < 0
+    q = np.where(inside, 2.0 * np.arccos(np.clip(1.0 + np.minimum(u, 0.0) / radius, -1.0, 1.0)), 0.0)
+    columns = [inside * 1.0, q, q * q, (~inside) * 1.0, np.where(inside, 0.0, u)]
+    kernel = np.exp(-0.5 * (np.arange(-4 * blur, 4 * blur + fine, fine) / blur) ** 2)
+    blurred = [np.convolve(column, kernel / kernel.sum(), "same") for column in columns]
+    return np.stack([np.stack([np.interp(t - s, u, column) for column in blurred], 1) for s in shifts])
+
+
+def _left(basis: Array) -> Array:
+    """Projection (n, n) onto what columns (n, k) cannot explain, with a ridge far below the codes' noise."""
+    basis = basis / (np.linalg.norm(basis, axis=0) + 1e-9)
+    gram = basis.T @ basis + 1e-6 * np.eye(basis.shape[1])
+    return np.asarray(np.eye(len(basis)) - basis @ np.linalg.solve(gram, basis.T))
+
+
+@functools.lru_cache(maxsize=64)
+def _projections(inward: float, outward: float, shift: float, radius: float, blur: float) -> tuple[Array, Array]:
+    """Shifts (k,), and for each the matrix (n, n) that leaves of a profile what the model cannot explain."""
+    t = np.arange(-inward, outward + 0.5 * STEP, STEP)
+    shifts = np.arange(-shift, shift + 0.5 * SHIFT_STEP, SHIFT_STEP)
+    return shifts, np.stack([_left(basis) for basis in _bases(t, shifts, radius, blur)])
+
+
+@functools.lru_cache(maxsize=64)
+def _window(radius: float, blur: float) -> tuple[Array, Array]:
+    """What the model, and what a parabola, cannot explain of a window about the rim: two matrices (n, n)."""
+    t = np.arange(-STEP_WINDOW[0], STEP_WINDOW[1] + 0.5 * STEP, STEP)
+    return _left(_bases(t, np.zeros(1), radius, blur)[0]), _left(np.stack([np.ones_like(t), t, t * t], 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class RimEvidence:
+    """Cost of every piece of an outline against its shift along the outward normal."""
+
+    shifts: Array
+    """Pixels, (k,), evenly spaced about zero."""
+    costs: Array
+    """(n, k): above each piece's best, at most ``MOST_COST``; zero where the picture does not show the piece."""
+    known: NDArray[np.bool_]
+    """Pieces (n,) that the picture shows."""
+    least: float = 0.0
+    """Mean of the pieces' best costs, by which blurs are compared."""
+
+    def total(self, shift: Array) -> float:
+        """Mean cost of the pieces shifted by ``shift`` (n,) pixels; outside the window a piece costs the most."""
+        return float(self._each(shift).mean())
+
+    def _each(self, shift: Array) -> Array:
+        step = self.shifts[1] - self.shifts[0]
+        at = (shift - self.shifts[0]) / step
+        low = np.clip(np.floor(at).astype(int), 0, len(self.shifts) - 2)
+        share = np.clip(at - low, 0.0, 1.0)
+        rows = np.arange(len(low))
+        cost = (1.0 - share) * self.costs[rows, low] + share * self.costs[rows, low + 1]
+        outside = (at < 0) | (at > len(self.shifts) - 1)
+        return np.where(outside & self.known, MOST_COST, cost)[self.known]
+
+    def support(self, shift: Array) -> float:
+        """Share of the pieces in view that speak for the outline; of evidence from ``gather_steps``."""
+        return float((self._each(shift) < 0.5 * MOST_COST).mean()) if self.known.any() else 0.0
+
+    def without(self, gone: NDArray[np.bool_]) -> RimEvidence:
+        """The same but for some pieces."""
+        return dataclasses.replace(self, known=self.known & ~gone)
+
+
+def _profiles(
+    image: Image, table: NDArray[np.float32], points: Array, normals: Array, inward: float, outward: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Profiles across an outline, (m, channels, samples), of the pieces that the picture shows whole, and which (n,).
+
+    ``table`` (256,) gives the value of each code.
+    """
+    height, width = image.shape[:2]
+    t = np.arange(-inward, outward + 0.5 * STEP, STEP)
+    at = points[:, None] + t[None, :, None] * normals[:, None]
+    known = ((at >= 0) & (at <= (width - 1, height - 1))).all((1, 2))
+    if not known.any():
+        return np.zeros((0, image.shape[2], len(t))), known
+    low = np.maximum(np.floor(at[known].min((0, 1))).astype(int) - 2, 0)
+    high = np.ceil(at[known].max((0, 1))).astype(int) + 3
+    part = table[image[low[1] : high[1], low[0] : high[0]]]
+    x, y = np.moveaxis((at[known] - low).astype(np.float32), 2, 0)
+    found = cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.moveaxis(found.reshape(*x.shape, -1), 2, 1).astype(float), known
+
+
+def gather_steps(
+    image: Image, points: Array, normals: Array, radius: float, *, shift: float, blur: float = 0.8
+) -> RimEvidence:
+    """Where there are steps: how much better than a smooth curve the model explains a window about each shift.
+
+    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain, however
+    strong it is: a circle is where most pieces have one.
+    """
+    inward, outward = STEP_WINDOW
+    profiles, known = _profiles(image, _CODES, points, normals, inward + shift, outward + shift)
+    shifts = np.arange(-shift, shift + 0.5 * STEP, STEP)
+    costs = np.zeros((len(points), len(shifts)))
+    if not known.any():
+        return RimEvidence(shifts, costs, known)
+    step, smooth = _window(float(f"{radius:.2g}"), blur)
+    size = len(step)
+    flat = profiles.reshape(-1, profiles.shape[2])
+    count = profiles.shape[2] - size + 1
+    gain, floor = np.empty((len(flat), count)), NOISE**2 * size
+    for k in range(count):
+        window = flat[:, k : k + size]
+        plain, rest = ((window @ smooth) ** 2).sum(1), ((window @ step) ** 2).sum(1)
+        gain[:, k] = 0.5 * STEP * size * np.log((plain + floor) / (rest + floor))
+    gain = gain.reshape(-1, 3, count).max(1) - 1.0
+    gain = np.clip(gain, 0.0, MOST_COST)
+    costs[known] = MOST_COST - gain
+    return RimEvidence(shifts, costs, known)
+
+
+def gather_evidence(
+    image: Image, points: Array, normals: Array, radius: float, *, shift: float, blur: float
+) -> RimEvidence:
+    """Cost of each piece of an outline that is right within ``shift`` pixels: minus a log likelihood.
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        points: Outline (n, 2), pixels.
+        normals: Outward unit normals (n, 2).
+        radius: Of the ball in pixels.
+        shift: Pixels by which the outline may be off.
+        blur: Standard deviation of the picture's blur in pixels.
+    """
+    inward, outward = FINE_WINDOW[0] + shift, FINE_WINDOW[1] + shift
+    # Blur is linear in light, and chroma is blurred by codecs.
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    profiles, known = _profiles(gray[..., None], _LIGHT, points, normals, inward, outward)
+    shifts, left = _projections(inward, outward, round(shift, 1), float(f"{radius:.2g}"), round(blur, 2))
+    costs = np.zeros((len(points), len(shifts)))
+    if not known.any():
+        return RimEvidence(shifts, costs, known)
+    light = profiles[:, 0] / (profiles[:, 0].mean(1, keepdims=True) + 0.03)
+    size = left.shape[1]
+    rest = np.stack([((light @ matrix) ** 2).sum(1) for matrix in left], 1)
+    # Neighbouring samples share pixels: a profile counts for as many as it is pixels long.
+    told = 0.5 * size * STEP * np.log(rest / size + NOISE**2)
+    best = told.min(1, keepdims=True)
+    costs[known] = np.minimum(told - best, MOST_COST)
+    return RimEvidence(shifts, costs, known, float(best.mean()))
+
+
+_CODES = (np.arange(256) / 255.0).astype(np.float32)
+_LIGHT = decode_table("srgb")[:, 1].astype(np.float32)
+
+
+def gradients(image: Image) -> NDArray[np.float32]:
+    """Derivatives of a picture's brightness (codes as 0 to 1) along x and y, (height, width, 2)."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
+    return np.dstack([cv2.Sobel(gray, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1))])
+
+
+def radial_compression(slopes: NDArray[np.float32], points: Array, normals: Array, radius: float) -> float:
+    """How much more radial gradients are just inside an outline than just outside.
+
+    A ball squeezes what it mirrors toward its rim along the radius, not along the rim: there q'(t) grows beyond bounds.
+    So inside the rim gradients point along the radius, and outside it they know nothing of the ball. An edge that is
+    mirrored concentrically, such as a table's, has radial gradients on both sides, and is no rim.
+
+    Returns:
+        Mean logarithm of radial over tangential energy inside, less that outside: 2 to 3 at a rim, below 0 inside it.
+    """
+    bands = [np.linspace(low, high, 6) * radius for low, high in (INNER_BAND, OUTER_BAND)]
+    at = points[:, None] + np.concatenate(bands)[None, :, None] * normals[:, None]
+    x, y = np.moveaxis(at.astype(np.float32), 2, 0)
+    slope = cv2.remap(slopes, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    along = slope[..., 0] * normals[:, None, 0] + slope[..., 1] * normals[:, None, 1]
+    across = slope[..., 1] * normals[:, None, 0] - slope[..., 0] * normals[:, None, 1]
+    pieces = len(points) // 8
+    radial, tangential = ((v * v)[: 8 * pieces].reshape(pieces, 8, -1).mean(1) + FLAT for v in (along, across))
+    ratio = np.clip(np.log(radial / tangential), -3.0, 3.0).mean(0)
+    return float(ratio[:6].mean() - ratio[6:].mean())
+
+
+def descend(
+    cost: Callable[[Array], float], start: Array, step: float, least: float, widths: Array | None = None
+) -> tuple[Array, float]:
+    """Minimum of a function of few unknowns by a pattern search: it needs no derivatives of interpolated costs."""
+    best, value = start.copy(), cost(start)
+    size = len(start)
+    widths = np.ones(size) if widths is None else widths
+    # Along each axis, and along the diagonals of all: a circle's place and radius trade off against each other.
+    moves = [sign * axis for axis in np.eye(size) for sign in (1.0, -1.0)]
+    moves += list(np.stack(np.meshgrid(*[(-1.0, 1.0)] * size), -1).reshape(-1, size))
+    while step >= least:
+        values = [cost(best + step * widths * move) for move in moves]
+        k = int(np.argmin(values))
+        if values[k] < value - 1e-12:
+            best, value = best + step * widths * moves[k], values[k]
+        else:
+            step *= 0.5
+    return best, value

@@ -1,0 +1,366 @@
+"""Photographs of one ball at several exposures: what their exposures really are, and how they lie over each other.
+
+**Alignment.** Two exposures of one scene differ by a monotone function of codes. It is read off the joint histogram
+(the comparagram [Mann00]), and the shift and scale that make the rest least are found by Gauss-Newton with weights that
+redescend; both in turn. What the ball mirrors has thousands of edges, so a tenth of a pixel is within reach.
+
+**Exposures.** Where nothing clips, the ratio of two pictures' linear values is that of their exposures. What EXIF or
+names say is believed if the pixels agree. They cannot be asked without a response: sRGB is tried first; where it does
+not hold, the response is estimated from the bracket itself, ln g(c) = ln sRGB(c) + sum_j a_j h_j(c), with hats h_j over
+the codes, by robust least squares on
+
+    ln g(u) - ln g(v) = ln(t_u / t_v)
+
+over pixel pairs (u, v) [DM97]. A curve can take up any one ratio, but not contradictions: equal codes mean equal light
+under every response. What remains of each step tells whether the exposures hold.
+
+References:
+    [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
+    [Mann00] S. Mann. Comparametric equations with practical applications in quantigraphic image processing. 2000.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.input.exposures import WAVERING
+from warp_ar.kernels.color import decode_table
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Circle = tuple[float, float, float]
+
+PATCH = 384
+"""Most pixels across the ball's picture in which exposures are compared."""
+DARKEST, DIM, BRIGHTEST = 8, 40, 245
+"""Codes between which a pixel tells of light; those below ``DIM`` only where there are no others.
+
+Flare and processing lift the darks of single pictures, and of short exposures nothing takes its darks.
+"""
+LEAST_PIXELS = 400
+"""Pixels well exposed in two pictures without which nothing is said of their ratio."""
+HOLDS = 0.12
+"""Logarithm of the factor by which a step may be off what the pixels say."""
+CONTRADICTS = 0.3
+"""The same where a response is estimated with it: beyond, no response explains the exposures."""
+MOVED = 0.75
+"""Correlation over well exposed pixels below which a picture shows something else."""
+HATS = 8
+"""Unknowns of a response: values at codes evenly spaced in (c / 255)^(1 / 2)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Aligned:
+    """Pictures of one ball laid over each other."""
+
+    circles: tuple[Circle, ...]
+    """Where the ball is in each: column, row, radius in pixels."""
+    patches: tuple[Image, ...]
+    """The balls, all of one size and place, uint8 RGB."""
+    correlation: tuple[float, ...]
+    """Of each with its neighbour toward the first; 1 for the first, NaN where too little is well exposed in both."""
+
+
+def cut_ball(image: Image, circle: Circle, size: int) -> Image:
+    """The square about a ball, its side 2.1 radii, resampled to ``size`` pixels."""
+    x, y, radius = circle
+    scale = 2.1 * radius / size
+    corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)
+    if scale > 1.5:
+        # Averaged first: a sample stands for all the pixels that it covers.
+        blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale)
+    else:
+        blurred = image
+    matrix = np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(blurred, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _tone_curve(u: Array, v: Array) -> Array:
+    """Median code of the second picture for each code of the first, (256,), rising."""
+    bins = np.clip((u / 8).astype(int), 0, 31)
+    middle = np.array([np.median(v[bins == k]) if (bins == k).sum() > 20 else np.nan for k in range(32)])
+    known = np.isfinite(middle)
+    curve = np.interp(np.arange(256), 8 * np.flatnonzero(known) + 3.5, np.maximum.accumulate(middle[known]))
+    return np.asarray(curve)
+
+
+def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Shift and scale that lay one picture over another of another exposure.
+
+    Args:
+        reference: uint8 RGB (n, n, 3).
+        other: The same size.
+        disc: Which pixels count.
+
+    Returns:
+        (columns, rows, log of the scale about the middle) by which ``other`` must be looked up, and the correlation
+        afterwards, NaN where fewer than ``LEAST_PIXELS`` are well exposed in both.
+    """
+    n = len(reference)
+    first, second = (cv2.GaussianBlur(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
+                     for p in (reference, other))  # fmt: skip
+    rows, columns = np.mgrid[:n, :n].astype(np.float32)
+    x, y = columns - (n - 1) / 2, rows - (n - 1) / 2
+    move, correlation = np.zeros(3), math.nan
+    well = disc & (reference.max(2) < BRIGHTEST) & (first > DARKEST)
+    for coarse in (4.0, 2.0, 0.0, 0.0):
+        a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
+        for _ in range(8):
+            grow = math.exp(move[2])
+            at = (
+                (grow * x + (n - 1) / 2 + move[0]).astype(np.float32),
+                (grow * y + (n - 1) / 2 + move[1]).astype(np.float32),
+            )
+            seen = cv2.remap(b, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            ok = well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
+            if ok.sum() < LEAST_PIXELS:
+                return np.zeros(3), math.nan
+            curve = _tone_curve(a[ok], seen[ok])
+            wanted = np.interp(a, np.arange(256), curve).astype(np.float32)
+            slope_x, slope_y = (cv2.Sobel(seen, cv2.CV_32F, *way, scale=1 / 8)[ok] for way in ((1, 0), (0, 1)))
+            error = (seen - wanted)[ok].astype(float)
+            scale = 2.0 + 1.5 * float(np.median(np.abs(error)))
+            weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
+            jacobian = np.column_stack([slope_x, slope_y, slope_x * x[ok] + slope_y * y[ok]]).astype(float)
+            normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(3)
+            step = -np.linalg.solve(normal, jacobian.T @ (weight * error))
+            move += np.clip(step, -0.02 * n, 0.02 * n) * np.array([1.0, 1.0, 1.0 if n else 0.0])
+            move[2] = float(np.clip(move[2], -0.1, 0.1))
+            if np.abs(step[:2]).max() < 0.01:
+                break
+        told = np.corrcoef(wanted[ok], seen[ok])[0, 1] if np.ptp(wanted[ok]) > 0 else math.nan
+        correlation = float(told)
+    return move, correlation
+
+
+def align(images: Sequence[Image], circles: Sequence[Circle]) -> Aligned:
+    """Lay pictures of one ball over each other, each over its neighbour toward the first.
+
+    Args:
+        images: uint8 RGB, in order of exposure.
+        circles: About where the ball is in each.
+    """
+    size = int(min(PATCH, max(48, 2.1 * circles[0][2])))
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
+    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
+    found, patches, correlation = [circles[0]], [cut_ball(images[0], circles[0], size)], [1.0]
+    for image, (x, y, radius) in zip(images[1:], circles[1:], strict=True):
+        move, told = register(patches[-1], cut_ball(image, (x, y, radius), size), disc)
+        pixel = 2.1 * radius / size
+        circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])
+        found.append(circle)
+        patches.append(cut_ball(image, circle, size))
+        correlation.append(told)
+    return Aligned(tuple(found), tuple(patches), tuple(correlation))
+
+
+@dataclasses.dataclass(frozen=True)
+class Ratios:
+    """What pixels say of the ratios of neighbouring exposures."""
+
+    pairs: tuple[tuple[Array, Array], ...]
+    """Codes (m, 3) well exposed in both pictures of each neighbouring pair."""
+    curve: Array
+    """Linear value of each code, (256, 3)."""
+    steps: tuple[float, ...]
+    """Ratio of each picture's exposure to the one before, by the pixels; NaN where too few are well exposed."""
+
+
+def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
+    size = len(patches[0])
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
+    disc = np.hypot(rows, columns) < 0.93 * size / 2.1
+    smooth = [cv2.GaussianBlur(patch, (0, 0), 1.5) for patch in patches]
+    # Beside edges a misalignment makes a ratio of its own.
+    plain = [
+        cv2.morphologyEx(cv2.cvtColor(patch, cv2.COLOR_RGB2GRAY), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+        for patch in smooth
+    ]
+    pairs = []
+    for k in range(len(patches) - 1):
+        u, v = smooth[k], smooth[k + 1]
+        ok = disc & (u.max(2) <= BRIGHTEST) & (v.max(2) <= BRIGHTEST)
+        bright = ok & (u.min(2) >= DIM) & (v.min(2) >= DIM)
+        ok = bright if bright.sum() >= LEAST_PIXELS else ok & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
+        flat = ok & (plain[k] < 24) & (plain[k + 1] < 24)
+        ok = flat if flat.sum() >= LEAST_PIXELS else ok
+        pairs.append((u[ok].astype(float), v[ok].astype(float)))
+    return tuple(pairs)
+
+
+def _steps(pairs: Sequence[tuple[Array, Array]], curve: Array) -> tuple[float, ...]:
+    steps = []
+    for u, v in pairs:
+        if len(u) < LEAST_PIXELS:
+            steps.append(math.nan)
+            continue
+        low, high = (np.stack([np.interp(c[:, i], np.arange(256), curve[:, i]) for i in range(3)], 1) for c in (u, v))
+        ratio = np.log(high.sum(1) / low.sum(1))
+        # Every level of brightness has the same say, however many pixels it has.
+        bins = (u.mean(1) / 16).astype(int)
+        medians = [np.median(ratio[bins == k]) for k in range(16) if (bins == k).sum() >= LEAST_PIXELS // 16]
+        steps.append(float(np.exp(np.median(medians))))
+    return tuple(steps)
+
+
+def measure_ratios(patches: Sequence[Image], curve: Array) -> Ratios:
+    """Ratios of neighbouring exposures under a response, from aligned pictures."""
+    pairs = _collect(patches)
+    return Ratios(pairs, curve, _steps(pairs, curve))
+
+
+def estimate_response(ratios: Ratios, steps: Sequence[float]) -> Ratios:
+    """The response under which the pixels agree best with given steps of exposure, and what they say under it.
+
+    All channels share a curve: cameras bend them alike, and a white balance leaves ratios alone.
+    """
+    knots = np.linspace(0.0, 1.0, HATS + 1)
+    codes = np.sqrt(np.arange(256) / 255.0)
+    hats = np.stack([np.interp(codes, knots, np.eye(HATS + 1)[j]) for j in range(HATS)], 1)
+    base = np.log(np.maximum(decode_table("srgb")[:, 1].astype(float), 1e-5))
+    rows, wanted, share = [], [], []
+    for (u, v), step in zip(ratios.pairs, steps, strict=True):
+        if len(u) < LEAST_PIXELS:
+            continue
+        u, v = u.mean(1), v.mean(1)
+        at_u, at_v = (np.stack([np.interp(c, np.arange(256), hats[:, j]) for j in range(HATS)], 1) for c in (u, v))
+        rows.append(at_v - at_u)
+        wanted.append(math.log(step) - (np.interp(v, np.arange(256), base) - np.interp(u, np.arange(256), base)))
+        # Every level of brightness has the same say, however many pixels it has.
+        bins = (u / 16).astype(int)
+        share.append(1.0 / np.bincount(bins, minlength=16)[bins])
+    if not rows:
+        return ratios
+    a, b, w = np.concatenate(rows), np.concatenate(wanted), np.concatenate(share)
+    bend = np.diff(np.eye(HATS + 1), 2, axis=0)[:, :HATS]
+    prior = 0.3 * bend.T @ bend + 1e-3 * np.eye(HATS)
+    weight, values = w, np.zeros(HATS)
+    for _ in range(12):
+        values = np.linalg.solve(a.T @ (weight[:, None] * a) + prior, a.T @ (weight * b))
+        error = a @ values - b
+        weight = w / (1.0 + (error / 0.15) ** 2)
+    table = np.exp(base + hats @ values)
+    table[0] = 0.0
+    table = np.maximum.accumulate(table)
+    curve = np.repeat((table / table[-1])[:, None], 3, 1)
+    return Ratios(ratios.pairs, curve, _steps(ratios.pairs, curve))
+
+
+@dataclasses.dataclass(frozen=True)
+class Exposures:
+    """Exposures that were agreed upon."""
+
+    ratios: tuple[float, ...]
+    """Of each picture to the first."""
+    curve: Array | None
+    """Linear value of each code, (256, 3), where sRGB does not hold; else None."""
+    notes: tuple[str, ...]
+    """What a user should know, a line each."""
+
+
+def _off(claimed: Sequence[float], seen: Sequence[float]) -> float:
+    """Largest logarithm by which a step is off what the pixels say."""
+    return max((abs(math.log(c / s)) for c, s in zip(claimed, seen, strict=True) if math.isfinite(s)), default=0.0)
+
+
+def _total(steps: Sequence[float]) -> float:
+    return 1.0 / math.prod(steps)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def agree_exposures(
+    patches: Sequence[Image],
+    transfer: str,
+    exif: Sequence[float] | None,
+    names: Sequence[float] | None,
+    given: Sequence[float] | None = None,
+) -> Exposures:
+    """Find out which exposures hold.
+
+    Args:
+        patches: Aligned pictures, longest exposure first.
+        transfer: Response to try first.
+        exif: Exposure of each by its EXIF, None where it does not tell.
+        names: The same by the files' names.
+        given: The same as the user gives them, before which the others have no say.
+
+    Raises:
+        UsageError: EXIF, names and pixels contradict each other; the message has all figures.
+    """
+    seen = measure_ratios(patches, decode_table(transfer).astype(float))
+    steps = {
+        name: tuple(b / a for a, b in itertools.pairwise(claim))
+        for name, claim in (("--exposures", given), ("EXIF", exif), ("names", names))
+        if claim is not None
+    }
+    if given is not None:
+        steps = {"--exposures": steps["--exposures"]}
+    figures = ", ".join(f"{name} say{'s' * (name == 'EXIF')} {_number(_total(s))}" for name, s in steps.items())
+    pixels = [s for s in seen.steps if math.isfinite(s)]
+    figures += f"{', ' * bool(figures)}pixels say {_number(_total(pixels))}" + " over the steps that they tell" * (
+        len(pixels) < len(seen.steps)
+    )
+    if not steps:
+        if len(pixels) < len(seen.steps):
+            raise UsageError("neither EXIF nor names tell the exposures, and too few pixels do; give --exposures")
+        note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
+        return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))
+    best = min(steps, key=lambda name: _off(steps[name], seen.steps))
+    if len(steps) > 1 and _off(steps["EXIF"], steps["names"]) > HOLDS:
+        if _off(steps[best], seen.steps) > 2.0 * HOLDS:
+            raise UsageError(
+                f"exposures contradict each other: from the longest to the shortest {figures} times; "
+                "give the true ones with --exposures, or leave out pictures with automatic ISO"
+            )
+        notes = [f"{best} and pixels agree on the exposures, which the others contradict: {figures} times"]
+    else:
+        best, notes = next(iter(steps)), []
+    claim = steps[best]
+    ratios = tuple(np.cumprod([1.0, *claim]).tolist())
+    off = _off(claim, seen.steps)
+    if off <= HOLDS:
+        return Exposures(ratios, None, tuple(notes))
+    bent = estimate_response(seen, claim)
+    rest = _off(claim, bent.steps)
+    if rest > CONTRADICTS:
+        raise UsageError(
+            f"exposures contradict the pictures: from the longest to the shortest {figures} times, and no response "
+            f"explains them (a step is off by {math.expm1(rest):.0%}); give the true ones with --exposures"
+        )
+    dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
+    notes.append(
+        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code 40): "
+        "it was estimated from the bracket"
+    )
+    return Exposures(ratios, bent.curve, tuple(notes))
+
+
+def thin_exposures(exposures: Sequence[float]) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+
+    Returns:
+        Indices, longest exposure first, and a note for each that is left out.
+    """
+    order = sorted(range(len(exposures)), key=lambda k: -exposures[k])
+    kept, notes = [order[0]], []
+    for k in order[1:]:
+        ratio = exposures[kept[-1]] / exposures[k]
+        if ratio < WAVERING:
+            notes.append(
+                f"exposure {_number(exposures[k])} is left out: {ratio:.2f} times from {_number(exposures[kept[-1]])}"
+            )
+        else:
+            kept.append(k)
+    return tuple(kept), tuple(notes)

@@ -1,0 +1,160 @@
+"""What a photograph's EXIF says of its exposure and its camera."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import logging
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any, Final
+
+import exifread
+from PIL import Image, UnidentifiedImageError
+
+from warp_ar.errors import SceneError
+from warp_ar.files import read_bytes
+from warp_ar.pictures import check_picture
+from warp_ar.scene.description import Camera
+
+FULL_FRAME_DIAGONAL: Final = math.hypot(36.0, 24.0)
+"""Millimetres: a focal length "in 35 mm film" gives the same angle across this diagonal."""
+SENSOR_SHAPES: Final = (1.0, 4 / 3, 3 / 2, 16 / 9, 5 / 4, 18 / 9, 19.5 / 9, 20 / 9)
+"""Ratios of sides that cameras have; a picture of another one has been cut."""
+SHAPE_TOLERANCE: Final = 0.012
+"""Relative: cameras round sides to multiples of 16."""
+LEAST_SIDE: Final = 400
+"""Pixels along the shorter side below which a picture is a cut-out or a thumbnail."""
+_TURNED: Final = (5, 6, 7, 8)
+"""EXIF orientations that exchange width and height."""
+
+# What exifread and Pillow have been seen to raise on damaged files; they do not document it.
+_READING_ERRORS: Final = (
+    OSError,
+    UnidentifiedImageError,
+    Image.DecompressionBombError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    RecursionError,
+    MemoryError,
+    SyntaxError,
+    struct.error,
+)
+
+# It logs that a picture has no EXIF: that is no event.
+logging.getLogger("exifread").setLevel(logging.ERROR)
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoInfo:
+    """EXIF of one photograph; None where it does not say."""
+
+    width: int
+    """Upright width in pixels."""
+    height: int
+    """Upright height in pixels."""
+    seconds: float | None = None
+    """Exposure time."""
+    iso: float | None = None
+    """Sensitivity."""
+    f_number: float | None = None
+    """Focal length over aperture."""
+    focal_35mm: float | None = None
+    """Focal length in millimetres of a full-frame camera with the same view."""
+    focal_pixels: float | None = None
+    """Focal length in pixels, where the sensor's resolution is told."""
+    model: str = ""
+    """Name of the camera."""
+
+    @property
+    def exposure(self) -> float | None:
+        """T ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
+        if self.seconds is None:
+            return None
+        return self.seconds * (self.iso or 100.0) / 100.0 / (self.f_number or 1.0) ** 2
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the picture has the shape of a sensor: of a cut-out the focal length in pixels is not known."""
+        if min(self.width, self.height) < LEAST_SIDE:
+            return False
+        shape = max(self.width, self.height) / min(self.width, self.height)
+        return any(abs(shape / known - 1.0) < SHAPE_TOLERANCE for known in SENSOR_SHAPES[1:])
+
+    def focal_length(self) -> float | None:
+        """Focal length in pixels, None where EXIF does not tell or the picture was cut."""
+        if not self.is_whole:
+            return None
+        if self.focal_pixels is not None:
+            return self.focal_pixels
+        if self.focal_35mm is None:
+            return None
+        return self.focal_35mm / FULL_FRAME_DIAGONAL * math.hypot(self.width, self.height)
+
+    def camera(self, transfer: str | Path = "srgb") -> Camera | None:
+        """Pinhole camera with the axis through the picture's middle; None where the focal length is not known."""
+        focal = self.focal_length()
+        if focal is None:
+            return None
+        middle = (self.width - 1) / 2, (self.height - 1) / 2
+        return Camera(self.width, self.height, focal, focal, *middle, transfer=transfer)
+
+
+def read_exif(path: str | Path) -> PhotoInfo:
+    """EXIF of a photograph; pictures without any give their size alone.
+
+    Raises:
+        SceneError: The file is missing or no picture.
+    """
+    path = Path(path)
+    data = read_bytes(path, "picture_bytes", SceneError, f"{path}: the photograph")
+    check_picture(data, SceneError, f"{path}: the photograph")
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            width, height = picture.size
+        tags = exifread.process_file(io.BytesIO(data), details=False)
+    except _READING_ERRORS as error:
+        raise SceneError(f"{path}: no photograph whose EXIF can be read ({' '.join(str(error).split())})") from error
+    if _number(tags, "Image Orientation") in _TURNED:
+        width, height = height, width
+    resolution = _number(tags, "EXIF FocalPlaneXResolution")
+    unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_number(tags, "EXIF FocalPlaneResolutionUnit") or 2), 25.4)
+    focal, told_width = _number(tags, "EXIF FocalLength"), _number(tags, "EXIF ExifImageWidth")
+    pixels = None
+    if resolution and focal and told_width:
+        pixels = focal * resolution / unit * max(width, height) / told_width
+    return PhotoInfo(
+        width,
+        height,
+        seconds=_number(tags, "EXIF ExposureTime"),
+        iso=_number(tags, "EXIF ISOSpeedRatings") or _number(tags, "EXIF PhotographicSensitivity"),
+        f_number=_number(tags, "EXIF FNumber"),
+        focal_35mm=_number(tags, "EXIF FocalLengthIn35mmFilm"),
+        focal_pixels=pixels,
+        model=" ".join(str(tags.get("Image Model", "")).split()),
+    )
+
+
+def _number(tags: dict[str, Any], name: str) -> float | None:
+    """First value of a tag as a number above 0."""
+    values = getattr(tags.get(name), "values", None)
+    if not isinstance(values, list) or not values:
+        return None
+    try:
+        value = float(values[0])
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return value if math.isfinite(value) and value > 0.0 else None
+
+
+def exposure_in_name(path: str | Path) -> float | None:
+    """Seconds that a file's name seems to tell: the last number n of ``d1_25.jpg`` or ``probe 1-4.png`` as 1 / n."""
+    numbers = re.findall(r"\d+", Path(path).stem)
+    value = int(numbers[-1]) if numbers else 0
+    return 1.0 / value if 1 <= value <= 100_000 else None
