@@ -344,18 +344,22 @@ def agree_exposures(
     return Exposures(ratios, bent.curve, tuple(notes))
 
 
-def thin_exposures(exposures: Sequence[float]) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def thin_exposures(ratios: Sequence[float], shown: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+
+    Args:
+        ratios: Exposures.
+        shown: Index of the one that stays in any case.
 
     Returns:
         Indices, longest exposure first, and a note for each that is left out.
     """
-    order = sorted(range(len(exposures)), key=lambda k: -exposures[k])
-    kept, notes = [order[0]], []
-    for k in order[1:]:
-        ratio = exposures[kept[-1]] / exposures[k]
-        if ratio < WAVERING:
-            notes.append(f"exposure {_number(exposures[k])} is left out: {ratio:.2f} times from {_number(exposures[kept[-1]])}")
-        else:
+    kept, notes = [shown], []
+    for k in sorted(range(len(ratios)), key=lambda k: -ratios[k]):
+        near = [other for other in kept if abs(math.log(ratios[k] / ratios[other])) < math.log(WAVERING)]
+        if k != shown and near:
+            ratio = max(ratios[k] / ratios[near[0]], ratios[near[0]] / ratios[k])
+            notes.append(f"picture {k + 1} by brightness is left out: its exposure is {ratio:.2f} times another's")
+        elif k != shown:
             kept.append(k)
-    return tuple(kept), tuple(notes)
+    return tuple(sorted(kept, key=lambda k: -ratios[k])), tuple(notes)

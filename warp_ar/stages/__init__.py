@@ -5,6 +5,7 @@ from __future__ import annotations
 from warp_ar.stages.accumulate import Accumulate
 from warp_ar.stages.base import Stage
 from warp_ar.stages.bracket import Bracket
+from warp_ar.stages.captured import Captured
 from warp_ar.stages.composite import Composite
 from warp_ar.stages.declip import Declip
 from warp_ar.stages.environment_samples import EnvironmentSamples
@@ -24,6 +25,7 @@ from warp_ar.stages.unwrap import Unwrap
 from warp_ar.stages.visibility import Visibility
 
 STAGES: tuple[type[Stage], ...] = (
+    Captured,
     Unwrap,
     Bracket,
     Accumulate,

@@ -128,9 +128,8 @@ class Arrays(Mapping[str, Any]):
         return tuple(map(self._versions.__getitem__, names))
 
 
-NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
-"""Reasons that several stages give."""
+"""Reason that several stages give."""
 
 
 class Stage(abc.ABC):

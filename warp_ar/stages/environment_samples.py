@@ -9,8 +9,8 @@ import warp as wp
 
 from warp_ar.kernels import environment_samples, pyramid
 from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import Features
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import NO_BALL, Features
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, SAMPLES, lists_texels, sample_names
 
 
@@ -65,7 +65,8 @@ class EnvironmentSamples(Stage):
         environment, samples = arrays["environment"], arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples
-        origin = wp.vec3(*self.request.scene.probes[0].center)
+        probes = self.request.scene.probes
+        origin = wp.vec3(*probes[0].center) if probes else wp.vec3()
         passes = [
             Pass(lambda rows: environment_samples.sum_environment(environment, cumulative, sums)),
             Pass(lambda rows: environment_samples.draw_samples(environment, cumulative, sums, origin, *out)),

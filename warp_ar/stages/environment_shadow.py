@@ -15,8 +15,8 @@ from warp_ar.kernels import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import Features
+from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import NO_BALL, Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
 from warp_ar.stages.shared.picture import make_picture

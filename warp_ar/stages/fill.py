@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import change, fill
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 
 
@@ -31,8 +31,8 @@ class Fill(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(features.unobserved)
         written = "filled_radiance" if features.recovered else "environment"
         return Wiring(("environment_radiance", "environment_confidence"), (written,))
 

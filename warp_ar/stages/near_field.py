@@ -11,8 +11,8 @@ import warp as wp
 from warp_ar.kernels import near_field
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import NO_BALL, NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import Features
+from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import NO_BALL, Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.picture import make_picture, make_visible
 

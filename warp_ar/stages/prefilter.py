@@ -11,8 +11,8 @@ import warp as wp
 from warp_ar.kernels import prefilter, pyramid
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
-from warp_ar.stages.features import Features
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import NO_BALL, Features
 
 
 def glossy_materials(scene: Scene) -> list[Material]:

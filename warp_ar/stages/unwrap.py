@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
@@ -45,8 +45,8 @@ class Unwrap(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(features.unobserved)
         return Wiring(("frame", "pose"), ("probe_radiance", "probe_confidence", "probe_clipped"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
