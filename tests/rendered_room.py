@@ -79,7 +79,11 @@ def _scene_radiance(room: Room, origin: Array, direction: Array, irradiance: Arr
         t = -origin[:, 2] / direction[:, 2]
     p = origin + np.where(np.isfinite(t), t, 0.0)[:, None] * direction
     on = (t > 1e-9) & np.isfinite(t) & (np.abs(p[:, 0]) < room.table[0]) & (np.abs(p[:, 1]) < room.table[1])
-    wood = 0.25 + 0.3 * _noise(room.seed + 3, 60 * p[:, 0], 9 * p[:, 1]) + 0.1 * _noise(room.seed + 4, 500 * p[:, 0], 70 * p[:, 1])
+    wood = (
+        0.25
+        + 0.3 * _noise(room.seed + 3, 60 * p[:, 0], 9 * p[:, 1])
+        + 0.1 * _noise(room.seed + 4, 500 * p[:, 0], 70 * p[:, 1])
+    )
     near = np.hypot(p[:, 0], p[:, 1]) / room.radius
     open_sky = 1.0 - 0.7 / (1.0 + near**2)
     table = (wood * open_sky)[:, None] * np.array([0.9, 0.65, 0.45]) * irradiance / math.pi
@@ -103,7 +107,7 @@ def table_irradiance(room: Room, count: int = 4096) -> Array:
     rng = np.random.default_rng(9)
     u, v = rng.random(count), 2 * np.pi * rng.random(count)
     d = np.column_stack([np.sqrt(u) * np.cos(v), np.sqrt(u) * np.sin(v), np.sqrt(1 - u)])
-    return math.pi * room_radiance(room, np.zeros((count, 3)) + [0, 0, 1e-3], d).mean(0)
+    return math.pi * room_radiance(room, np.tile([0.0, 0.0, 1e-3], (count, 1)), d).mean(0)
 
 
 def radiance_along(room: Room, origin: Array, direction: Array, irradiance: Array) -> Array:

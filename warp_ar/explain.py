@@ -51,7 +51,7 @@ def explain(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     size = (scene.camera.width, scene.camera.height)
     spec = scene.source
-    exposures = plan_bracket((spec and spec.exposures) or (), spec and spec.shown).ratios
+    exposures = plan_bracket(spec.exposures or (), spec.shown).ratios if spec is not None else ()
     print_plan(make_plan(Request(scene, resolve_quality(options.quality), size, exposures=exposures)))
     return EXIT_DONE
 

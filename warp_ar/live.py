@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import dataclasses
 import faulthandler
 import itertools
 import json
@@ -39,8 +38,8 @@ from warp_ar.output.places import PROGRAM, check_places, check_replaceable, file
 from warp_ar.output.report import RunLog, print_plan
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
-from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
-from warp_ar.session import Session
+from warp_ar.scene import Scene, bundled_scenes, load_scene
+from warp_ar.session import Session, calibrated, with_light
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
 DEFAULT_PORT = 8720
@@ -75,7 +74,12 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="PATH|INDEX",
         help="frames from this folder, video file or capture device, not the scene's own",
     )
-    add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
+    add(
+        "--calibration",
+        metavar="FILE|exif",
+        help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers; exif: the first picture's",
+    )
+    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball in the frames shows")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add(
         "--quality",
@@ -167,6 +171,8 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
     reads["what the scene names,"] = [path for path in files_of(scene) if path != scene.path]
     if options.calibration is not None:
         reads["--calibration"] = [Path(options.calibration)]
+    if options.light is not None:
+        reads["--light"] = [Path(options.light)]
     if source is not None:
         reads["the source"] = [Path(source)]
     names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
@@ -205,7 +211,9 @@ def serve_page(options: argparse.Namespace) -> int:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     scene = load_scene(options.scene)
     if options.calibration is not None:
-        scene = dataclasses.replace(scene, camera=load_calibration(options.calibration, scene.camera.transfer))
+        scene = calibrated(scene, options.calibration, options.source)
+    if options.light is not None:
+        scene = with_light(scene, options.light)
     local = options.host in LOOPBACK
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
@@ -367,6 +375,7 @@ def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str,
         scene,
         source=options.source,
         calibration=options.calibration,
+        light=options.light,
         device=options.device,
         quality=options.quality,
         budget_ms=options.budget_ms,

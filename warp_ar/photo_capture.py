@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere
 from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
 from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
 from warp_ar.input.response import write_response
+from warp_ar.input.support import Support
 from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
 from warp_ar.scene import Camera, Pose, Probe, Scene
 from warp_ar.scene.pose_file import pose_of_position
@@ -43,10 +44,12 @@ class Capture:
     """The light, in axes whose z is up where the camera was level."""
     outline: BallOutline
     """The ball in the photograph that was shown."""
-    shown: str
-    """That photograph's name."""
+    shown: Path
+    """That photograph."""
     camera: Camera
     """Of that photograph."""
+    support: Support | None
+    """The plane that the ball stands on, where it was asked for."""
     notes: tuple[str, ...]
     """What a user should know, a line each."""
 
@@ -59,7 +62,7 @@ def capture_light(
     shown: int | None = None,
     transfer: str = "srgb",
     focal_35mm: float | None = None,
-    pitch: float = 0.0,
+    support: Callable[[BallOutline, Camera], Support] | None = None,
     reflectance: float = 0.85,
     device: str = "auto",
     height: int = HEIGHT,
@@ -74,7 +77,7 @@ def capture_light(
         shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
         transfer: Response that is tried first.
         focal_35mm: Focal length for a full frame in millimetres; None: by EXIF.
-        pitch: Degrees by which the camera looked down.
+        support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
         reflectance: Of the ball.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         height: Rows of the map.
@@ -95,9 +98,14 @@ def capture_light(
     outline = find_ball(reference.image, camera, ball)
     bracket = _merge_plan(photos, reference, outline, transfer, exposures)
     notes += [*bracket.notes, _describe_outline(outline)]
-    light, more = _unwrap(bracket, reference, camera, outline, transfer, pitch, reflectance, device, height)
-    exposure = reference.info.exposure
-    return Capture(dataclasses.replace(light, exposure=exposure), outline, reference.name, camera, (*notes, *more))
+    found = None if support is None else support(outline, camera)
+    turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
+    if found is not None:
+        turn = found.pose.rotation
+        notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
+    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
+    light = dataclasses.replace(light, exposure=reference.info.exposure)
+    return Capture(light, outline, reference.path, camera, found, (*notes, *more))
 
 
 def _best_exposed(photos: Sequence[Photograph]) -> int:
@@ -112,7 +120,9 @@ def _best_exposed(photos: Sequence[Photograph]) -> int:
 
 
 def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
-    info = photo.info if focal_35mm is None else dataclasses.replace(photo.info, focal_35mm=focal_35mm, focal_pixels=None)
+    info = (
+        photo.info if focal_35mm is None else dataclasses.replace(photo.info, focal_35mm=focal_35mm, focal_pixels=None)
+    )
     camera = info.camera(transfer)
     if camera is not None:
         return camera, []
@@ -158,11 +168,15 @@ def _merge_plan(
     chosen = [photos[k] for k in order]
     aligned = _align_all(chosen, chosen.index(reference), circle)
     moved = [k for k, c in enumerate(aligned.correlation) if math.isfinite(c) and c < MOVED]
-    notes = [f"{chosen[k].name} is left out: it shows something else ({aligned.correlation[k]:.0%} alike)" for k in moved]
+    notes = [
+        f"{chosen[k].name} is left out: it shows something else ({aligned.correlation[k]:.0%} alike)" for k in moved
+    ]
     notes += _shift_notes(chosen, aligned, circle)
     stay = [k for k in range(len(chosen)) if k not in moved]
     picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
-    agreed = agree_exposures([aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"])
+    agreed = agree_exposures(
+        [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"]
+    )
     first = [chosen[k] for k in stay].index(reference)
     kept, more = thin_exposures(agreed.ratios, first)
     return _Bracket(
@@ -206,8 +220,7 @@ def _unwrap(
     reference: Photograph,
     camera: Camera,
     outline: BallOutline,
-    transfer: str,
-    pitch: float,
+    turn: Array,
     reflectance: float,
     device: str,
     height: int,
@@ -219,9 +232,6 @@ def _unwrap(
     x0, y0 = round(own[0]) - half, round(own[1]) - half
     side = 2 * half + 1
     window = dataclasses.replace(camera, width=side, height=side, cx=camera.cx - x0, cy=camera.cy - y0)
-    # World: x right, y forward, z up where the camera was level; the ball is 1 m from its centre to its surface.
-    rotation, _ = pose_of_position((0.0, 0.0, 0.0), (-pitch, 0.0, 0.0))
-    turn = np.array(rotation).reshape(3, 3)
     sphere = np.array(outline.sphere)
     with tempfile.TemporaryDirectory() as folder:
         if bracket.curve is not None:
@@ -229,7 +239,10 @@ def _unwrap(
             write_response(bracket.curve, response)
             window = dataclasses.replace(window, transfer=response)
         scene = Scene(
-            camera=window, probes=(Probe((0.0, 0.0, 0.0), 1.0, (reflectance,) * 3),), has_marker=False, name=reference.name
+            camera=window,
+            probes=(Probe((0.0, 0.0, 0.0), 1.0, (reflectance,) * 3),),
+            has_marker=False,
+            name=reference.name,
         )
         times = tuple(bracket.ratios)
         quality = dataclasses.replace(PRESETS["medium"], name="custom", environment_height=height)
@@ -285,5 +298,3 @@ def _place(
     moved = sphere_of_circle(camera, x - dx, y - dy, radius) - sphere_of_circle(camera, *own)
     center = sphere + moved
     return cut, Pose(turn, center)
-
-

@@ -1,8 +1,8 @@
 """The outline of a mirror ball in a photograph, to a fraction of a pixel, with its uncertainty.
 
 From coarse to fine: a rough circle, given or looked for, is corrected in a reduced picture whose ball is
-``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of a
-sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
+``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of
+a sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
 
 How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
 spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
@@ -20,7 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.input.ball_rim import MOST_COST, RimEvidence, descend, gather_evidence, gather_steps, gradients, radial_compression
+from warp_ar.input.ball_rim import (
+    MOST_COST,
+    RimEvidence,
+    descend,
+    gather_evidence,
+    gather_steps,
+    gradients,
+    radial_compression,
+)
 from warp_ar.scene import Camera
 
 Array = NDArray[np.float64]
@@ -290,9 +298,20 @@ def propose_circles(image: Image, most: int = 8) -> list[tuple[float, float, flo
     gray = cv2.medianBlur(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), 3)
     side = min(gray.shape)
     found: list[tuple[float, float, float]] = []
-    for way, edge, votes in ((cv2.HOUGH_GRADIENT_ALT, 120, 0.6), (cv2.HOUGH_GRADIENT_ALT, 60, 0.3), (cv2.HOUGH_GRADIENT, 80, 30)):
+    for way, edge, votes in (
+        (cv2.HOUGH_GRADIENT_ALT, 120, 0.6),
+        (cv2.HOUGH_GRADIENT_ALT, 60, 0.3),
+        (cv2.HOUGH_GRADIENT, 80, 30),
+    ):
         circles = cv2.HoughCircles(
-            gray, way, 1.5, max(side / 20, 4), param1=edge, param2=votes, minRadius=max(side // 40, 5), maxRadius=side * 6 // 10
+            gray,
+            way,
+            1.5,
+            max(side / 20, 4),
+            param1=edge,
+            param2=votes,
+            minRadius=max(side // 40, 5),
+            maxRadius=side * 6 // 10,
         )
         if circles is not None:
             for x, y, r, *_ in circles.reshape(-1, circles.shape[-1])[:most]:
@@ -319,8 +338,12 @@ def find_ball(
     height, width = image.shape[:2]
     camera = camera or far_camera(width, height)
     if rough is not None and (len(rough) != 3 or not all(map(math.isfinite, rough)) or rough[2] < 4.0):
-        raise UsageError(f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels")
-    starts = [sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))]
+        raise UsageError(
+            f"ball {', '.join(f'{v:g}' for v in rough)}: expected column, row and radius (4 or more) in pixels"
+        )
+    starts = [
+        sphere_of_circle(camera, *circle) for circle in ([rough] if rough is not None else propose_circles(image))
+    ]
     starts = [start for start in starts if start[2] > 1.0]
     # Of what a Hough transform proposes, those that look most like a ball; a mirrored edge may be one inside it.
     starts.sort(key=lambda start: -_strength(image, camera, start))
@@ -335,8 +358,8 @@ def find_ball(
     if outline.support < LEAST_SUPPORT:
         raise UsageError(
             f"no ball was found in the picture: only {outline.support:.0%} of the best outline, about "
-            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is seen; "
-            "give a rough circle: column, row, radius in pixels"
+            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is "
+            "seen; give a rough circle: column, row, radius in pixels"
         )
     return outline
 

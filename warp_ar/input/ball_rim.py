@@ -11,9 +11,9 @@ on changes slowly in q. So a profile across the rim is modelled, before the pict
 
     I(t) = a0 + a1 t  outside,    b0 + b1 q(t) + b2 q(t)^2  inside,
 
-linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains, C(s),
-makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen it is
-flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
+linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains,
+C(s), makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen
+it is flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
 """
 
 from __future__ import annotations
@@ -132,14 +132,14 @@ def _profiles(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Profiles across an outline, (m, channels, samples), of the pieces that the picture shows, and which (n,).
 
-    ``table`` (256,) gives the value of each code. ``whole``: pieces whose profile leaves the picture are not shown; else
-    it goes on as at the picture's edge, and only the piece itself must be inside.
+    ``table`` (256,) gives the value of each code. ``whole``: pieces whose profile leaves the picture are not shown;
+    else it goes on as at the picture's edge, and only the piece itself must be inside.
     """
     height, width = image.shape[:2]
     t = np.arange(-inward, outward + 0.5 * STEP, STEP)
     at = points[:, None] + t[None, :, None] * normals[:, None]
     asked = at if whole else points[:, None]
-    known = ((asked >= 0) & (asked <= (width - 1, height - 1))).all((1, 2))
+    known = np.asarray(((asked >= 0) & (asked <= (width - 1, height - 1))).all((1, 2)))
     if not known.any():
         return np.zeros((0, image.shape[2], len(t))), known
     low = np.clip(np.floor(at[known].min((0, 1))).astype(int) - 2, 0, (width - 1, height - 1))
@@ -155,8 +155,8 @@ def gather_steps(
 ) -> RimEvidence:
     """Where there are steps: how much better than a smooth curve the model explains a window about each shift.
 
-    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain, however
-    strong it is: a circle is where most pieces have one.
+    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain,
+    however strong it is: a circle is where most pieces have one.
     """
     inward, outward = STEP_WINDOW
     profiles, known = _profiles(image, _CODES, points, normals, inward + shift, outward + shift, whole=False)

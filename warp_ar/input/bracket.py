@@ -74,11 +74,8 @@ def cut_ball(image: Image, circle: Circle, size: int) -> Image:
     x, y, radius = circle
     scale = 2.1 * radius / size
     corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)
-    if scale > 1.5:
-        # Averaged first: a sample stands for all the pixels that it covers.
-        blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale)
-    else:
-        blurred = image
+    # Averaged first where it is reduced: a sample stands for all the pixels that it covers.
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale) if scale > 1.5 else image
     matrix = np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(blurred, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
@@ -116,7 +113,10 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
         for _ in range(8):
             grow = math.exp(move[2])
-            at = (grow * x + (n - 1) / 2 + move[0]).astype(np.float32), (grow * y + (n - 1) / 2 + move[1]).astype(np.float32)
+            at = (
+                (grow * x + (n - 1) / 2 + move[0]).astype(np.float32),
+                (grow * y + (n - 1) / 2 + move[1]).astype(np.float32),
+            )
             seen = cv2.remap(b, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             ok = well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
             if ok.sum() < LEAST_PIXELS:
@@ -130,7 +130,7 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
             jacobian = np.column_stack([slope_x, slope_y, slope_x * x[ok] + slope_y * y[ok]]).astype(float)
             normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(3)
             step = -np.linalg.solve(normal, jacobian.T @ (weight * error))
-            move += np.clip(step, -0.02 * n, 0.02 * n) * np.array([1.0, 1.0, 1.0 if n else 0.0])
+            move += np.clip(step, -0.02 * n, 0.02 * n)
             move[2] = float(np.clip(move[2], -0.1, 0.1))
             if np.abs(step[:2]).max() < 0.01:
                 break
@@ -338,8 +338,8 @@ def agree_exposures(
         )
     dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
     notes.append(
-        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code 40): "
-        "it was estimated from the bracket"
+        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code "
+        "40): it was estimated from the bracket"
     )
     return Exposures(ratios, bent.curve, tuple(notes))
 

@@ -204,9 +204,12 @@ def find_emitters(radiance: Map, clipped: Map, error: float) -> tuple[CapturedEm
         clips = clipped[inside].max() > 0.0
         found.append(
             CapturedEmitter(
-                _triple(toward), float(area[inside].sum()), _triple(power), _triple(power * (1 - error)),
+                _triple(toward),
+                float(area[inside].sum()),
+                _triple(power),
+                _triple(power * (1 - error)),
                 None if clips else _triple(power * (1 + error)),
-            )  # fmt: skip
+            )
         )
     return tuple(sorted(found, key=lambda emitter: -sum(emitter.power))[:MOST_EMITTERS])
 
@@ -239,11 +242,15 @@ def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
         entries = json.loads(str(text))
         return tuple(
             CapturedEmitter(
-                _triple(entry["direction"]), float(entry["solid_angle"]), _triple(entry["power"]), _triple(entry["low"]),
+                _triple(entry["direction"]),
+                float(entry["solid_angle"]),
+                _triple(entry["power"]),
+                _triple(entry["low"]),
                 None if entry["high"] is None else _triple(entry["high"]),
-                None if entry["distance"] is None else float(entry["distance"]), _triple(entry["origin"]),
+                None if entry["distance"] is None else float(entry["distance"]),
+                _triple(entry["origin"]),
             )
             for entry in entries
-        )  # fmt: skip
+        )
     except (ValueError, TypeError, KeyError) as error:
         raise SceneError(f"{path}: its attribute emitters is damaged: {reason(error)}") from error

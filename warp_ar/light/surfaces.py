@@ -101,7 +101,8 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
             local = local[(np.abs(local) < half).all(axis=1)]
             points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
             flat = np.abs(points[:, 2]) < 0.02
-            card = flat & scene.has_marker & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
+            card = flat & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
+            card &= scene.has_marker
             points = points[~card & ~_in_boxes(scene, points)]
             found.add(list(points), rotation[:, 2], rotation[:, 0], 0.004, Kind.PLANE, 2 + number)
         elif proxy.shape == "box":

@@ -53,7 +53,7 @@ class PhotoInfo:
 
     @property
     def exposure(self) -> float | None:
-        """t ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
+        """T ISO / (100 N^2), seconds at ISO 100 and f/1: what the picture's brightness is proportional to."""
         if self.seconds is None:
             return None
         return self.seconds * (self.iso or 100.0) / 100.0 / (self.f_number or 1.0) ** 2
@@ -117,6 +117,25 @@ def read_exif(path: str | Path) -> PhotoInfo:
         focal_pixels=pixels,
         model=" ".join(str(tags.get("Image Model", "")).split()),
     )
+
+
+def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
+    """Camera of a photograph, or of the first one in a folder.
+
+    Raises:
+        SceneError: It has no focal length, or was cut.
+    """
+    if path.is_dir():
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif", ".tiff", ".png"))
+        if not pictures:
+            raise SceneError(f"{path}: holds no photograph to read EXIF from")
+        path = pictures[0]
+    info = read_exif(path)
+    camera = info.camera(transfer)
+    if camera is None:
+        why = "tells no focal length" if info.is_whole else f"is of {info.width}x{info.height}, a part of a photograph"
+        raise SceneError(f"{path}: its EXIF {why}; calibrate the camera or give its numbers")
+    return camera
 
 
 def _number(tags: dict[str, Any], name: str) -> float | None:

@@ -52,8 +52,8 @@ def pose_of_position(position: Sequence[float], rotate: Sequence[float]) -> RawP
 def load_poses(path: Path) -> tuple[RawPose, ...]:
     """Poses of a clip's frames in order.
 
-    COLMAP's ``images.txt`` has them by name: they are put in order of name, as frames of a folder are. JSON holds a list
-    of objects with ``R`` (9 numbers or 3 rows) and ``t``, both ``camera_from_world`` as OpenCV's ``solvePnP`` gives.
+    COLMAP's ``images.txt`` has them by name: they are put in order of name, as frames of a folder are. JSON holds a
+    list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's ``solvePnP`` gives.
 
     Raises:
         SceneError: The file cannot be used.
@@ -68,7 +68,9 @@ def load_poses(path: Path) -> tuple[RawPose, ...]:
 def _read_json(path: Path, text: str) -> tuple[RawPose, ...]:
     entries = parse_json(text, str(path), SceneError)
     if not isinstance(entries, list):
-        raise SceneError(f'{path}: expected a list of poses such as {{"R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "t": [0, 0, 1]}}')
+        raise SceneError(
+            f'{path}: expected a list of poses such as {{"R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "t": [0, 0, 1]}}'
+        )
     return tuple(_json_pose(f"{path}: pose {index}", entry) for index, entry in enumerate(entries))
 
 
@@ -100,6 +102,8 @@ def _read_colmap(path: Path, text: str) -> tuple[RawPose, ...]:
             if len(words) < 10 or not all(map(math.isfinite, (w, x, y, z, *shift))) or w == x == y == z == 0.0:
                 raise ValueError
         except ValueError:
-            raise SceneError(f"{path}: image {number}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes") from None
+            raise SceneError(
+                f"{path}: image {number}: expected ID QW QX QY QZ TX TY TZ CAMERA NAME, as COLMAP writes"
+            ) from None
         found.append((words[9], (rotation_of_quaternion(w, x, y, z), (shift[0], shift[1], shift[2]))))
     return tuple(pose for _, pose in sorted(found, key=lambda item: item[0]))

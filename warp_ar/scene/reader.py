@@ -49,10 +49,11 @@ from warp_ar.scene.description import (
     SourceSpec,
     Vec3,
 )
+from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
-from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
+from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
 
 _TOP_KEYS: Final = ("schema", "name")
 _SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
@@ -204,8 +205,21 @@ def _range(what: str, low: float, high: float, unit: str) -> str:
     return f"{what}, finite{unit}" if what == "a number" else f"{what}, each finite{unit}"
 
 
-def _read_camera(table: _Table) -> Camera:
+def _exif_camera(table: _Table, source: object, transfer: str | Path) -> Camera:
+    """The camera by the EXIF of the scene's own first picture."""
+    path = source.get("path") if isinstance(source, dict) else None
+    if not isinstance(path, str):
+        table.fail("calibration", '"exif" reads the pictures of the scene: give [source] path; else a file or numbers')
+    return camera_by_exif(table.folder / path, transfer)
+
+
+def _read_camera(table: _Table, source: object = None) -> Camera:
     transfer = _read_transfer(table)
+    if table.data.get("calibration") == "exif":
+        for key in INTRINSICS:
+            if key in table:
+                table.fail(key, "not used beside calibration; give either EXIF or the numbers")
+        return _exif_camera(table, source, transfer)
     if "calibration" in table:
         for key in INTRINSICS:
             if key in table:
@@ -464,7 +478,7 @@ def _read_pose(table: _Table) -> PoseSpec:
     if way == "R":
         rotation = table.vector("R", sizes=(9,))
         if not check_rotation(rotation):
-            table.fail("R", "expected a rotation matrix, 9 numbers row by row: camera_from_world, as OpenCV's Rodrigues gives")
+            table.fail("R", "expected a rotation matrix, 9 numbers row by row: camera_from_world, as OpenCV has it")
         return PoseSpec(((rotation, translation),))
     w, x, y, z = table.vector("quaternion", sizes=(4,), low=-1e6, high=1e6)
     if w == x == y == z == 0.0:
@@ -553,7 +567,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
             raise SceneError(f"{label}: {section}: there may be several: write [[{section}]] instead of [{section}]")
         return tuple(read(_Table(label, folder, f"{section}[{i}]", item, keys)) for i, item in enumerate(value))
 
-    lights, captured = data.get("light", []), []
+    lights = data.get("light", [])
+    captured: list[tuple[str, Any]] = []
     if isinstance(lights, dict) and "file" in lights:
         lights, captured = [], [("light", lights)]
     elif isinstance(lights, list):
@@ -567,7 +582,11 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
-        camera=one("camera", (*INTRINSICS, "transfer", "calibration"), _read_camera),
+        camera=one(
+            "camera",
+            (*INTRINSICS, "transfer", "calibration"),
+            lambda table: _read_camera(table, data.get("source")),
+        ),
         source=one("source", keys_of(SourceSpec), _read_source),
         marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),

@@ -59,7 +59,8 @@ class Lighting:
         target = make_target(controls.wanted, controls.feed)
         assert target.size is not None
         camera = target.scene.camera.scaled_to(*target.size)
-        scene, ratios = dataclasses.replace(target.scene, camera=camera), plan_bracket(target.exposures, target.shown).ratios
+        scene = dataclasses.replace(target.scene, camera=camera)
+        ratios = plan_bracket(target.exposures, target.shown).ratios
         make_plan(Request(scene, target.quality, target.size, target.outputs, ratios))
         self.builder = ThreadPoolExecutor(1, "warp-ar-build")
         """Builds pipelines and does other work beside the frames."""
