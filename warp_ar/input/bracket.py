@@ -45,6 +45,8 @@ DARKEST, DIM, BRIGHTEST = 8, 40, 245
 
 Flare and processing lift the darks of single pictures, and of short exposures nothing takes its darks.
 """
+FLAT = 30
+"""Range of codes around a pixel from which on it is beside an edge: there blur mixes what clips with what does not."""
 LEAST_PIXELS = 400
 """Pixels well exposed in two pictures without which nothing is said of their ratio."""
 HOLDS = 0.12
@@ -187,9 +189,10 @@ def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
         u, v = smooth[k], smooth[k + 1]
         ok = disc & (u.max(2) <= BRIGHTEST) & (v.max(2) <= BRIGHTEST)
         bright = ok & (u.min(2) >= DIM) & (v.min(2) >= DIM)
-        ok = bright if bright.sum() >= LEAST_PIXELS else ok & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
-        flat = ok & (plain[k] < 24) & (plain[k + 1] < 24)
-        ok = flat if flat.sum() >= LEAST_PIXELS else ok
+        flat = (plain[k] < FLAT) & (plain[k + 1] < FLAT)
+        dim = ok & flat & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
+        ways = ((bright & flat, LEAST_PIXELS), (bright, 5 * LEAST_PIXELS), (dim, 0))
+        ok = next(chosen for chosen, least in ways if chosen.sum() >= least)
         pairs.append((u[ok].astype(float), v[ok].astype(float)))
     return tuple(pairs)
 
