@@ -145,15 +145,18 @@ class Light:
                 return np.ascontiguousarray(source)
             rotation = np.eye(3)
         rows, columns = source.shape[:2]
+        # Beyond a pole lies its other side, beyond the right edge the left one.
+        poles = [np.roll(source[row : row + 1], columns // 2, 1) for row in (0, rows - 1)]
+        wide = np.concatenate([poles[0], source, poles[1]], 0)
+        wide = np.concatenate([wide[:, -1:], wide, wide[:, :2]], 1)
         total = np.zeros((height, 2 * height, 3), np.float32)
         for dy in (0.25, 0.75):
             for dx in (0.25, 0.75):
                 d = latlong_directions(height, dy, dx) @ rotation  # the inverse: rotation^T d
                 y = np.arccos(np.clip(d[..., 2], -1.0, 1.0)) / math.pi * rows - 0.5
                 x = (np.arctan2(d[..., 1], d[..., 0]) / (2 * math.pi) + 0.5) * columns - 0.5
-                wide = np.concatenate([source[:, -1:], source, source[:, :2]], 1)
                 total += cv2.remap(
-                    wide, (np.mod(x, columns) + 1.0).astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR,
+                    wide, (np.mod(x, columns) + 1.0).astype(np.float32), (y + 1.0).astype(np.float32), cv2.INTER_LINEAR,
                     borderMode=cv2.BORDER_REPLICATE,
                 )  # fmt: skip
         return np.ascontiguousarray(total / 4.0)
