@@ -1,4 +1,4 @@
-"""Composite of a 640x480 frame: nothing, a quarter and all of it covered by layers."""
+"""Composite on one core or a device: nothing, a quarter and all of a frame covered, against a copy of as many bytes."""
 
 from __future__ import annotations
 
@@ -7,42 +7,57 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from bench.common import measure, report
+from bench.common import measure, paired_ratio, report
 from warp_ar.kernels import color, composite
 from warp_ar.kernels.structs import FrameParams
 
-H, W = 480, 640
-CASES = (("untouched", 0), ("quarter", H // 4), ("whole", H))
+SIZES = ((480, 640), (1080, 1920))
+CASES = (("untouched", 0.0), ("quarter", 0.25), ("whole", 1.0))
 
 
-def frame_and_layers(device: str, rows: int) -> tuple[Any, ...]:
-    """FrameParams, frame, tables, and layers: virtual objects and added light over the first ``rows`` rows."""
+def frame_and_layers(device: str, height: int, width: int, rows: int) -> tuple[Any, ...]:
+    """FrameParams, frame, tables, and layers: all four kinds over the first ``rows`` rows."""
     rng = np.random.default_rng(0)
-    frame = rng.integers(0, 256, (H, W, 3)).astype(np.uint8)
-    virtual = np.zeros((H, W, 4), np.float32)
-    added = np.zeros((H, W, 3), np.float32)
-    virtual[:rows, : W // 2] = 0.3
-    added[:rows] = rng.random((rows, W, 3)) * 0.3
+    frame = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
+    virtual = np.zeros((height, width, 4), np.float32)
+    added, mirrored = np.zeros((2, height, width, 3), np.float32)
+    ratio = np.ones((height, width, 3), np.float32)
+    virtual[:rows, : width // 2] = 0.3
+    added[:rows] = rng.random((rows, width, 3)) * 0.3
+    ratio[:rows] = rng.random((rows, width, 3))
+    mirrored[:rows, : width // 8] = 0.1
     params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
-    params["object_rect"] = params["light_rect"] = (0, rows, 0, W)
+    for name in ("object", "light", "shadow", "ball"):
+        params[f"{name}_rect"] = (0, rows, 0, width)
     params["exposure_scale"] = 0.5
+    arrays = {"virtual": (virtual, wp.vec4), "physical_added": (added, wp.vec3), "shadow_ratio": (ratio, wp.vec3)}
+    arrays["mirrored"] = (mirrored, wp.vec3)
+    given = {name: wp.array(values, dtype=dtype, device=device) for name, (values, dtype) in arrays.items()}
     return (
         wp.array(params, dtype=FrameParams, device=device),
         wp.array(frame, dtype=wp.vec3ub, device=device),
         wp.array(color.decode_table("srgb"), dtype=wp.vec3, device=device),
         wp.array(color.encode_table("srgb"), dtype=wp.vec3, device=device),
-        composite.make_layers(
-            wp.array(virtual, dtype=wp.vec4, device=device), wp.array(added, dtype=wp.vec3, device=device)
-        ),
+        composite.make_layers(**given),
     )
 
 
 def main(device: str) -> None:
-    config = composite.CompositeConfig(virtual=True, added=True)
-    for name, rows in CASES:
-        inputs = frame_and_layers(device, rows)
-        image = wp.zeros((H, W), wp.vec3ub, device=device)
-        call = lambda inputs=inputs, image=image: composite.composite(config, *inputs, image)  # noqa: E731
-        call()
-        np.testing.assert_array_equal(image.numpy()[rows:], inputs[1].numpy()[rows:])
-        report(f"composite {W}x{H} {name}", measure({"ours": call}, device)["ours"], device)
+    config = composite.CompositeConfig(virtual=True, added=True, ratio=True, mirrored=True)
+    for height, width in SIZES:
+        for name, share in CASES:
+            rows = round(share * height)
+            inputs = frame_and_layers(device, height, width, rows)
+            image = wp.zeros((height, width), wp.vec3ub, device=device)
+            # The frame is read, the picture written, layers read where they reach.
+            moved = height * width * 6 + rows * width * (16 + 3 * 12)
+            source, target = (wp.zeros(moved // 2, dtype=wp.uint8, device=device) for _ in range(2))
+            calls = {
+                "ours": lambda inputs=inputs, image=image: composite.composite(config, *inputs, image),
+                "copy": lambda source=source, target=target: wp.copy(target, source),
+            }
+            calls["ours"]()
+            np.testing.assert_array_equal(image.numpy()[rows:], inputs[1].numpy()[rows:])
+            times = measure(calls, device)
+            over = round(paired_ratio(times, "ours", "copy"), 2)
+            report(f"composite {width}x{height} {name}", times["ours"], device, over_copy=over)

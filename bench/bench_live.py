@@ -187,7 +187,7 @@ class Growth:
 async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bool = False) -> dict[str, Any]:
     """A light client: takes pictures and shows none. One that does not read only keeps its connection open."""
     delays: list[float] = []
-    frames, begun = 0, False
+    frames, begun, plan = 0, False, 0
     start = time.monotonic()
     async with (
         aiohttp.ClientSession() as session,
@@ -209,6 +209,10 @@ async def view(growth: Growth, seconds: float, *, reads: bool = True, counts: bo
                     continue
                 await socket.send_str(json.dumps({"type": "ack", "id": header["id"]}))
                 now = time.monotonic()
+                if header["plan"] != plan:
+                    # Another pipeline has taken over, or the first: what came before does not count.
+                    plan, start, begun, frames = header["plan"], now, False, 0
+                    delays.clear()
                 if now - start < WARM_SECONDS:
                     continue
                 if not begun:
@@ -401,8 +405,8 @@ WORK = {
     "SideBySide._work": "kernels",
     "invoke": "kernels",
     "encode_jpeg": "pack JPEG",
-    "Host.push": "unpack the camera's JPEG",
-    "Host._estimate": "estimate the focal length",
+    "BrowserCamera.push": "unpack the camera's JPEG",
+    "BrowserCamera._estimate": "estimate the focal length",
     "Pipeline._set_frame_values": "poses and rectangles",
     "Pipeline._upload": "copies",
     "Result.image": "copies",
@@ -410,10 +414,10 @@ WORK = {
     "Server._receive": "headers and messages",
     "Server._send": "headers and messages",
     "Server._tick": "state and light",
-    "Host._look_at_light": "state and light",
+    "FrameLoop._look_at_light": "state and light",
     "VideoFile._pictures": "decode the clip",
     "_ahead": "decode the clip",
-    "_Slot._build": "build pipelines",
+    "PipelineSwitcher._build": "build pipelines",
     "BaseEventLoop._run_once": "event loop",
 }
 # Threads that wait in C, which py-spy takes for running.

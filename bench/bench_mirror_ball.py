@@ -8,7 +8,7 @@ import warp as wp
 from bench.common import measure, report
 from warp_ar.kernels import color, mirror_ball
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.relight import RelightConfig, make_receiver
+from warp_ar.kernels.relight import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     DIRECTIONAL,
@@ -22,6 +22,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.stages.mirror_ball import SAMPLES
@@ -95,10 +96,11 @@ def main(device: str) -> None:
             probes = _records(Probe, device, {"center": center, "radius": radius, "reflectance": (RHO,) * 3})
             keys = _records(KeyLight, device, {"direction": (0.6, 0, 0.8), "directionality": 0.5})
             decode = wp.array(decode_table, dtype=wp.vec3, device=device)
-            desk = make_receiver(relighting, frame, decode, None, probes, keys, irradiance)
+            picture = make_picture(frame, decode, rays)
+            receiver = make_receiver(relighting, picture, probes=probes, key_lights=keys, irradiance=irradiance)
 
-            def call(config: mirror_ball.MirrorBallConfig = config, desk: object = desk) -> None:
-                inputs = (params, rays, scene, lights, surroundings, desk, ratio)
+            def call(config: mirror_ball.MirrorBallConfig = config, receiver: Receiver = receiver) -> None:
+                inputs = (params, scene, lights, surroundings, receiver, ratio)
                 mirror_ball.mirror_ball(config, *inputs, out)
 
             call()

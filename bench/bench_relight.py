@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import warp as wp
@@ -11,8 +13,21 @@ from bench.common import measure, report
 from warp_ar.kernels import color, environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.kernels.environment_shadow import count_parts
-from warp_ar.kernels.structs import BOX, PLANE, POINT, SPHERE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
+from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.structs import (
+    BOX,
+    PLANE,
+    POINT,
+    SPHERE,
+    FrameParams,
+    KeyLight,
+    Light,
+    Picture,
+    Probe,
+    RayScene,
+    Shape,
+    make_picture,
+)
 from warp_ar.kernels.visibility import TraceConfig
 
 H, W = 480, 640
@@ -30,24 +45,24 @@ def _shape(kind: int, position: tuple, extent: tuple) -> dict:
     return {"kind": kind, "rotation": np.eye(3), "position": position, "scale": 1.0, "extent": extent, "material": -1}
 
 
-def _cells(
-    device: str,
-    params: wp.array,
-    rays: wp.array,
-    frame: wp.array,
-    decode: wp.array,
-    table: wp.array,
-    scene: RayScene,
-    probes: wp.array,
-    lights: wp.array,
-    keys: wp.array,
-    surroundings: wp.array,
-    out: wp.array,
-) -> dict[str, Callable[[], None]]:
+@dataclasses.dataclass(frozen=True)
+class World:
+    """What is relit."""
+
+    device: str
+    params: wp.array
+    picture: Picture
+    scene: RayScene
+    lights: wp.array
+    known: Mapping[str, wp.array]
+    """What ``make_receiver`` takes beside the picture."""
+
+
+def _cells(world: World, out: wp.array) -> dict[str, Callable[[], None]]:
     """Passes of the method ``bounce``, in their order, in a white environment."""
-    trace = TraceConfig((SPHERE,), (PLANE, BOX))
-    config = relight.RelightConfig("reflectance", trace, "sh", True, share=True, bounced=True)
-    place, share_stride, stride, patch_stride = receiver_cells.CellConfig(config), 4, 8, 16
+    device, trace = world.device, TraceConfig((SPHERE,), (PLANE, BOX))
+    config = relight.RelightConfig("reflectance", trace, "sh", True, ambient_visibility=True, bounced=True)
+    place, ambient_stride, stride, patch_stride = receiver_cells.CellConfig(config), 4, 8, 16
     environment = wp.full((64, 128), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     cumulative = wp.zeros((64, 128), wp.float32, device=device)
     sums, samples = wp.zeros(64, wp.vec2, device=device), wp.zeros(1024, EnvironmentSample, device=device)
@@ -59,32 +74,32 @@ def _cells(
         return wp.zeros((-(-H // size), -(-W // size)), dtype, device=device)
 
     cells = relight.ReceiverCells()
-    cells.share, cells.share_surface = grid(share_stride, wp.vec3), grid(share_stride, wp.int32)
+    cells.ambient_visibility, cells.ambient_surface = grid(ambient_stride, wp.vec3), grid(ambient_stride, wp.int32)
     cells.bounced, cells.bounced_surface = grid(stride, wp.vec3), grid(stride, wp.int32)
-    cells.share_stride, cells.bounced_stride = share_stride, stride
+    cells.ambient_stride, cells.bounced_stride = ambient_stride, stride
     patches, listed = grid(patch_stride, receiver_cells.Patch), grid(patch_stride, receiver_cells.Patch)
     count = wp.zeros(patches.shape[0], wp.int32, device=device)
-    desk = relight.make_receiver(config, frame, decode, table, probes, keys, surroundings, cells=cells)
-    seen = params, rays, scene
-    shares = desk, samples, 128, share_stride, cells.share, cells.share_surface
-    parts = count_parts(*cells.share.shape, receiver_cells.SHARE_PARTS) if wp.get_device(device).is_cuda else 1
+    receiver = relight.make_receiver(config, world.picture, cells=cells, **world.known)
+    inputs = world.params, world.scene, world.lights, receiver
+    shape, on_cuda = cells.ambient_visibility.shape, wp.get_device(device).is_cuda
+    partials = count_partials(*shape, receiver_cells.MAX_PARTIALS) if on_cuda else 1
     scratch = None
-    if parts > 1:
-        scratch = wp.zeros(receiver_cells.share_sums_shape(parts, *cells.share.shape), wp.vec3, device=device)
-    sums_out = cells.bounced, cells.bounced_surface
-    known = frame, decode, table, scene, probes, lights, keys, surroundings, out
+    if partials > 1:
+        scratch = wp.zeros(receiver_cells.partial_sums_shape(partials, *shape), wp.vec3, device=device)
     passes: dict[str, Callable[[], None]] = {
-        "share_environment": lambda: receiver_cells.share_environment(place, *seen, lights, *shares, sums_out=scratch),
-        "send_light": lambda: receiver_cells.send_light(place, *seen, lights, desk, patch_stride, patches),
+        "ambient_visibility": lambda: receiver_cells.estimate_ambient_visibility(
+            place, *inputs, samples, 128, cells, sums_out=scratch
+        ),
+        "send_light": lambda: receiver_cells.send_light(place, *inputs, patch_stride, patches),
         "list_patches": lambda: receiver_cells.list_patches(patches, listed, count),
         "gather_light": lambda: receiver_cells.gather_light(
-            place, *seen, desk, listed, count, patch_stride, stride, *sums_out
+            place, world.params, world.scene, receiver, listed, count, patch_stride, cells
         ),
-        "bounce, with cells": lambda: relight.relight(config, params, rays, *known, cells=cells),
+        "bounce, with cells": lambda: relight.relight(config, *inputs, out),
     }
     for call in passes.values():
         call()
-    on_desk, share = cells.share_surface.numpy() == 0, cells.share.numpy()
+    on_desk, share = cells.ambient_surface.numpy() == 0, cells.ambient_visibility.numpy()
     assert on_desk.any()
     assert ((share[on_desk] > 0.4) & (share[on_desk] <= 1.0)).all(), "half is what grey paper leaves at least"
     assert share[on_desk].min() < 0.95, "the ball and the box hide some of the environment"
@@ -92,43 +107,22 @@ def _cells(
     return passes
 
 
-def _edges(
-    device: str,
-    params: wp.array,
-    rays: wp.array,
-    frame: wp.array,
-    decode: wp.array,
-    table: wp.array,
-    scene: RayScene,
-    probes: wp.array,
-    lights: wp.array,
-    keys: wp.array,
-    surroundings: wp.array,
-) -> dict[str, Callable[[], None]]:
+def _edges(world: World) -> dict[str, Callable[[], None]]:
     """Edges at 4 and 16 samples: each pixel's one after another, or listed and side by side."""
     contenders: dict[str, Callable[[], None]] = {}
+    device = world.device
     for samples in (4, 16):
         trace = TraceConfig((SPHERE,), (PLANE, BOX))
         config = relight.RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
-        seen, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
-        desk = relight.make_receiver(config, frame, decode, table, probes, keys, surroundings)
+        visibility, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
+        receiver = relight.make_receiver(config, world.picture, **world.known)
         count = wp.zeros(1, wp.int32, device=device)
         edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
         lists = EdgeLists(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
-        relight.relight(
-            config, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out, seen
-        )
+        inputs = config, world.params, world.scene, world.lights, receiver
+        relight.relight(*inputs, out, visibility)
         for name, own in (("in place", None), ("listed", lists)):
-
-            def call(
-                config: relight.RelightConfig = config,
-                desk: relight.Receiver = desk,
-                seen: wp.array = seen,
-                out: wp.array = out,
-                own: EdgeLists | None = own,
-            ) -> None:
-                relight.smooth_edges(config, params, rays, scene, lights, desk, seen, out, edge_lists=own)
-
+            call = functools.partial(relight.smooth_edges, *inputs, visibility, out, edge_lists=own)
             call()
             contenders[f"edges, {samples} samples, {name}"] = call
         assert 100 < int(count.numpy()[0]) < len(edges)
@@ -163,19 +157,19 @@ def main(device: str) -> None:
     surroundings = wp.array(sh, dtype=wp.vec3, device=device)
     decode = wp.array(color.decode_table("srgb"), dtype=wp.vec3, device=device)
     out = wp.zeros((H, W), wp.vec3, device=device)
-    contenders = {}
+    known = {"table": table, "probes": probes, "key_lights": keys, "irradiance": surroundings}
+    world = World(device, params, make_picture(frame, decode, rays), scene, lights, known)
+    contenders: dict[str, Callable[[], None]] = {}
     for method in relight.METHODS:
         config = relight.RelightConfig(method, TraceConfig((SPHERE,), (PLANE, BOX)), "sh", True)
-
-        def call(config: relight.RelightConfig = config) -> None:
-            relight.relight(config, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out)
-
+        receiver = relight.make_receiver(config, world.picture, **known)
+        call = functools.partial(relight.relight, config, params, scene, lights, receiver, out)
         call()
         bright = 0.3 * 0.3 / (np.pi * (0.02 + 0.09) ** 1.5)  # a white desk at the frame's centre
         centre = out.numpy()[H // 2, W // 2]
         assert ((centre > 0.0) & (centre <= bright * 1.01)).all(), (method, centre)
         contenders[method] = call
-    contenders |= _cells(device, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings, out)
-    contenders |= _edges(device, params, rays, frame, decode, table, scene, probes, lights, keys, surroundings)
+    contenders |= _cells(world, out)
+    contenders |= _edges(world)
     for method, times in measure(contenders, device).items():
         report(f"relight {W}x{H} {method}", times, device)

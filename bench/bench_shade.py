@@ -14,6 +14,7 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
+from warp_ar.kernels.visibility import make_visible
 
 LEVEL_HEIGHT = 64
 
@@ -77,7 +78,7 @@ def main(device: str) -> None:
         inputs = (frame.params, frame.rays, frame.scene, light_array, surroundings)
 
         def call(config=config, inputs=inputs, frame=frame, virtual=virtual):
-            shade(config, *inputs, frame.found, frame.hits, virtual, rows=frame.launch_rows)
+            shade(config, *inputs, make_visible(frame.found, frame.hits), virtual, rows=frame.launch_rows)
 
         frame.trace()
         call()

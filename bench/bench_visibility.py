@@ -7,7 +7,7 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import structs
-from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+from warp_ar.kernels.visibility import Hit, TraceConfig, make_visible, trace_pixels
 from warp_ar.scene.ray_scene import make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 
@@ -48,14 +48,13 @@ class Frame:
         x, y = np.meshgrid((np.arange(W) - 319.5) / FOCAL, (np.arange(H) - 239.5) / FOCAL)
         self.rays = wp.array(np.stack([x, y], -1).astype(np.float32), dtype=wp.vec2, device=device)
         self.found = wp.full((H, W), -1, dtype=wp.int32, device=device)
-        self.depth = wp.zeros((H, W), dtype=wp.float32, device=device)
         self.hits = wp.zeros((H, W), dtype=Hit, device=device)
         # As the pipeline runs it: on CPU over the rows that matter, on CUDA over the frame.
         self.launch_rows = self.rows if device == "cpu" else None
 
     def trace(self) -> None:
         """Trace the frame's rows."""
-        inputs = (self.params, self.rays, self.scene, self.found, self.depth, self.hits)
+        inputs = (self.params, self.rays, self.scene, make_visible(self.found, self.hits))
         trace_pixels(self.config, *inputs, rows=self.launch_rows)
 
 
@@ -66,7 +65,7 @@ def main(device: str) -> None:
         covered = float((frame.found.numpy() >= 0).mean())
         expected = share * (8 / 9 if kind == "mesh" else 1.0)
         assert abs(covered / expected - 1) < 0.1, (kind, covered, expected)
-        depth = frame.depth.numpy()[frame.found.numpy() >= 0]
+        depth = frame.hits.numpy()["t"][frame.found.numpy() >= 0]
         assert np.isfinite(depth).all()
         report(
             f"visibility {W}x{H} {kind} covering {share:.0%}", measure({"ours": frame.trace}, device)["ours"], device

@@ -6,11 +6,13 @@ A page says ``<!-- made: NAME -->`` where the part belongs.
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
+import pathlib
 import re
 from typing import Any
 
-COMMANDS = ("live", "explain", "calibrate", "tradeoff")
+COMMANDS = ("live", "explain", "calibrate", "tradeoff", "paper")
 """Commands whose options are listed, in the order of the page."""
 
 
@@ -48,6 +50,11 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
     return [*rows, ""] if len(rows) > 2 else []
 
 
+def paper_figures() -> str:
+    """The paper's figures as ``python -m warp_ar.paper --out docs/paper`` wrote them."""
+    return (pathlib.Path(__file__).parent / "paper" / "figures.md").read_text(encoding="utf-8")
+
+
 def stages() -> str:
     """Every stage: what it does, its methods, and the file of its kernels."""
     from warp_ar.stages import STAGES
@@ -59,7 +66,20 @@ def stages() -> str:
     return "\n".join(rows)
 
 
-PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages}
+def example(name: str) -> str:
+    """A worked example as the changes that it makes."""
+    text = (pathlib.Path(__file__).parent / "examples" / f"{name}.diff").read_text(encoding="utf-8")
+    parts = re.split(r"^diff --git a/(\S+) b/\S+\n", text, flags=re.M)[1:]
+    shown = []
+    for path, change in zip(parts[::2], parts[1::2], strict=True):
+        lines = [line for line in change.splitlines() if not line.startswith(("index ", "--- ", "+++ ", "new file"))]
+        shown += [f'??? example "`{path}`"', "", "    ```diff", *(f"    {line}" for line in lines), "    ```", ""]
+    return "\n".join(shown)
+
+
+PARTS = {"scene-keys": scene_keys, "command-line": command_line, "stages": stages, "paper-figures": paper_figures} | {
+    f"example-{name}": functools.partial(example, name) for name in ("stage", "method", "scene-key", "source")
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

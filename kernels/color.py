@@ -40,10 +40,13 @@ _KEY_SCALE = wp.constant(wp.float32(ENCODE_KEYS - 1))
 _NEXT = wp.constant(ENCODE_KEYS)
 _THRESHOLDS = wp.constant(2 * ENCODE_KEYS)
 
-CLIPPING_CODE = wp.constant(254)  # video codecs and JPEG bring a clipped 255 back as 254 now and then
+SATURATION_ENTRY = wp.constant(256)
+"""Where a ``camera_table`` holds the codes at which channels saturate."""
+# Video codecs and JPEG bring a clipped 255 back as 254 now and then.
+BELOW_SATURATION = wp.constant(wp.float32(-1.0))
 # Chroma at half the resolution (4:2:0) lowers the clipped blue of a small emitter to 239 to 252 (measured in H.264).
 # Where another channel clips, what is so near to clipping counts; lower codes are as often what the camera saw.
-BESIDE_CLIPPING_CODE = wp.constant(248)
+BESIDE_SATURATION = wp.constant(wp.float32(-7.0))
 
 
 @wp.func
@@ -65,15 +68,27 @@ def decode(table: wp.array[wp.vec3], code: wp.vec3ub) -> wp.vec3:
 
 
 @wp.func
+def saturation_codes(table: wp.array[wp.vec3]) -> wp.vec3:
+    """Code at which each channel saturates: the last entry of a ``camera_table``, 255 in a plain ``decode_table``."""
+    if table.shape[0] > SATURATION_ENTRY:
+        return table[SATURATION_ENTRY]
+    return wp.vec3(255.0, 255.0, 255.0)
+
+
+@wp.func
+def is_saturated(code: wp.vec3ub, saturation: wp.vec3) -> wp.vec3:
+    """1 in the channels that are at clipping, where they saturate at the codes ``saturation``."""
+    r = wp.float32(code[0]) - saturation[0]
+    g = wp.float32(code[1]) - saturation[1]
+    b = wp.float32(code[2]) - saturation[2]
+    least = wp.where(wp.max(wp.max(r, g), b) >= BELOW_SATURATION, BESIDE_SATURATION, BELOW_SATURATION)
+    return wp.vec3(wp.where(r >= least, 1.0, 0.0), wp.where(g >= least, 1.0, 0.0), wp.where(b >= least, 1.0, 0.0))
+
+
+@wp.func
 def is_clipped(code: wp.vec3ub) -> wp.vec3:
-    """1 in the channels that are at clipping."""
-    largest = wp.max(wp.max(wp.int32(code[0]), wp.int32(code[1])), wp.int32(code[2]))
-    from_code = wp.where(largest >= CLIPPING_CODE, BESIDE_CLIPPING_CODE, CLIPPING_CODE)
-    return wp.vec3(
-        wp.where(wp.int32(code[0]) >= from_code, 1.0, 0.0),
-        wp.where(wp.int32(code[1]) >= from_code, 1.0, 0.0),
-        wp.where(wp.int32(code[2]) >= from_code, 1.0, 0.0),
-    )
+    """1 in the channels that are at clipping, where they saturate at 255."""
+    return is_saturated(code, wp.vec3(255.0, 255.0, 255.0))
 
 
 @wp.func
@@ -114,6 +129,21 @@ def decode_table(transfer: str | pathlib.Path) -> np.ndarray:
         SceneError: The name is not a transfer, or the file is not a measured response.
     """
     return _decode_values(transfer).astype(np.float32)
+
+
+def camera_table(
+    transfer: str | pathlib.Path, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255)
+) -> np.ndarray:
+    """``decode_table``, and behind it the codes at which the camera's channels saturate.
+
+    Args:
+        transfer: As for ``decode_table``.
+        saturation: Codes, (3,).
+
+    Returns:
+        (257, 3) float32.
+    """
+    return np.concatenate([decode_table(transfer), np.asarray(saturation, np.float32)[None]])
 
 
 def encode_table(transfer: str | pathlib.Path) -> np.ndarray:
@@ -177,10 +207,9 @@ def _decode_values(transfer: str | pathlib.Path) -> np.ndarray:
             f"camera.transfer = {name!r}: neither 'srgb', 'linear', 'gamma:2.2' nor the path of a measured response"
         )
     text = read_text(path, SceneError, expected="256 lines of three linear values")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     try:
-        values = np.array(
-            [[float(word) for word in line.replace(",", " ").split()] for line in text.splitlines() if line.strip()]
-        )
+        values = np.array([[float(word) for word in line.replace(",", " ").split()] for line in lines])
     except ValueError as error:
         raise SceneError(f"{path}: a measured response is 256 lines of three linear values: {error}") from None
     if values.shape != (256, 3):

@@ -24,7 +24,7 @@ from warp_ar.kernels.codes import (
     set_code,
     store_codes,
 )
-from warp_ar.kernels.color import decode, encode
+from warp_ar.kernels.color import ENCODE_KEYS, decode, encode
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.visibility import inside_rect
@@ -44,6 +44,10 @@ class CompositeConfig:
     """Shadows of the environment, a factor on the frame."""
     mirrored: bool = False
     """What mirror balls show of what is virtual, a change of the frame."""
+
+    def general(self) -> CompositeConfig:
+        """For any scene: layers that it lacks may then be empty."""
+        return CompositeConfig(True, True, True, True)
 
 
 @wp.struct
@@ -79,16 +83,16 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
         at = LayersAt()
         at.ratio = wp.vec3(1.0, 1.0, 1.0)
         if wp.static(config.virtual):
-            if inside_rect(row, col, params[0].object_rect):
+            if layers.objects.shape[0] > 0 and inside_rect(row, col, params[0].object_rect):
                 at.objects = layers.objects[row, col]
         if wp.static(config.added):
-            if inside_rect(row, col, params[0].light_rect):
+            if layers.added.shape[0] > 0 and inside_rect(row, col, params[0].light_rect):
                 at.added = layers.added[row, col]
         if wp.static(config.ratio):
-            if inside_rect(row, col, params[0].shadow_rect):
+            if layers.ratio.shape[0] > 0 and inside_rect(row, col, params[0].shadow_rect):
                 at.ratio = layers.ratio[row, col]
         if wp.static(config.mirrored):
-            if inside_rect(row, col, params[0].ball_rect):
+            if layers.mirrored.shape[0] > 0 and inside_rect(row, col, params[0].ball_rect):
                 at.mirrored = layers.mirrored[row, col]
         return at
 
@@ -108,6 +112,171 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     """All layers over the frame's radiance; no more is taken from it than there is."""
     physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirrored, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
+
+
+# A row on CPU, sixteen pixels at a time: their 48 values go side by side through the processor's vectors, all but the
+# tables' look-ups; a block that no layer touches is copied. Every product and sum is rounded by itself and in the order
+# of ``compose`` and ``encode_channel``, which it equals in all bits.
+@wp.func_native(
+    """
+#if !defined(__CUDA_ARCH__)
+    #pragma clang fp contract(off)
+    constexpr int N = 16;
+    const int width = frame.shape[1];
+    const unsigned char* codes = reinterpret_cast<const unsigned char*>(frame.data) + size_t(row) * 3 * width;
+    unsigned char* out = reinterpret_cast<unsigned char*>(image.data) + size_t(row) * 3 * width;
+    const float* decoded = reinterpret_cast<const float*>(decode_table.data);
+    const float* table = reinterpret_cast<const float*>(encode_table.data);
+
+    // Columns that each layer reaches in this row, and where it lies.
+    struct Layer { const float* at; int start, stop; };
+    auto reach = [&](const auto& array, const wp::vec_t<4, wp::int32>& rect, int bit) {
+        Layer layer = {nullptr, 0, 0};
+        if ((kept & bit) && array.shape[0] > 0 && row >= rect[0] && row < rect[1]) {
+            layer.at = reinterpret_cast<const float*>(array.data) + size_t(row) * width * (sizeof(*array.data) / 4);
+            layer.start = rect[2] > 0 ? rect[2] : 0;
+            layer.stop = rect[3] < width ? rect[3] : width;
+        }
+        return layer;
+    };
+    const Layer objects = reach(layers.objects, params.object_rect, 1);
+    const Layer added = reach(layers.added, params.light_rect, 2);
+    const Layer ratio = reach(layers.ratio, params.shadow_rect, 4);
+    const Layer mirrored = reach(layers.mirrored, params.ball_rect, 8);
+
+    auto overlaps = [](const Layer& layer, int j) { return j < layer.stop && j + N > layer.start; };
+    auto take = [&](float* into, const Layer& layer, int j, float neutral) {
+        if (j >= layer.start && j + N <= layer.stop) {
+            memcpy(into, layer.at + 3 * j, 3 * N * sizeof(*into));
+            return;
+        }
+        for (int i = 0; i < 3 * N; ++i) {
+            const int column = j + i / 3;
+            into[i] = column >= layer.start && column < layer.stop ? layer.at[3 * j + i] : neutral;
+        }
+    };
+
+    int start = width, stop = 0;
+    const Layer* all[4] = {&objects, &added, &ratio, &mirrored};
+    for (const Layer* layer : all)
+        if (layer->stop > layer->start) {
+            start = layer->start < start ? layer->start : start;
+            stop = layer->stop > stop ? layer->stop : stop;
+        }
+    if (start >= stop) start = stop = width;
+    memcpy(out, codes, 3 * start);
+    memcpy(out + 3 * stop, codes + 3 * stop, 3 * (width - stop));
+    for (int j = start; j < stop; j += N) {
+        const int count = width - j < N ? width - j : N;
+        const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirrored, j)};
+        float covered[3 * N] = {}, left[3 * N], a[3 * N] = {}, m[3 * N] = {}, r[3 * N];
+        unsigned changed[3 * N] = {};
+        unsigned touched = 0;
+        if (any[0] || any[1] || any[2] || any[3]) {
+            for (int i = 0; i < 3 * N; ++i) left[i] = r[i] = 1.0f;
+            if (any[0]) {
+                const int first = objects.start > j ? objects.start - j : 0;
+                const int last = objects.stop < j + N ? objects.stop - j : N;
+                for (int k = first; k < last; ++k) {
+                    const float* at = objects.at + 4 * (j + k);
+                    for (int c = 0; c < 3; ++c) {
+                        covered[3 * k + c] = at[c];
+                        left[3 * k + c] = 1.0f - at[3];
+                    }
+                    changed[3 * k] = at[3] != 0.0f;
+                }
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= covered[i] != 0.0f;
+            }
+            if (any[1]) {
+                take(a, added, j, 0.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= a[i] != 0.0f;
+            }
+            if (any[2]) {
+                take(r, ratio, j, 1.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= r[i] != 1.0f;
+            }
+            if (any[3]) {
+                take(m, mirrored, j, 0.0f);
+                for (int i = 0; i < 3 * N; ++i) changed[i] |= m[i] != 0.0f;
+            }
+            for (int i = 0; i < 3 * N; ++i) touched |= changed[i];
+        }
+        if (touched == 0) {
+            memcpy(out + 3 * j, codes + 3 * j, 3 * count);
+            continue;
+        }
+        unsigned char code[3 * N] = {};
+        memcpy(code, codes + 3 * j, 3 * count);
+        float x[3 * N], steps[3 * N], next[3 * N];
+        wp::int32 key[3 * N], found[3 * N];
+        // Look-ups one by one: a vector of them takes longer on half of all processors, and no less on the others.
+        #pragma clang loop vectorize(disable) unroll_count(6)
+        for (int i = 0; i < 3 * N; ++i) x[i] = decoded[3 * code[i] + i % 3];
+        for (int i = 0; i < 3 * N; ++i) {
+            float value = x[i] * r[i];
+            value = value + a[i];
+            value = value + m[i];
+            value = value > 0.0f ? value : 0.0f;
+            value = left[i] * value;
+            value = value + covered[i];
+            x[i] = value > 0.0f ? (value < 1.0f ? value : 1.0f) : 0.0f;  // NaN is not above 0
+            key[i] = 3 * static_cast<wp::int32>(__builtin_sqrtf(x[i]) * static_cast<float>(keys - 1));
+        }
+        #pragma clang loop vectorize(disable) unroll_count(6)
+        for (int i = 0; i < 3 * N; ++i) {
+            steps[i] = table[key[i] + i % 3];
+            next[i] = table[key[i] + i % 3 + 3 * keys];
+        }
+        unsigned unsure = 0;
+        for (int i = 0; i < 3 * N; ++i) {
+            const wp::int32 whole = static_cast<wp::int32>(steps[i]);
+            found[i] = whole + (x[i] >= next[i] ? 1 : 0);
+            unsure |= steps[i] != static_cast<float>(whole);
+        }
+        if (unsure)
+            for (int i = 0; i < 3 * N; ++i)
+                if (steps[i] != static_cast<float>(static_cast<wp::int32>(steps[i])))
+                    while (x[i] >= table[3 * (2 * keys + found[i]) + i % 3]) ++found[i];
+        for (int k = 0; k < 3 * N; k += 3) {
+            const bool kept_code = (changed[k] | changed[k + 1] | changed[k + 2]) == 0;
+            for (int i = k; i < k + 3; ++i) code[i] = kept_code ? code[i] : static_cast<unsigned char>(found[i]);
+        }
+        memcpy(out + 3 * j, code, 3 * count);
+    }
+#endif
+"""
+)
+def composite_row(
+    params: FrameParams,
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    encode_table: wp.array[wp.vec3],
+    layers: Layers,
+    kept: wp.int32,
+    keys: wp.int32,
+    row: wp.int32,
+    image: wp.array2d[wp.vec3ub],
+):
+    """Write a row of the picture, on CPU; ``kept`` has a bit for each layer, ``keys`` are those of the encode table."""
+
+
+@wp.kernel(enable_backward=False)
+def composite_rows_kernel(
+    # In:
+    row_start: wp.int32,
+    params: wp.array[FrameParams],
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    encode_table: wp.array[wp.vec3],
+    layers: Layers,
+    kept: wp.int32,
+    keys: wp.int32,
+    # Out:
+    image_out: wp.array2d[wp.vec3ub],
+):
+    """One thread per row, on CPU."""
+    i = row_start + wp.tid()
+    composite_row(params[0], frame, decode_table, encode_table, layers, kept, keys, i, image_out)
 
 
 @functools.cache
@@ -193,11 +362,17 @@ def composite(
         rows: Band of rows; None means all.
     """
     height, width = frame.shape
+    tables = [decode_table, encode_table]
+    if frame.device.is_cpu:
+        kept = config.virtual + 2 * config.added + 4 * config.ratio + 8 * config.mirrored
+        inputs = [params, frame, *tables, layers, kept, ENCODE_KEYS]
+        launch_rows(composite_rows_kernel, (height,), inputs, [image_out], rows=rows, device=frame.device)
+        return
     threads, run = row_parts(frame.device, width)
     launch_rows(
         make_composite_kernel(config, by_warps(frame.device, width)),
         (height, threads),
-        [params, frame, decode_table, encode_table, layers, run],
+        [params, frame, *tables, layers, run],
         [image_out],
         rows=rows,
         device=frame.device,

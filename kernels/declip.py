@@ -46,7 +46,7 @@ import warp as wp
 
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
 
@@ -424,7 +424,7 @@ def mark_tiles(frame: wp.array, marked_out: wp.array, *, rows: Rows | None = Non
 
 def widen_tiles(marked: wp.array, active_out: wp.array) -> None:
     """Mark the neighbours of marked tiles too; both ``tile_shape(H, W)`` int32."""
-    wp.launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
+    launch(widen_tiles_kernel, active_out.shape, [marked], [active_out], device=marked.device)
 
 
 def pull_frame(
@@ -475,10 +475,10 @@ def fill_levels(active: wp.array, shape: tuple[int, int], levels_out: wp.array) 
             offsets[level],
             shapes[level][1],
         ]
-        wp.launch(pull_level_kernel, shapes[level], inputs, [levels_out], device=device)
+        launch(pull_level_kernel, shapes[level], inputs, [levels_out], device=device)
     coarser = (0, 0, 0)
     for level in reversed(range(len(shapes))):
-        wp.launch(
+        launch(
             push_level_kernel,
             shapes[level],
             [0, active, TILE_LEVEL - 1 - level, *coarser, offsets[level], shapes[level][1]],

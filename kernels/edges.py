@@ -11,6 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_ar.kernels.launch import launch
+
 wp.set_module_options({"enable_backward": False})
 
 EDGE_THREADS = 1 << 16
@@ -101,6 +103,6 @@ def sample_listed_edges(
         weighted: As ``make_average_edges_kernel`` has it.
     """
     listed, device = [lists.count, lists.edges], values_out.device
-    wp.launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, *listed], [lists.samples], device=device)
+    launch(kernel, EDGE_THREADS, [EDGE_THREADS, *inputs, *listed], [lists.samples], device=device)
     averaging = [EDGE_THREADS, count, *listed, lists.samples]
-    wp.launch(make_average_edges_kernel(weighted), EDGE_THREADS, averaging, [values_out], device=device)
+    launch(make_average_edges_kernel(weighted), EDGE_THREADS, averaging, [values_out], device=device)

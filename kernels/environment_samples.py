@@ -30,7 +30,7 @@ import warp as wp
 
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.guards import safe_radiance
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.sampling import BELOW_ONE, radical_inverse, uniform_from_bits
 from warp_ar.kernels.structs import Emitter
 
@@ -360,7 +360,7 @@ def sum_environment(
         rows=None,
         device=device,
     )
-    wp.launch(sum_rows_kernel, dim=lanes, inputs=[lanes, cumulative_out], outputs=[rows_out], device=device)
+    launch(sum_rows_kernel, dim=lanes, inputs=[lanes, cumulative_out], outputs=[rows_out], device=device)
 
 
 def draw_samples(

@@ -30,6 +30,8 @@ from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
     DistantLight,
     DistantLightConfig,
+    knows_irradiance,
+    knows_levels,
     look_up,
     make_distant_irradiance,
     make_find_in_frame,
@@ -88,13 +90,16 @@ def make_look_wide(config: DistantLightConfig) -> wp.Function:
     @wp.func(module="unique")
     def look_wide(distant: DistantLight, direction: wp.vec3) -> wp.vec3:
         radiance = wp.vec3(0.0)
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant) and not knows_levels(distant):
+                if wp.static(config.diffuse == "sh"):
+                    radiance = sh_irradiance(distant.irradiance_sh, direction) / wp.pi
+                if wp.static(config.diffuse == "map"):
+                    radiance = sample_latlong(distant.irradiance_map, direction) / wp.pi
         if wp.static(config.specular):
-            level = level_from_alpha(CAUSTIC_ALPHA, distant.level_height)
-            radiance = sample_levels(distant.levels, direction, level, distant.level_height)
-        elif wp.static(config.diffuse == "sh"):
-            radiance = sh_irradiance(distant.irradiance_sh, direction) / wp.pi
-        elif wp.static(config.diffuse == "map"):
-            radiance = sample_latlong(distant.irradiance_map, direction) / wp.pi
+            if knows_levels(distant):
+                level = level_from_alpha(CAUSTIC_ALPHA, distant.level_height)
+                radiance = sample_levels(distant.levels, direction, level, distant.level_height)
         return radiance
 
     return look_wide
@@ -136,15 +141,16 @@ def make_estimated(config: DistantLightConfig) -> wp.Function:
             sent.receiver = wp.cw_mul(surface.diffuse, received) / wp.pi
             sent.distant = wp.cw_mul(surface.diffuse, irradiance - received) / wp.pi
         if wp.static(config.specular):
-            wi = reflect(wo, normal)
-            floor = level_from_alpha(alpha, distant.level_height)
-            radiance = wp.cw_mul(
-                surface.reflectance,
-                reflected_radiance(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor),
-            )
-            share = wp.clamp(0.5 - 0.5 * wp.dot(wi, up) / CAUSTIC_ALPHA, 0.0, 1.0)
-            sent.receiver += share * radiance
-            sent.distant += (1.0 - share) * radiance
+            if knows_levels(distant):
+                wi = reflect(wo, normal)
+                floor = level_from_alpha(alpha, distant.level_height)
+                reflected = reflected_radiance(
+                    distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
+                )
+                radiance = wp.cw_mul(surface.reflectance, reflected)
+                share = wp.clamp(0.5 - 0.5 * wp.dot(wi, up) / CAUSTIC_ALPHA, 0.0, 1.0)
+                sent.receiver += share * radiance
+                sent.distant += (1.0 - share) * radiance
         return sent
 
     return estimated
@@ -191,9 +197,9 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         )
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
-        if wp.static(config.diffuse == "none"):
+        if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
             rough = float(0.0)
-        if wp.static(not config.specular):
+        if wp.static(not config.specular) or not knows_levels(distant):
             glossy = float(0.0)
         if rough + glossy <= 0.0:
             return wp.vec3(0.0)
@@ -225,7 +231,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             else:
                 received = sample_latlong(distant.environment, wi)
             if is_rough:
-                if wp.static(config.diffuse != "none"):
+                if wp.static(config.diffuse != "none"):  # what is rough here has an irradiance
                     received = distant_irradiance(distant, hit.point, normal) / wp.pi
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
@@ -265,12 +271,15 @@ def make_look_before(config: DistantLightConfig) -> wp.Function:
         if wp.dot(normal, direction) < 0.0:
             before.up = -normal
         before.brightest = MAX_BRIGHTNESS * wp.max(look_wide(distant, before.up))
-        if wp.static(config.diffuse == "sh"):
-            before.from_receiver = sh_irradiance(distant.irradiance_sh, -before.up)
-            before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(distant.irradiance_sh, before.up)) / wp.pi
-        if wp.static(config.diffuse == "map"):
-            before.from_receiver = sample_latlong(distant.irradiance_map, -before.up)
-            before.brightest = MAX_BRIGHTNESS * wp.max(sample_latlong(distant.irradiance_map, before.up)) / wp.pi
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant):
+                if wp.static(config.diffuse == "sh"):
+                    before.from_receiver = sh_irradiance(distant.irradiance_sh, -before.up)
+                    before.brightest = MAX_BRIGHTNESS * wp.max(sh_irradiance(distant.irradiance_sh, before.up)) / wp.pi
+                if wp.static(config.diffuse == "map"):
+                    before.from_receiver = sample_latlong(distant.irradiance_map, -before.up)
+                    upward = sample_latlong(distant.irradiance_map, before.up)
+                    before.brightest = MAX_BRIGHTNESS * wp.max(upward) / wp.pi
         return before
 
     return look_before

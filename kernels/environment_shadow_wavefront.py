@@ -27,7 +27,7 @@ from warp_ar.kernels.environment_shadow_cells import (
     ratio_of,
 )
 from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
-from warp_ar.kernels.launch import MOST_REGISTERS
+from warp_ar.kernels.launch import MOST_REGISTERS, launch
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
@@ -365,8 +365,8 @@ def shade_wavefront(
     threads = min(wave.queue.shape[0], QUEUE_THREADS)
     size = wave.occluded.shape
     wave.queue_length.zero_()
-    wp.launch(make_find_occluded_kernel(config), size, inputs, [cells_out, wave], device=device)
-    wp.launch(make_sum_light_kernel(config), size, [*inputs, cells_out], [wave], device=device)
+    launch(make_find_occluded_kernel(config), size, inputs, [cells_out, wave], device=device)
+    launch(make_sum_light_kernel(config), size, [*inputs, cells_out], [wave], device=device)
     secondary = [*inputs, cells_out, threads]
-    wp.launch(make_trace_secondary_kernel(config), threads, secondary, [wave], device=device)
-    wp.launch(make_reduce_partials_kernel(config), size[1:], [params, wave], [cells_out], device=device)
+    launch(make_trace_secondary_kernel(config), threads, secondary, [wave], device=device)
+    launch(make_reduce_partials_kernel(config), size[1:], [params, wave], [cells_out], device=device)

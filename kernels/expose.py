@@ -71,7 +71,7 @@ from warp_ar.kernels.codes import (
 )
 from warp_ar.kernels.color import decode, encode, is_clipped
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.summed_area import box_mean
 
@@ -365,7 +365,7 @@ def largest_box(height: int) -> int:
 
 def read_scale(params: wp.array, scale_out: wp.array) -> None:
     """Write the fixed scale of ``params[0]``, not below 0, to ``scale_out``, (1,) float32."""
-    wp.launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
+    launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
 
 
 def count_levels(
@@ -401,12 +401,12 @@ def count_levels(
 
 def adapt_scale(params: wp.array, levels: wp.array, scale_out: wp.array) -> None:
     """Move ``scale_out``, (1,) float32, toward what ``levels`` of ``count_levels`` call for; 0 means never set."""
-    wp.launch(adapt_scale_kernel, 1, [params, levels], [scale_out], device=params.device)
+    launch(adapt_scale_kernel, 1, [params, levels], [scale_out], device=params.device)
 
 
 def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array, codes_out: wp.array) -> None:
     """Write the code of every code, (256,) vec3ub, after scaling by ``scale``, (1,) float32."""
-    wp.launch(expose_codes_kernel, 256, [decode_table, encode_table, scale], [codes_out], device=scale.device)
+    launch(expose_codes_kernel, 256, [decode_table, encode_table, scale], [codes_out], device=scale.device)
 
 
 def expose(

@@ -65,7 +65,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels.guards import safe_radiance
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -496,7 +496,7 @@ def project_irradiance_sh(
 
 def window_sh(irradiance_sh_out: wp.array[wp.vec3]) -> None:
     """Window nine coefficients in place, as little as keeps irradiance from being negative anywhere."""
-    wp.launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out], device=irradiance_sh_out.device)
+    launch(window_sh_kernel, dim=1, outputs=[irradiance_sh_out], device=irradiance_sh_out.device)
 
 
 def evaluate_sh4(
@@ -551,13 +551,12 @@ def sum_clusters(
         irradiance_map_out: (h, w).
         rows: Band of the map's rows; None means all.
     """
-    start, stop = rows if rows is not None else (0, irradiance_map_out.shape[0])
-    if stop > start:
-        launch_tiles(
-            sum_clusters_kernel,
-            (stop - start, irradiance_map_out.shape[1]),
-            [start, clusters],
-            [irradiance_map_out],
-            block_dim=BLOCK,
-            device=clusters.device,
-        )
+    launch_tiles(
+        sum_clusters_kernel,
+        irradiance_map_out.shape,
+        [clusters],
+        [irradiance_map_out],
+        block_dim=BLOCK,
+        device=clusters.device,
+        rows=rows if rows is not None else (0, irradiance_map_out.shape[0]),
+    )

@@ -31,7 +31,7 @@ from warp_ar.kernels.color import luminance
 from warp_ar.kernels.cooperative import block_max, from_first, lane_count, team_max, team_sum, warp_sum
 from warp_ar.kernels.guards import smooth_ramp
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
-from warp_ar.kernels.launch import launch_tiles, wait_for_block
+from warp_ar.kernels.launch import launch, launch_tiles, wait_for_block
 from warp_ar.kernels.structs import KeyLight
 
 wp.set_module_options({"enable_backward": False})
@@ -530,9 +530,9 @@ def find_key_lights(environment: wp.array, sums_out: wp.array, sectors_out: wp.a
         raise ValueError(f"key_lights_out has {len(key_lights_out)} places; expected 1 to {MAX_KEY_LIGHTS}")
     device = environment.device
     lanes, parts = (1, 1) if device.is_cpu else (32, 4)
-    wp.launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
+    launch(sum_rows_kernel, (environment.shape[0], lanes), [lanes, environment], [sums_out], device=device)
     sectors = SECTOR_ROWS * SECTOR_COLUMNS
-    wp.launch(sum_sectors_kernel, (sectors, lanes), [lanes, parts, environment, sums_out], [sectors_out], device=device)
+    launch(sum_sectors_kernel, (sectors, lanes), [lanes, parts, environment, sums_out], [sectors_out], device=device)
     blocks = KEY_BLOCKS if device.is_cuda and device.arch >= CLUSTERS_FROM else 1
     launch_tiles(
         find_key_lights_kernel,

@@ -1,15 +1,19 @@
 """How every launcher starts its kernel, over all rows or over one band of them, and how blocks wait for each other.
 
-A Warp CPU launch uses one thread and releases the interpreter lock, so the scheduler splits a pass into bands of rows
-and launches them side by side. Every per-row kernel therefore takes ``row_start`` as its first input and adds it to
-its first thread index.
+A Warp CPU launch uses one thread, so the scheduler splits a pass into bands of rows that threads take side by side.
+Every per-row kernel therefore takes ``row_start`` as its first input and adds it to its first thread index.
+
+Launchers go through this module, so that their launches can be noted instead of done (``noting``): from the notes the
+scheduler learns which modules must be compiled, and on CPU what native threads are to call.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import functools
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import warp as wp
@@ -38,6 +42,77 @@ def count_partials(rows: int, columns: int, most: int = MAX_PARTIALS) -> int:
     return partials
 
 
+@dataclasses.dataclass(frozen=True)
+class Note:
+    """A launch, or a copy, that was asked for while ``noting``."""
+
+    kernel: wp.Kernel | None
+    """None: a copy."""
+    rows: Rows | None
+    """Band that the launcher passed on."""
+    do: Callable[[], None]
+    """Does it."""
+    record: Callable[[], wp.Launch] | None = None
+    """Loads the kernel and packs its arguments; the launch is over all rows, its first input being 0."""
+    arrays: tuple[wp.array, wp.array] | None = None
+    """Of a copy: target and source."""
+    block_dim: int = 256
+    """Threads of a block, on CUDA."""
+    tiles: bool = False
+    """Whether it may not meet another that uses tiles."""
+
+
+_NOTES = threading.local()
+
+
+@contextlib.contextmanager
+def noting() -> Iterator[list[Note]]:
+    """This thread's launches are noted in the list, and nothing is done."""
+    before = getattr(_NOTES, "list", None)
+    _NOTES.list = notes = []
+    try:
+        yield notes
+    finally:
+        _NOTES.list = before
+
+
+def _do_or_note(note: Note) -> None:
+    notes = getattr(_NOTES, "list", None)
+    if notes is None:
+        note.do()
+    else:
+        notes.append(note)
+
+
+def launch(
+    kernel: wp.Kernel,
+    dim: int | Sequence[int],
+    inputs: Sequence[Any] = (),
+    outputs: Sequence[Any] = (),
+    *,
+    device: wp.DeviceLike = None,
+    stream: wp.Stream | None = None,
+    block_dim: int = 256,
+) -> None:
+    """Launch a kernel that is not split, as ``wp.launch`` does."""
+    given = {"dim": dim, "inputs": inputs, "outputs": outputs, "device": device, "stream": stream}
+    given["block_dim"] = None if wp.get_device(device).is_cpu else block_dim
+    _do_or_note(
+        Note(
+            kernel,
+            None,
+            lambda: wp.launch(kernel, **given),
+            lambda: wp.launch(kernel, **given, record_cmd=True),
+            block_dim=block_dim,
+        )
+    )
+
+
+def copy(target: wp.array, source: wp.array) -> None:
+    """Copy an array into another of its size and type, on the same device."""
+    _do_or_note(Note(None, None, lambda: wp.copy(target, source), arrays=(target, source)))
+
+
 def launch_rows(
     kernel: wp.Kernel,
     shape: Sequence[int],
@@ -59,15 +134,28 @@ def launch_rows(
         device: Where the arrays live.
         stream: CUDA stream; None means the device's current one.
     """
-    start, stop = rows if rows is not None else (0, shape[0])
-    if stop > start:
-        dim = (stop - start, *shape[1:])
-        wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
+
+    def do() -> None:
+        start, stop = rows if rows is not None else (0, shape[0])
+        if stop > start:
+            dim = (stop - start, *shape[1:])
+            wp.launch(kernel, dim=dim, inputs=[start, *inputs], outputs=outputs, device=device, stream=stream)
+
+    def record() -> wp.Launch:
+        given = {"inputs": [0, *inputs], "outputs": outputs, "device": device, "stream": stream}
+        return wp.launch(kernel, dim=tuple(shape), **given, record_cmd=True)
+
+    _do_or_note(Note(kernel, rows, do, record))
 
 
 # On CPU a module's tiles lie on the stack of the kernel that began last, for there is one pointer to them per module:
 # two threads in kernels of that module, with tiles or without, take each other's (seen with 1.19 on x86-64: crashes).
 _CPU_TILES = threading.Lock()
+
+
+def alone_with_tiles() -> contextlib.AbstractContextManager[Any]:
+    """Held by who runs kernels with tiles on the CPU other than by ``launch_tiles``."""
+    return _CPU_TILES
 
 
 def tile_kernel(function: Callable[..., None]) -> Any:
@@ -86,19 +174,31 @@ def launch_tiles(
     *,
     block_dim: int,
     device: wp.DeviceLike,
+    rows: Rows | None = None,
 ) -> None:
     """Launch a kernel whose blocks work together, one block per element of ``dim``; on CPU never two at a time.
 
     Args:
-        kernel: Declared by ``tile_kernel``, or without tiles.
+        kernel: Declared by ``tile_kernel``, or without tiles. If ``rows`` are given, its first argument is as that of
+            ``launch_rows``.
         dim: Blocks along each axis.
         inputs: Arguments before the outputs.
         outputs: Arrays that the kernel writes.
         block_dim: Threads per block on CUDA; on CPU a block is one thread.
         device: Where the arrays live.
+        rows: Band of blocks along the first axis; None means all, of a kernel that knows no bands.
     """
-    with _CPU_TILES if wp.get_device(device).is_cpu else contextlib.nullcontext():
-        wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block_dim, device=device)
+
+    def do(record_cmd: bool = False) -> wp.Launch | None:
+        start, stop = rows if rows is not None and not record_cmd else (0, dim[0])
+        if stop <= start:
+            return None
+        given = [start, *inputs] if rows is not None else list(inputs)
+        more = {"block_dim": block_dim, "device": device, "record_cmd": record_cmd}
+        with _CPU_TILES if wp.get_device(device).is_cpu else contextlib.nullcontext():
+            return wp.launch_tiled(kernel, dim=(stop - start, *dim[1:]), inputs=given, outputs=outputs, **more)
+
+    _do_or_note(Note(kernel, rows, do, functools.partial(do, True), block_dim=block_dim, tiles=True))
 
 
 @wp.func_native("""

@@ -145,9 +145,10 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
                 continue
             if wp.static(config.ratio):
-                at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
-                if at[0] >= 0.0:
-                    change += wp.cw_mul(seen, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
+                if shadow_ratio.shape[0] > 0:
+                    at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
+                    if at[0] >= 0.0:
+                        change += wp.cw_mul(seen, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
             if wp.static(config.relight is not None):
                 lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
                 change += wp.cw_mul(rho, lit.added)

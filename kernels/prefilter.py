@@ -65,7 +65,7 @@ import warp as wp
 
 from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.latlong import latlong_from_direction, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
+from warp_ar.kernels.launch import Rows, launch, launch_rows, launch_tiles, tile_kernel
 from warp_ar.kernels.pyramid import level_count, sample_packed, sample_packed_smooth
 from warp_ar.kernels.sampling import ggx_masking, ggx_masking_shadowing, hammersley, sample_ggx_visible
 
@@ -764,4 +764,4 @@ def integrate_dfg(dfg_out: wp.array2d[wp.vec2], *, samples: int = 1024) -> None:
         dfg_out: (R, V): roughness and n_dot_v from 0 to 1, at least (2, 2); 32 x 32 is what shading uses.
         samples: Directions per entry.
     """
-    wp.launch(integrate_dfg_kernel, dim=dfg_out.shape, inputs=[samples], outputs=[dfg_out], device=dfg_out.device)
+    launch(integrate_dfg_kernel, dim=dfg_out.shape, inputs=[samples], outputs=[dfg_out], device=dfg_out.device)

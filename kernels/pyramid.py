@@ -33,7 +33,7 @@ import warp as wp
 
 from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.latlong import latlong_from_direction, wrap_texel
-from warp_ar.kernels.launch import Rows, is_last_block, launch_rows, launch_tiles, wait_for_block
+from warp_ar.kernels.launch import Rows, is_last_block, launch, launch_rows, launch_tiles, wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -404,7 +404,7 @@ def reduce_latlong(radiance: wp.array2d[wp.vec3], reduced_out: wp.array2d[wp.vec
         reduced_out: (h, w), h <= H and w <= W.
         scale: Factor on the result.
     """
-    wp.launch(
+    launch(
         reduce_latlong_kernel,
         dim=reduced_out.shape,
         inputs=[radiance, scale],

@@ -36,7 +36,7 @@ from warp_ar.kernels.cells import cell_pixel, look_up_cells
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.relight import (
     DEFAULT_REFLECTANCE,
     Receiver,
@@ -449,7 +449,7 @@ def estimate_ambient_visibility(
         device=device,
     )
     if partials > 1:
-        wp.launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
+        launch(reduce_partials_kernel, shape, [sums_out], [cells_out], device=device)
 
 
 def partial_sums_shape(partials: int, rows: int, columns: int) -> tuple[int, int, int]:

@@ -30,7 +30,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import (
     PI,
     direction_from_latlong,
@@ -521,11 +521,13 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         point = points[index]
         seen = Observation()
         across = wp.cross(point.normal, point.tangent)
+        saturation = saturation_codes(table)
         if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
             squares = wp.vec3(0.0, 0.0, 0.0)
             count = wp.float32(0.0)
-            for a in range(PATCH):
-                for b in range(PATCH):
+            side = wp.int32(PATCH)  # a variable: the loops stay loops, and the kernel a seventh of its size
+            for a in range(side):
+                for b in range(side):
                     u = (2.0 * wp.float32(a) + 1.0) / wp.float32(PATCH) - 1.0
                     v = (2.0 * wp.float32(b) + 1.0) / wp.float32(PATCH) - 1.0
                     place = point.position + point.half * (u * point.tangent + v * across)
@@ -551,7 +553,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                         before = value - seen.radiance
                         seen.radiance += before / count
                         squares += wp.cw_mul(before, value - seen.radiance)
-                        seen.clipped += is_clipped(code)
+                        seen.clipped += is_saturated(code, saturation)
             if count > 0.0:
                 seen.clipped /= count
                 seen.visible = count / wp.float32(PATCH * PATCH)

@@ -22,7 +22,17 @@ from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
-from warp_ar.kernels.structs import MIRROR, PHONG, Emitter, FrameParams, Picture, Probe, RayScene
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    METALLIC_ROUGHNESS,
+    MIRROR,
+    PHONG,
+    Emitter,
+    FrameParams,
+    Picture,
+    Probe,
+    RayScene,
+)
 from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace, meets_probe
 
 wp.set_module_options({"enable_backward": False})
@@ -51,6 +61,21 @@ class DistantLightConfig:
     """Whether there are mirror balls, which hide the receiver."""
     emitters: bool = False
     """Whether emitters of the environment are known by their places."""
+    captured: bool = False
+    """Whether the environment is known without mirror balls, from a file."""
+
+    def general(self, form: DiffuseForm) -> DistantLightConfig:
+        """For any scene with as many mirror balls: forms that it does not call for may then be empty.
+
+        Args:
+            form: Where irradiance comes from in scenes that call for it.
+        """
+        models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
+        known = self.probes or self.captured
+        diffuse: DiffuseForm = form if known else "none"
+        return DistantLightConfig(
+            self.trace.general(), models, True, diffuse, known, self.probes, self.emitters, self.captured
+        )
 
 
 @wp.struct
@@ -91,6 +116,18 @@ def look_up_layer(layer: wp.array2d[wp.vec3], x: wp.float32, y: wp.float32) -> w
     top = (1.0 - fx) * layer[i, j] + fx * layer[i, j + 1]
     bottom = (1.0 - fx) * layer[i + 1, j] + fx * layer[i + 1, j + 1]
     return (1.0 - fy) * top + fy * bottom
+
+
+@wp.func
+def knows_irradiance(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the environment's irradiance: a kernel of several scenes has it compiled in."""
+    return distant.irradiance_map.shape[0] > 0 or distant.irradiance_sh.shape[0] > 0
+
+
+@wp.func
+def knows_levels(distant: DistantLight) -> wp.bool:
+    """Whether this scene calls for the prefiltered environment."""
+    return distant.levels.shape[0] > 0
 
 
 @functools.cache
@@ -141,9 +178,10 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
         )
         radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
         if wp.static(config.specular):
-            wi = reflect(wo, normal)
-            reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
-            radiance += wp.cw_mul(surface.reflectance, reflected)
+            if knows_levels(distant):
+                wi = reflect(wo, normal)
+                reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                radiance += wp.cw_mul(surface.reflectance, reflected)
         return radiance
 
     return shade_unoccluded
@@ -156,12 +194,14 @@ def make_distant_irradiance(config: DistantLightConfig) -> wp.Function:
     @wp.func(module="unique")
     def distant_irradiance(distant: DistantLight, point: wp.vec3, normal: wp.vec3) -> wp.vec3:
         irradiance = wp.vec3(0.0)
-        if wp.static(config.diffuse == "sh"):
-            irradiance = sh_irradiance(distant.irradiance_sh, normal)
-        if wp.static(config.diffuse == "map"):
-            irradiance = sample_latlong(distant.irradiance_map, normal)
-        if wp.static(config.emitters and config.diffuse != "none"):
-            irradiance = add_emitters(irradiance, distant.emitters, point, normal)
+        if wp.static(config.diffuse != "none"):
+            if knows_irradiance(distant):
+                if wp.static(config.diffuse == "sh"):
+                    irradiance = sh_irradiance(distant.irradiance_sh, normal)
+                if wp.static(config.diffuse == "map"):
+                    irradiance = sample_latlong(distant.irradiance_map, normal)
+                if wp.static(config.emitters):
+                    irradiance = add_emitters(irradiance, distant.emitters, point, normal)
         return irradiance
 
     return distant_irradiance

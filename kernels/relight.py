@@ -82,7 +82,7 @@ from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_lis
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean, intensity
@@ -170,6 +170,10 @@ class RelightConfig:
     """Whether light that lit proxies send to each other is known."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
+
+    def general(self, *, soft: bool) -> RelightConfig:
+        """For any scene in which as much is known of the receiver."""
+        return dataclasses.replace(self, trace=self.trace.general(), soft=soft)
 
     def __post_init__(self) -> None:
         known = dict.fromkeys((*METHODS, *READINGS))
@@ -293,7 +297,7 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         matter.directionality = receiver.key_lights[0].directionality
         if wp.static(reading is not None):
             if wp.static(reading is not None and reading.values == "video"):
-                matter.m = wp.float32(intensity(receiver.frame[row, col])) / 255.0
+                matter.m = wp.float32(intensity(receiver.picture.frame[row, col])) / 255.0
             else:
                 matter.m = luminance(radiance)
         else:
@@ -720,7 +724,7 @@ def smooth_edges(
         return
     listed = [edge_lists.count, edge_lists.edges]
     edge_lists.count.zero_()
-    wp.launch(list_edges_kernel, shape, [params, visibility], listed, device=device)
+    launch(list_edges_kernel, shape, [params, visibility], listed, device=device)
     kernel = make_smooth_edges_kernel(config, left=True)
     launch_rows(kernel, shape, [*inputs, visibility, *listed], [added_out], rows=None, device=device)
     sample_listed_edges(

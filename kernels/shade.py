@@ -25,8 +25,15 @@ from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_lis
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
 from warp_ar.kernels.near_field import NearLight
-from warp_ar.kernels.reflect import DistantLight, DistantLightConfig, make_distant_irradiance, make_reflected_radiance
-from warp_ar.kernels.shadow import make_sample_light, make_shadow, make_visible_share, tile_turn
+from warp_ar.kernels.reflect import (
+    DiffuseForm,
+    DistantLight,
+    DistantLightConfig,
+    knows_levels,
+    make_distant_irradiance,
+    make_reflected_radiance,
+)
+from warp_ar.kernels.shadow import ALL_LIGHTS, make_sample_light, make_shadow, make_visible_share, tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import (
     Hit,
@@ -64,6 +71,10 @@ class ShadeConfig:
     """Whether lights with a radius cast soft shadows."""
     near_field: bool = False
     """Whether ``near_field`` says what surrounds the objects."""
+
+    def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
+        """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
+        return dataclasses.replace(self, distant=self.distant.general(form), lights=ALL_LIGHTS, soft=soft)
 
     def __post_init__(self) -> None:
         check_edge_samples(self.edge_samples)
@@ -123,7 +134,8 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                     irradiance = near.irradiance
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
-            if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
+            glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+            if glossiness > 0.0 and knows_levels(distant):
                 wi = reflect(wo, normal)
                 reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
                 if wp.static(config.near_field):
@@ -233,9 +245,11 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             point.known = pixel[0] >= 0
             if point.known:
                 if wp.static(config.distant.diffuse != "none"):
-                    point.irradiance = near.irradiance[pixel[0], pixel[1]]
+                    if near.irradiance.shape[0] > 0:
+                        point.irradiance = near.irradiance[pixel[0], pixel[1]]
                 if wp.static(config.distant.specular):
-                    point.reflected = near.reflected[pixel[0], pixel[1]]
+                    if near.reflected.shape[0] > 0:
+                        point.reflected = near.reflected[pixel[0], pixel[1]]
         radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j))
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 

@@ -94,7 +94,9 @@ def make_sample_light(kinds: tuple[int, ...]) -> wp.Function:
     return sample_light_of_kinds
 
 
-sample_light = make_sample_light((POINT, SPOT, DIRECTIONAL))
+ALL_LIGHTS = tuple(sorted(map(int, (POINT, SPOT, DIRECTIONAL))))
+"""Kinds of virtual light."""
+sample_light = make_sample_light(ALL_LIGHTS)
 """``sample_light(light, point) -> LightSample``: what a light of any kind sends to a world point; finite everywhere."""
 
 

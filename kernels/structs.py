@@ -135,6 +135,15 @@ class Picture:
     rays: wp.array2d[wp.vec2]  # undistorted (x / z, y / z) of each pixel's centre
 
 
+def make_picture(frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None) -> Picture:
+    """The arrays of a picture together; None for what a kernel does not read."""
+    picture = Picture()
+    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays)):
+        if value is not None:
+            setattr(picture, name, value)
+    return picture
+
+
 @wp.struct
 class KeyLight:
     """A dominant direction of the environment."""

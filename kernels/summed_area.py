@@ -6,8 +6,10 @@ other, so the sum over a box is exact whenever that sum itself is below 2^32, th
 
     table[i, j] = sum of intensity[0..i, 0..j] mod 2^32
 
-Two forms. *By rows, then columns* (``sum_area``), for CPU: a row belongs to one thread; columns are taken in blocks of
-neighbours that share cache lines. On CUDA that would be a few thousand threads, each waiting for load after load.
+Two forms. *By slabs* (``sum_area``), for CPU: a thread takes a slab of whole rows, sixteen pixels of a row at a time in
+a processor's vectors, and adds the row above; the slabs then add what those above them sum up to. There are as many
+slabs as threads: one thread reads the frame once and writes the table once. On CUDA that would be a few threads, each
+waiting for load after load.
 
 *By strips* (``sum_area_by_strips``), for CUDA, in one launch that reads the frame once and writes the table once: a
 block takes a strip of whole rows into its registers, a byte per pixel, and scans along them. With S_k(j) the sum of
@@ -35,12 +37,12 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch, launch_rows
 
 wp.set_module_options({"enable_backward": False})
 
-CPU_COLUMN_BLOCK = 64
-"""Columns that one CPU thread sums side by side: four cache lines of the table."""
+LEAST_SLAB = 16
+"""Rows of a slab: fewer take longer to be joined than to be summed."""
 STRIPS = 128
 """Strips of a frame: a block each, all of them on the device at once where it has as many multiprocessors."""
 MAX_THREADS = 1024
@@ -158,42 +160,120 @@ def four_intensities(frame: wp.array2d[wp.vec3ub], row: wp.int32, column: wp.int
     return value
 
 
+# Luma fits 16 bits before the shift, and so do sums of sixteen; sums along a row need 32. Loads and stores of sixteen
+# neighbours are single ones, colours are told apart by shuffles, and a sum over sixteen is four steps of shifted adds.
+@wp.func_native("""
+    const int width = frame.shape[1];
+    const unsigned char* line = reinterpret_cast<const unsigned char*>(frame.data) + size_t(row) * frame.strides[0];
+    unsigned int* sums = table.data + size_t(row) * width;
+    const unsigned int* above = first ? nullptr : sums - width;
+    unsigned int total = 0;
+    int j = 0;
+#if !defined(__CUDA_ARCH__)
+    typedef unsigned char Bytes __attribute__((ext_vector_type(16), aligned(1)));
+    typedef unsigned short Halves __attribute__((ext_vector_type(16)));
+    typedef unsigned int Words __attribute__((ext_vector_type(16), aligned(4)));
+    const Halves none = 0;
+    for (; j + 16 <= width; j += 16) {
+        const unsigned char* at = line + 3 * j;
+        const auto front = __builtin_shufflevector(*(const Bytes*)at, *(const Bytes*)(at + 16),
+            0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15,
+            16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31);
+        const Bytes last = *(const Bytes*)(at + 32);
+        const auto back = __builtin_shufflevector(last, last,
+            0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15,
+            -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1);
+        const auto red = __builtin_shufflevector(front, back,
+            0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45);
+        const auto green = __builtin_shufflevector(front, back,
+            1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 34, 37, 40, 43, 46);
+        const auto blue = __builtin_shufflevector(front, back,
+            2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 32, 35, 38, 41, 44, 47);
+        Halves value = (__builtin_convertvector(red, Halves) * 54 + __builtin_convertvector(green, Halves) * 183
+            + __builtin_convertvector(blue, Halves) * 19 + 128) >> 8;
+        value += __builtin_shufflevector(none, value, 0, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30);
+        value += __builtin_shufflevector(none, value, 0, 1, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29);
+        value += __builtin_shufflevector(none, value, 0, 1, 2, 3, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27);
+        value += __builtin_shufflevector(none, value, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+        Words sum = __builtin_convertvector(value, Words) + total;
+        total += value[15];
+        if (above != nullptr) sum += *(const Words*)(above + j);
+        *(Words*)(sums + j) = sum;
+    }
+#endif
+    for (; j < width; ++j) {
+        total += (54u * line[3 * j] + 183u * line[3 * j + 1] + 19u * line[3 * j + 2] + 128u) >> 8;
+        sums[j] = total + (above != nullptr ? above[j] : 0u);
+    }
+""")
+def sum_row(frame: wp.array2d[wp.vec3ub], table: wp.array2d[wp.uint32], row: wp.int32, first: wp.bool):
+    """Write a row of a slab's table; ``first`` of the slab: there is none above.
+
+    The table is contiguous, and rows of the frame are.
+    """
+
+
+@wp.func_native("""
+    unsigned int* sums = table.data + size_t(row) * table.shape[1];
+    const unsigned int* more = offsets.data + size_t(slab) * offsets.shape[1];
+    for (int j = 0; j < table.shape[1]; ++j) sums[j] += more[j];
+""")
+def add_row(table: wp.array2d[wp.uint32], row: wp.int32, offsets: wp.array2d[wp.uint32], slab: wp.int32):
+    """Add a row of sums to a row of the table."""
+
+
+@wp.func
+def slab_start(slab: wp.int32, slabs: wp.int32, height: wp.int32) -> wp.int32:
+    """First row of a slab: they differ by a row at most."""
+    return slab * height / slabs
+
+
 @wp.kernel(enable_backward=False)
-def sum_along_rows_kernel(
+def sum_slabs_kernel(
     # In:
     row_start: wp.int32,
     frame: wp.array2d[wp.vec3ub],
     # Out:
     table_out: wp.array2d[wp.uint32],
+    ends_out: wp.array2d[wp.uint32],
 ):
-    """One thread per row, four columns at a time."""
-    i = row_start + wp.tid()
-    total = wp.uint32(0)
-    for j in range(0, frame.shape[1], 4):
-        value = four_intensities(frame, i, j)
-        value[0] = value[0] + total
-        value[1] = value[1] + value[0]
-        value[2] = value[2] + value[1]
-        value[3] = value[3] + value[2]
-        store_four(table_out, i, j, value)
-        total = value[3]
+    """One thread per slab: its own table, whose last row is kept for those below."""
+    slab = row_start + wp.tid()
+    height = frame.shape[0]
+    start = slab_start(slab, ends_out.shape[0], height)
+    stop = slab_start(slab + 1, ends_out.shape[0], height)
+    for i in range(start, stop):
+        sum_row(frame, table_out, i, i == start)
+    for j in range(frame.shape[1]):
+        ends_out[slab, j] = table_out[stop - 1, j]
 
 
 @wp.kernel(enable_backward=False)
-def sum_along_columns_kernel(
+def add_ends_kernel(
     # In:
-    column_start: wp.int32,
-    column_stop: wp.int32,
-    block: wp.int32,
+    slabs: wp.int32,
+    # Out:
+    ends_out: wp.array2d[wp.uint32],
+):
+    """One thread: the last rows of slabs become sums over all slabs down to each."""
+    for slab in range(1, slabs - 1):
+        for j in range(ends_out.shape[1]):
+            ends_out[slab, j] = ends_out[slab, j] + ends_out[slab - 1, j]
+
+
+@wp.kernel(enable_backward=False)
+def join_slabs_kernel(
+    # In:
+    row_start: wp.int32,
+    ends: wp.array2d[wp.uint32],
     # Out:
     table_out: wp.array2d[wp.uint32],
 ):
-    """One thread per block of columns; it adds whole rows, so the previous one is in the cache."""
-    start = column_start + wp.tid() * block
-    stop = wp.min(start + block, column_stop)
-    for i in range(1, table_out.shape[0]):
-        for j in range(start, stop):
-            table_out[i, j] = table_out[i - 1, j] + table_out[i, j]
+    """One thread per slab but the first: adds what all above it sum up to."""
+    slab = row_start + wp.tid() + 1
+    height = table_out.shape[0]
+    for i in range(slab_start(slab, ends.shape[0], height), slab_start(slab + 1, ends.shape[0], height)):
+        add_row(table_out, i, ends, slab - 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -481,45 +561,48 @@ def make_sum_strips_kernel(config: StripConfig) -> wp.Kernel:
     return sum_strips_kernel
 
 
-def sum_along_rows(frame: wp.array, table_out: wp.array, *, rows: Rows | None = None) -> None:
-    """Write the running sums of every row's intensity; first half of the table.
+def slab_shape(height: int, width: int, threads: int) -> tuple[int, int]:
+    """Shape of the scratch array of ``sum_slabs`` for so many threads: a row per slab."""
+    return max(1, min(threads, height // LEAST_SLAB)), width
+
+
+def sum_slabs(frame: wp.array, table_out: wp.array, ends_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Write the table of each slab by itself; first part of the table.
 
     Args:
-        frame: (H, W) vec3ub, RGB.
-        table_out: (H, W) uint32.
-        rows: Band of rows; None means all.
+        frame: (H, W) vec3ub, RGB; pixels of a row side by side.
+        table_out: (H, W) uint32, contiguous.
+        ends_out: Last row of each slab, uint32, of ``slab_shape``.
+        rows: Band of slabs; None means all.
     """
-    launch_rows(sum_along_rows_kernel, (frame.shape[0],), [frame], [table_out], rows=rows, device=frame.device)
+    launch_rows(sum_slabs_kernel, ends_out.shape[:1], [frame], [table_out, ends_out], rows=rows, device=frame.device)
 
 
-def sum_along_columns(table_out: wp.array, *, columns: Rows | None = None) -> None:
-    """Sum row sums down every column, in place; second half of the table.
+def add_ends(ends_out: wp.array) -> None:
+    """Sum the last rows of slabs, in place; second part of the table."""
+    launch(add_ends_kernel, 1, [ends_out.shape[0]], [ends_out], device=ends_out.device)
+
+
+def join_slabs(ends: wp.array, table_out: wp.array, *, rows: Rows | None = None) -> None:
+    """Add to each slab what those above it sum up to; last part of the table.
 
     Args:
-        table_out: (H, W) uint32, row sums.
-        columns: Band of columns; None means all.
+        ends: From ``add_ends``.
+        table_out: From ``sum_slabs``.
+        rows: Band of slabs but the first; None means all.
     """
-    start, stop = columns if columns is not None else (0, table_out.shape[1])
-    block = CPU_COLUMN_BLOCK if table_out.device.is_cpu else 1
-    if stop > start:
-        wp.launch(
-            sum_along_columns_kernel,
-            dim=-(-(stop - start) // block),
-            inputs=[start, stop, block],
-            outputs=[table_out],
-            device=table_out.device,
-        )
+    launch_rows(join_slabs_kernel, (ends.shape[0] - 1,), [ends], [table_out], rows=rows, device=table_out.device)
 
 
 def sum_area(frame: wp.array, table_out: wp.array) -> None:
-    """Write the whole summed-area table of a frame's intensity.
+    """Write the whole summed-area table of a frame's intensity, by one thread.
 
     Args:
-        frame: (H, W) vec3ub, RGB.
+        frame: (H, W) vec3ub, RGB; pixels of a row side by side.
         table_out: (H, W) uint32; entry (i, j) is the sum over rows 0..i and columns 0..j modulo 2^32.
     """
-    sum_along_rows(frame, table_out)
-    sum_along_columns(table_out)
+    ends = wp.empty(slab_shape(*frame.shape, 1), dtype=wp.uint32, device=frame.device)
+    sum_slabs(frame, table_out, ends)
 
 
 def strip_config(height: int, width: int, device: wp.DeviceLike) -> StripConfig:
@@ -569,7 +652,7 @@ def sum_area_by_strips(
         raise ValueError("sum_area_by_strips: frame and table_out must be contiguous; copy what is a view")
     config = strip_config(*frame.shape, frame.device)
     strips = sums_out.shape[0]
-    wp.launch(
+    launch(
         make_sum_strips_kernel(config),
         strips * config.threads,
         [frame, _group_size(strips)],

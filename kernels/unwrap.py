@@ -31,7 +31,7 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
@@ -105,6 +105,10 @@ class ProjectConfig:
 
     occluders: tuple[int, ...] = ()
     """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
+
+    def general(self) -> ProjectConfig:
+        """For any scene."""
+        return ProjectConfig(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
 
 
 @functools.cache
@@ -309,6 +313,7 @@ def make_gather_probe_kernel(method: str) -> wp.Kernel:
         width = radiance_out.shape[1]
         last_row = wp.float32(frame.shape[0] - 1)
         last_column = wp.float32(frame.shape[1] - 1)
+        saturation = saturation_codes(table)
 
         radiance = wp.vec3(0.0, 0.0, 0.0)
         clipped = wp.vec3(0.0, 0.0, 0.0)
@@ -366,8 +371,8 @@ def make_gather_probe_kernel(method: str) -> wp.Kernel:
                         p11 = frame[i1, j1]
                         top = mix(decode(table, p00), decode(table, p01), fx)
                         value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
-                        top = mix(is_clipped(p00), is_clipped(p01), fx)
-                        saturated = mix(top, mix(is_clipped(p10), is_clipped(p11), fx), fy)
+                        top = mix(is_saturated(p00, saturation), is_saturated(p01, saturation), fx)
+                        saturated = mix(top, mix(is_saturated(p10, saturation), is_saturated(p11, saturation), fx), fy)
                         total += weight
                         mean = mix(mean, value, weight / total)
                         mean_clipped = mix(mean_clipped, saturated, weight / total)

@@ -37,6 +37,8 @@ from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
 
+ALL_KINDS = tuple(sorted(map(int, (SPHERE, BOX, PLANE, MESH))))
+"""Of shapes."""
 FACES = wp.constant(8)
 """Numbers of ``surface_key`` per shape."""
 MESH_KEY = wp.constant(7)
@@ -293,6 +295,10 @@ class TraceConfig:
     proxies: tuple[int, ...]
     """Kinds among the proxies."""
 
+    def general(self) -> TraceConfig:
+        """For any scene: each shape's kind is asked for as it is met."""
+        return TraceConfig(ALL_KINDS, ALL_KINDS)
+
 
 @functools.cache
 def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
@@ -538,6 +544,13 @@ def make_sample_direction(count: int) -> wp.Function:
         return params[0].world_from_camera * inner
 
     return sample_direction
+
+
+def make_visible(objects: wp.array, hits: wp.array) -> VisibleObjects:
+    """The arrays of ``trace_pixels`` together."""
+    visible = VisibleObjects()
+    visible.objects, visible.hits = objects, hits
+    return visible
 
 
 @functools.cache

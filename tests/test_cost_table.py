@@ -40,7 +40,7 @@ def test_turning_changes_nothing_else():
 
 
 def test_bad_turns_are_refused():
-    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected top_mip"):
+    with pytest.raises(UsageError, match="irradiance has no method 'sh9'; expected sphere_mip"):
         turn(PRESETS["medium"], {"irradiance": "sh9"})
     with pytest.raises(UsageError, match="nothing called 'colour'"):
         turn(PRESETS["medium"], {"colour": "red"})
@@ -153,4 +153,11 @@ def test_price_list_is_checked():
     with pytest.raises(UsageError, match=r"errors\.irradiance\.sh2 is -1"):
         read_errors({"errors": {"irradiance": {"sh2": -1}}})
     errors = read_errors({"errors": {"irradiance": {"top_mip": 0.5, "sh4": 0.1}}})
-    assert errors["irradiance"] == {"top_mip": 0.5, "sh2": 0.5, "sh4": 0.1, "clusters": 0.1, "brute_force": 0.1}
+    assert errors["irradiance"] == {
+        "sphere_mip": 0.0,
+        "top_mip": 0.5,
+        "sh2": 0.5,
+        "sh4": 0.1,
+        "clusters": 0.1,
+        "brute_force": 0.1,
+    }

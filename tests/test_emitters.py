@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.kernels.emitters import MAX_GAIN, REACH, add_nearness, correct_parallax
+from warp_ar.kernels.emitters import MAX_GAIN, REACH, add_emitters, correct_parallax
 from warp_ar.kernels.structs import Emitter
 
 CENTER = np.array([-0.12, 0.03, 0.035])
@@ -29,7 +29,7 @@ def evaluate_kernel(
     irradiance_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    irradiance_out[i] = add_nearness(irradiance, lamps, points[i], normals[i])
+    irradiance_out[i] = add_emitters(irradiance, lamps, points[i], normals[i])
 
 
 def evaluate(device, irradiance, lamps, points, normals):

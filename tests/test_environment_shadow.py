@@ -9,8 +9,19 @@ from tests.reference import environment_shadow as reference
 from tests.test_composite import tables
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records, shape
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import environment_samples, environment_shadow
-from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels import (
+    environment_samples,
+    environment_shadow,
+    environment_shadow_filter,
+    environment_shadow_wavefront,
+)
+from warp_ar.kernels.environment_samples import EnvironmentSample, SampleSets
+from warp_ar.kernels.environment_shadow_cells import (
+    EnvironmentShadowConfig,
+    ShadowCells,
+    cell_column,
+    shaded_shape,
+)
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     BOX,
@@ -23,6 +34,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import load_scene
@@ -80,6 +92,23 @@ def sphere(center, radius):
     return shape(SPHERE, center, (radius, 0, 0))
 
 
+def shadow_cells(shape, stride=1, *, like=None, notes=True):
+    """Cells with nothing in them yet, or with the estimates of others."""
+    cells = ShadowCells()
+    cells.stride = stride
+    cells.ratio, cells.bounced, cells.surface = (
+        (wp.zeros(shape, wp.vec4), wp.zeros(shape, wp.vec3), wp.full(shape, 7, wp.int32))
+        if like is None
+        else (like.ratio, like.bounced, like.surface)
+    )
+    cells.filtered = wp.zeros(shape, wp.vec3)
+    if notes:
+        tiles = shaded_shape(*shape)
+        cells.shaded = wp.full(tiles, -1, dtype=wp.int32) if like is None else like.shaded
+        cells.changed = wp.full(tiles, -1, dtype=wp.int32)
+    return cells
+
+
 def run(
     drawn,
     objects=(),
@@ -89,19 +118,19 @@ def run(
     side=SIDE,
     stride=1,
     bounce="estimated",
-    asking=1.0,
+    secondary=1.0,
     albedo=0.0,
     rect=(0, H, 0, W),
     rows=None,
     filtered=True,
     out=None,
-    near=False,
-    parts=1,
-    in_steps=False,
+    emitters=False,
+    partials=1,
+    as_wavefront=False,
 ):
     kinds = tuple(tuple(sorted({item["kind"] for item in items})) for items in (objects, proxies))
     forms = DistantLightConfig(TraceConfig(*kinds), (LAMBERT,), False, "sh", False, bool(probes))
-    config = environment_shadow.EnvironmentShadowConfig(forms, count, side, bounce, asking, near, parts)
+    config = EnvironmentShadowConfig(forms, count, side, bounce, secondary, emitters, partials)
     params = records(
         FrameParams,
         {
@@ -125,47 +154,27 @@ def run(
     coefficients[0] = np.pi / 0.28209479
     surroundings.irradiance_sh = wp.array(coefficients, dtype=wp.vec3)
     frame = wp.full((H, W), wp.vec3ub(255, 255, 255), dtype=wp.vec3ub)
-    cells = -(-H // stride), -(-W // stride)
-    ratio, surface = wp.zeros(cells, wp.vec4), wp.full(cells, 7, wp.int32)
-    bounced = wp.zeros(cells, wp.vec3)
-    shaded = wp.full(environment_shadow.shaded_shape(*cells), -1, dtype=wp.int32)
+    shape = -(-H // stride), -(-W // stride)
+    cells = shadow_cells(shape, stride)
     rays = wp.array(RAYS, dtype=wp.vec2)
-    steps = environment_shadow.make_steps(config, *cells, rays.device) if in_steps else None
-    assert in_steps == (steps is not None)
+    wave = environment_shadow_wavefront.make_wavefront(config, *shape, rays.device) if as_wavefront else None
+    assert as_wavefront == (wave is not None)
+    picture = make_picture(frame, tables()[0], rays)
+    sets = SampleSets()
+    sets.directions, sets.flux, sets.samples = drawn
     environment_shadow.shade_environment(
-        config,
-        params,
-        rays,
-        frame,
-        tables()[0],
-        scene,
-        surroundings,
-        *drawn,
-        stride,
-        ratio,
-        bounced,
-        surface,
-        shaded_out=shaded,
-        steps=steps,
-        sums_out=wp.full(environment_shadow.sums_shape(parts, *cells), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3),
-        rows=rows,
+        config, params, picture, scene, surroundings, sets, cells, wave=wave, rows=rows
     )
     if not filtered:
-        return ratio.numpy()[..., :3], surface.numpy()
-    averaged, skipped = wp.zeros(cells, wp.vec3), wp.zeros(cells, wp.vec3)
-    seen = wp.full_like(shaded, -1)
-    environment_shadow.filter_ratio(ratio, bounced, surface, side, averaged, rows=rows)
-    # Around cells that are not shaded nothing is averaged, with the same result.
-    environment_shadow.filter_ratio(
-        ratio, bounced, surface, side, skipped, params=params, shaded=shaded, seen_out=seen, rows=rows
-    )
-    np.testing.assert_array_equal(skipped.numpy(), averaged.numpy())
+        return cells.ratio.numpy()[..., :3], cells.surface.numpy()
+    # Around cells that are not shaded nothing is averaged, and tiles in which no cell differs from 1 are passed by.
+    every, skipped = shadow_cells(shape, stride, like=cells, notes=False), shadow_cells(shape, stride, like=cells)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    spread = [forms, params, rays, scene, surroundings.probes, averaged, surface, stride]
-    environment_shadow.spread_ratio(*spread, out)
-    # Tiles in which no cell differs from 1 are passed by, with the same result.
     passed = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
-    environment_shadow.spread_ratio(*spread, passed, seen=seen)
+    for some, target in ((every, out), (skipped, passed)):
+        environment_shadow_filter.filter_ratio(config, params, some, rows=rows)
+        environment_shadow_filter.spread_ratio(config, params, rays, scene, surroundings.probes, some, target)
+    np.testing.assert_array_equal(skipped.filtered.numpy(), every.filtered.numpy())
     np.testing.assert_array_equal(passed.numpy(), out.numpy())
     return out.numpy()
 
@@ -280,7 +289,7 @@ def test_lamps_give_their_samples_a_place(device):
     environment[wi @ direction > np.cos(0.1)] = 40.0
     environment[wi[..., 2] > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    environment_samples.place_lamps(lamp_at(at, None), samples)
+    environment_samples.place_emitters(lamp_at(at, None), samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     np.testing.assert_array_equal(near, (wi @ direction > np.cos(0.1)).ravel())
@@ -294,7 +303,7 @@ def test_lamps_are_placed_from_where_the_ball_mirrors_them(device):
     environment = sky(0.5, (256, 512))
     environment[reference.texel_directions(256, 512)[0] @ direction > np.cos(0.1)] = 40.0
     _, _, samples = list_texels(environment)
-    environment_samples.place_lamps(lamp_at(at, origin=mirrors), samples)
+    environment_samples.place_emitters(lamp_at(at, origin=mirrors), samples)
     found = samples.numpy()
     near = found["distance"] < 1e29
     places = found["origin"][near] + found["distance"][near, None] * found["direction"][near]
@@ -488,21 +497,12 @@ def test_the_physical_among_samples_matches_the_reference(device, bounce):
 def test_half_of_a_set_speaks_for_all_of_it(device, bounce):
     environment = with_sun(6, 20, 100.0)
     item = [sphere((0, 0, 0.07), 0.05)]
-    whole, half = (run(draw(environment), item, albedo=0.8, bounce=bounce, asking=share) for share in (1.0, 0.5))
+    whole, half = (run(draw(environment), item, albedo=0.8, bounce=bounce, secondary=share) for share in (1.0, 0.5))
     assert (half != whole).any()
     assert abs((half - whole).mean()) < MEAN_ERROR
     assert np.abs(half - whole).max() < SET_ERROR
-    black = [run(draw(environment), item, bounce=bounce, asking=share) for share in (1.0, 0.5)]
+    black = [run(draw(environment), item, bounce=bounce, secondary=share) for share in (1.0, 0.5)]
     np.testing.assert_array_equal(*black)
-
-
-@pytest.mark.parametrize("asking", [0.0, 1.5])
-def test_asking_is_a_share(asking):
-    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
-    with pytest.raises(ValueError, match="asking is"):
-        environment_shadow.make_environment_shadow_kernel(
-            environment_shadow.EnvironmentShadowConfig(forms, 64, 4, "traced", asking)
-        )
 
 
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
@@ -527,8 +527,8 @@ def test_near_lamps_cast_their_own_shadow(device):
     directions, flux, samples = draw(environment)
     item = [sphere((0.1, 0, 0.1), 0.03)]
     distant = run((directions, flux, samples), item)[..., 0]
-    environment_samples.place_lamps(lamp_at(lamp), samples)
-    near = run((directions, flux, samples), item, near=True)[..., 0]
+    environment_samples.place_emitters(lamp_at(lamp), samples)
+    near = run((directions, flux, samples), item, emitters=True)[..., 0]
     # Centre of the shadow: where the line through lamp and object meets the desk.
     expected = lamp + (np.array([0.1, 0, 0.1]) - lamp) * lamp[2] / (lamp[2] - 0.1)
     for got, center in ((distant, (0.1, 0.0)), (near, expected[:2])):
@@ -556,52 +556,50 @@ def test_bands_of_rows_and_rectangles(device, stride):
     assert (run(drawn, item, stride=stride, rect=(0, 0, 0, 0)) == 1).all()
 
 
-@pytest.mark.parametrize("asking", [1.0, 0.5])
+@pytest.mark.parametrize("secondary", [1.0, 0.5])
 @pytest.mark.parametrize("bounce", ["estimated", "traced"])
-def test_threads_that_share_a_cell_find_the_same(device, bounce, asking):
-    """By one kernel or in steps: with a box, a ball and a lamp at a place, all of which may be before the objects."""
+def test_a_wavefront_finds_the_same(device, bounce, secondary):
+    """By one kernel or by four: with a box, a ball and a lamp at a place, all of which may be before the objects."""
     drawn = draw(with_sun(6, 20, 100.0))
-    environment_samples.place_lamps(lamp_at((0.1, 0.05, 0.4)), drawn[2])
+    environment_samples.place_emitters(lamp_at((0.1, 0.05, 0.4)), drawn[2])
     scene = {
         "objects": [sphere((0, 0, 0.05), 0.05), shape(BOX, (-0.1, -0.1, 0.03), (0.03, 0.02, 0.03))],
         "proxies": (DESK, shape(BOX, (-0.12, 0.08, 0.04), (0.03, 0.04, 0.04))),
         "probes": [{"center": (0.1, 0, 0.03), "radius": 0.03, "reflectance": (0.8, 0.7, 0.6)}],
         "stride": 2,
         "bounce": bounce,
-        "asking": asking,
+        "secondary": secondary,
         "albedo": 0.5,
-        "near": True,
+        "emitters": True,
     }
     one = run(drawn, **scene)
     assert one.min() < 0.7
-    np.testing.assert_allclose(run(drawn, **scene, parts=8), one, atol=SUM_ERROR)
-    for parts in (2, 8):
-        steps = run(drawn, **scene, parts=parts, in_steps=True)
-        np.testing.assert_allclose(steps, one, atol=SUM_ERROR)
-        np.testing.assert_array_equal(run(drawn, **scene, parts=parts, in_steps=True), steps)
-    dark = run(drawn, **{**scene, "albedo": 0.0}, parts=8, in_steps=True)
+    for partials in (2, 8):
+        found = run(drawn, **scene, partials=partials, as_wavefront=True)
+        np.testing.assert_allclose(found, one, atol=SUM_ERROR)
+        np.testing.assert_array_equal(run(drawn, **scene, partials=partials, as_wavefront=True), found)
+    dark = run(drawn, **{**scene, "albedo": 0.0}, partials=8, as_wavefront=True)
     assert (dark[one < 0.99] < one[one < 0.99]).mean() > 0.5, "objects send light"
 
 
-def test_steps_take_one_set_and_little_memory(device):
+def test_a_wavefront_takes_one_set_and_little_memory(device):
     forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
-    def steps(count, parts, asking=1.0):
-        config = environment_shadow.EnvironmentShadowConfig(forms, count, 4, "traced", asking, parts=parts)
-        return environment_shadow.make_steps(config, 10, 20, device)
+    def wavefront(count, partials, secondary=1.0, size=(10, 20)):
+        config = EnvironmentShadowConfig(forms, count, 4, "traced", secondary, partials=partials)
+        return environment_shadow_wavefront.make_wavefront(config, *size, device)
 
-    found = steps(64, 4, 0.5)
-    assert (found.hits.shape, found.items.shape) == ((4, 10, 20), (10 * 20 * 32,))
-    assert steps(64, 1) is None, "more samples than a word has bits"
-    assert steps(128, 8) is None, "more than a set"
-    config = environment_shadow.EnvironmentShadowConfig(forms, 64, 4, "traced", parts=2)
-    assert environment_shadow.make_steps(config, 1080, 1920, device) is None
+    found = wavefront(64, 4, 0.5)
+    assert (found.occluded.shape, found.queue.shape) == ((4, 10, 20), (10 * 20 * 32,))
+    assert wavefront(64, 1) is None, "more samples than a word has bits"
+    assert wavefront(128, 8) is None, "more than a set"
+    assert wavefront(64, 2, size=(1080, 1920)) is None, "too much memory"
 
 
 @wp.kernel(enable_backward=False)
 def _columns_kernel(side: wp.int32, lanes: wp.int32, out: wp.array[wp.int32]):
     thread = wp.tid()
-    out[thread] = environment_shadow.cell_column(thread, out.shape[0], side, lanes)
+    out[thread] = cell_column(thread, out.shape[0], side, lanes)
 
 
 @pytest.mark.parametrize("columns", [5, 128, 300, 640])
@@ -633,28 +631,36 @@ def test_bands_agree_with_the_whole(device):
         np.testing.assert_array_equal(part_key[slice(*rows)], key[slice(*rows)])
 
 
+ON_DESK = EnvironmentShadowConfig(
+    DistantLightConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False), 64, 4, "estimated"
+)
+
+
+def filtered_cells(ratio, surface, side=4):
+    cells = shadow_cells(surface.shape, notes=False)
+    cells.ratio.assign(np.asarray(ratio, np.float32))
+    cells.surface.assign(surface.astype(np.int32))
+    config = dataclasses.replace(ON_DESK, side=side)
+    environment_shadow_filter.filter_ratio(config, records(FrameParams, {}), cells)
+    return cells.filtered.numpy()
+
+
 def test_filter_keeps_surfaces_apart(device):
     ratio = np.ones((16, 16, 4), np.float32)
     ratio[:, 8:, :3] = 0.25
     surface = np.zeros((16, 16), np.int32)
     surface[:, 8:] = 8
     surface[3, :] = -1
-    out = wp.full((16, 16), wp.vec3(5.0, 5.0, 5.0), dtype=wp.vec3)
-    bounced = wp.zeros((16, 16), wp.vec3)
-    environment_shadow.filter_ratio(wp.array(ratio, dtype=wp.vec4), bounced, wp.array(surface, dtype=wp.int32), 4, out)
+    out = filtered_cells(ratio, surface)
     expected = np.where(surface == 0, 1.0, 0.25)[..., None].repeat(3, -1)
-    expected[3] = 5.0
-    np.testing.assert_array_equal(out.numpy(), expected)
+    expected[3] = 0.0
+    np.testing.assert_array_equal(out, expected)
 
 
 def filtered(ratio, side=4):
     """What ``filter_ratio`` makes of one channel."""
     cells = np.repeat(np.asarray(ratio, np.float32)[..., None], 4, -1)
-    surface = wp.zeros(cells.shape[:2], wp.int32)
-    out = wp.zeros(surface.shape, wp.vec3)
-    cells = wp.array(cells, dtype=wp.vec4)
-    environment_shadow.filter_ratio(cells, wp.zeros(surface.shape, wp.vec3), surface, side, out)
-    return out.numpy()[..., 0]
+    return filtered_cells(cells, np.zeros(cells.shape[:2]), side)[..., 0]
 
 
 def test_filter_weights_every_set_alike(device):
@@ -673,7 +679,7 @@ def test_filter_narrows_where_that_makes_a_difference(device):
     np.testing.assert_allclose(np.delete(got, [11, 12]), np.delete(expected, [11, 12]), atol=1e-6)
     assert 0.35 <= got[11] <= 0.425
     weak = np.full((24, 24), 0.5)
-    weak[:, 12:] += 0.5 * environment_shadow.CONTRAST
+    weak[:, 12:] += 0.5 * environment_shadow_filter.CONTRAST
     assert np.ptp(filtered(weak)[8, 10:14]) < np.ptp(filtered(weak, side=2)[8, 10:14])
     # A mean of 16 cells has half the noise of a mean of 4: where cells differ by chance, few of the latter are picked.
     noise = 0.5 + np.random.default_rng(0).normal(0, 0.1, (96, 96))
@@ -683,13 +689,10 @@ def test_filter_narrows_where_that_makes_a_difference(device):
 
 def test_what_no_picture_shows_is_exactly_one(device):
     value = np.ones((24, 24), np.float32)
-    value[:, 12:] = 1 - 0.9 * environment_shadow.NEGLIGIBLE
+    value[:, 12:] = 1 - 0.9 * environment_shadow_filter.NEGLIGIBLE
     assert (filtered(value) == 1).all()
-    value[:, 12:] = 1 - 1.1 * environment_shadow.NEGLIGIBLE
+    value[:, 12:] = 1 - 1.1 * environment_shadow_filter.NEGLIGIBLE
     assert (filtered(value)[:, 14:] != 1).all()
-
-
-ON_DESK = DistantLightConfig(TraceConfig((), (PLANE,)), (LAMBERT,), False, "none", False, False)
 
 
 def test_spread_is_a_ramp(device):
@@ -701,9 +704,9 @@ def test_spread_is_a_ramp(device):
         values = np.stack([*np.meshgrid(*axes, indexing="ij"), np.zeros(cells)], -1).astype(np.float32)
         params = records(FrameParams, {"shadow_rect": (0, size[0], 0, size[1])})
         out, rays = wp.zeros(size, wp.vec3), wp.zeros(size, wp.vec2)
-        surface = wp.zeros(cells, wp.int32)
-        averaged = wp.array(values, dtype=wp.vec3)
-        environment_shadow.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, surface, stride, out)
+        averaged = shadow_cells(cells, stride, notes=False)
+        averaged.filtered, averaged.surface = wp.array(values, dtype=wp.vec3), wp.zeros(cells, wp.int32)
+        environment_shadow_filter.spread_ratio(ON_DESK, params, rays, RayScene(), None, averaged, out)
         expected = [np.clip(np.arange(n), axis[0], axis[-1]) for n, axis in zip(size, axes, strict=True)]
         np.testing.assert_allclose(out.numpy()[..., :2], np.stack(np.meshgrid(*expected, indexing="ij"), -1), atol=1e-5)
 
@@ -720,19 +723,26 @@ def test_pixels_between_surfaces_find_their_own(device):
     meets = CAMERA + (POINTS - CAMERA) * (0.6 - 0.1) / 0.6
     on_board = (np.abs(meets[..., :2] - (0.003, 0.004)) <= (0.083, 0.061)).all(-1)
     middle = on_board[stride // 2 :: stride, stride // 2 :: stride]
-    surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
-    averaged = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
+    averaged = shadow_cells(middle.shape, stride, notes=False)
+    averaged.surface = wp.array(np.where(middle, 8, 0), dtype=wp.int32)
+    averaged.filtered = wp.array(np.where(middle, 0.25, 1.0)[..., None].repeat(3, -1), dtype=wp.vec3)
     out, rays = wp.zeros((H, W), wp.vec3), wp.array(RAYS, dtype=wp.vec2)
-    environment_shadow.spread_ratio(ON_DESK, params, rays, scene, None, averaged, surface, stride, out)
+    environment_shadow_filter.spread_ratio(ON_DESK, params, rays, scene, None, averaged, out)
     np.testing.assert_array_equal(out.numpy()[..., 0], np.where(on_board, 0.25, 1.0))
 
 
-def test_count_must_fill_chunks():
-    forms = DistantLightConfig(TraceConfig((SPHERE,), (PLANE,)), (LAMBERT,), False, "none", False, False)
-    with pytest.raises(ValueError, match="count is 100"):
-        environment_shadow.make_environment_shadow_kernel(
-            environment_shadow.EnvironmentShadowConfig(forms, 100, 4, "estimated")
-        )
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"count": 100}, "count is 100"),
+        ({"secondary": 0.0}, "secondary is 0"),
+        ({"secondary": 1.5}, "secondary is 1.5"),
+        ({"partials": 3}, "partials is 3"),
+    ],
+)
+def test_bad_configs_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(ON_DESK, **changes)
 
 
 # --- Stage ------------------------------------------------------------------------------------------------------------

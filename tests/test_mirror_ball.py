@@ -43,6 +43,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import load_scene
@@ -150,14 +151,12 @@ def run(
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
     scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **one} for one in materials])
-    desk = make_receiver(
+    receiver = make_receiver(
         config.relight or RelightConfig(method, trace),
-        wp.array(frame, dtype=wp.vec3ub),
-        tables()[0],
-        None,
-        records(Probe, *balls),
-        records(KeyLight, {"direction": KEY, "directionality": DIRECTIONALITY}),
-        wp.array(constant_environment(ENVIRONMENT), dtype=wp.vec3),
+        make_picture(wp.array(frame, dtype=wp.vec3ub), tables()[0], wp.array(rays, dtype=wp.vec2)),
+        probes=records(Probe, *balls),
+        key_lights=records(KeyLight, {"direction": KEY, "directionality": DIRECTIONALITY}),
+        irradiance=wp.array(constant_environment(ENVIRONMENT), dtype=wp.vec3),
     )
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     light = np.ones(3) if irradiance is None else irradiance
@@ -169,11 +168,10 @@ def run(
     mirror_ball.mirror_ball(
         config,
         params,
-        wp.array(rays, dtype=wp.vec2),
         scene,
         records(Light, *lights),
         surroundings,
-        desk,
+        receiver,
         None if ratio is None else wp.array(ratio.astype(np.float32), dtype=wp.vec3),
         out,
         rows=rows,
@@ -684,7 +682,7 @@ def test_config_holds_what_the_scene_calls_for():
     assert whole.ratio
     assert whole.relight is not None
     assert whole.shade is not None
-    assert not whole.shade.near
+    assert not whole.shade.near_field
     assert config(dataclasses.replace(desk, lights=()), mirror_ball="single").relight is None
     bare = config(dataclasses.replace(desk, objects=()), mirror_ball="single")
     assert bare.shade is None

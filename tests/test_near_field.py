@@ -14,8 +14,8 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import near_field, shade
 from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape
-from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape, make_picture
+from warp_ar.kernels.visibility import Hit, TraceConfig, VisibleObjects, make_visible, trace_pixels
 from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
@@ -25,6 +25,13 @@ FURNACE_ERROR = 0.15
 BALL = (0.0, 0.0, 0.06)
 RADIUS = 0.05
 LEVEL_HEIGHT = 8
+
+
+def near_light(shape):
+    near = near_field.NearLight()
+    near.irradiance = wp.zeros(shape, wp.vec3)
+    near.reflected, near.transmitted = wp.zeros(shape, wp.vec4), wp.zeros(shape, wp.vec4)
+    return near
 
 
 def run(
@@ -75,34 +82,24 @@ def run(
     surroundings.levels = wp.full(lobe_texels(LEVEL_HEIGHT), wp.vec3(*3 * [environment_shows]), dtype=wp.vec3)
     surroundings.level_height = LEVEL_HEIGHT
     rays = wp.array(RAYS, dtype=wp.vec2)
-    hit_object, depth, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), wp.float32), wp.zeros((H, W), Hit)
-    trace_pixels(forms.trace, params, rays, scene, hit_object, depth, hits)
+    hit_object, hits = wp.zeros((H, W), wp.int32), wp.zeros((H, W), Hit)
+    visible = make_visible(hit_object, hits)
+    trace_pixels(forms.trace, params, rays, scene, visible)
     drawn = draw(environment)
     frame = wp.full((H, W), wp.vec3ub(code, code, code), dtype=wp.vec3ub)
-    irradiance, mirrored, passed = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4), wp.zeros((H, W), wp.vec4)
-    layers = [None if layer is None else wp.array(layer, dtype=wp.vec3) for layer in (ratio, added)]
-    near_field.light_objects(
-        config,
-        params,
-        rays,
-        frame,
-        tables()[0],
-        *layers,
-        scene,
-        surroundings,
-        drawn[2],
-        hit_object,
-        hits,
-        irradiance,
-        mirrored,
-        passed,
-        rows=rows,
+    near, layers = near_light((H, W)), near_field.ReceiverLayers()
+    if ratio is not None:
+        layers.shadow_ratio = wp.array(ratio, dtype=wp.vec3)
+    if added is not None:
+        layers.added = wp.array(added, dtype=wp.vec3)
+    picture = make_picture(frame, tables()[0], rays)
+    near_field.estimate_near_field(
+        config, params, picture, layers, scene, surroundings, drawn[2], visible, near, rows=rows
     )
     if filtered:
-        raw = irradiance, mirrored, passed
-        irradiance, mirrored = wp.zeros((H, W), wp.vec3), wp.zeros((H, W), wp.vec4)
-        near_field.filter_near_field(config, params, scene, hit_object, hits, *raw, irradiance, mirrored)
-    return irradiance.numpy(), mirrored.numpy(), hit_object.numpy(), hits.numpy(), drawn
+        raw, near = near, near_light((H, W))
+        near_field.filter_near_field(config, params, scene, visible, raw, near)
+    return near.irradiance.numpy(), near.reflected.numpy(), hit_object.numpy(), hits.numpy(), drawn
 
 
 CHALK = {"model": LAMBERT, "base_color": (1, 1, 1)}
@@ -266,19 +263,14 @@ def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rec
     scene.materials = records(Material, *[{"model": model, "base_texture": -1} for model in models])
     hits = np.zeros(found.shape, np.dtype(Hit.numpy_dtype()))
     hits["normal"] = normals
-    outputs = wp.zeros((height, width), wp.vec3), wp.zeros((height, width), wp.vec4)
-    near_field.filter_near_field(
-        config,
-        records(FrameParams, {"object_rect": rect or (0, height, 0, width)}),
-        scene,
-        wp.array(found.astype(np.int32), dtype=wp.int32),
-        wp.array(hits, dtype=Hit),
-        wp.array(irradiance.astype(np.float32), dtype=wp.vec3),
-        wp.array(mirrored.astype(np.float32), dtype=wp.vec4),
-        wp.array(np.zeros_like(mirrored, np.float32) if passed is None else passed.astype(np.float32), dtype=wp.vec4),
-        *outputs,
-    )
-    return tuple(output.numpy() for output in outputs)
+    estimate, near = near_light((height, width)), near_light((height, width))
+    estimate.irradiance.assign(irradiance.astype(np.float32))
+    estimate.reflected.assign(mirrored.astype(np.float32))
+    estimate.transmitted.assign(np.zeros_like(mirrored, np.float32) if passed is None else passed.astype(np.float32))
+    visible = make_visible(wp.array(found.astype(np.int32), dtype=wp.int32), wp.array(hits, dtype=Hit))
+    params = records(FrameParams, {"object_rect": rect or (0, height, 0, width)})
+    near_field.filter_near_field(config, params, scene, visible, estimate, near)
+    return near.irradiance.numpy(), near.reflected.numpy()
 
 
 def test_averages_stop_at_the_edges_of_objects(device):
@@ -341,15 +333,15 @@ def test_a_sample_of_an_edge_takes_the_light_of_the_pixel_most_like_it(device):
     asked["shape"] = 3, 3, 3, 5, 7
     asked["normal"] = (0, 0, 1), (0.8, 0, 0.6), (0, 0.8, 0.6), (1, 0, 0), (0, 0, 1)
     out = wp.zeros(len(asked), wp.vec2i)
-    inputs = [wp.array(found), wp.array(hits, dtype=Hit), wp.array(asked, dtype=Hit)]
+    inputs = [make_visible(wp.array(found), wp.array(hits, dtype=Hit)), wp.array(asked, dtype=Hit)]
     wp.launch(_alike_kernel, dim=len(asked), inputs=inputs, outputs=[out])
     assert out.numpy().tolist() == [[1, 1], [0, 1], [1, 0], [2, 1], [-1, -1]]
 
 
 @wp.kernel(enable_backward=False)
-def _alike_kernel(found: wp.array2d[wp.int32], hits: wp.array2d[Hit], asked: wp.array[Hit], out: wp.array[wp.vec2i]):
+def _alike_kernel(visible: VisibleObjects, asked: wp.array[Hit], out: wp.array[wp.vec2i]):
     k = wp.tid()
-    out[k] = shade.most_alike(found, hits, 1, 1, asked[k])
+    out[k] = shade.most_alike(visible, 1, 1, asked[k])
 
 
 def test_stage_follows_the_method_of_shade():

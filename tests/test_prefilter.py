@@ -31,7 +31,7 @@ ERRORS = {"box_mip": 2.0, "energy_mip": 0.6, "fis32": 0.35, "fis128": 0.2}
 # Split-sum table: 1024 Hammersley directions against quadrature.
 DFG = 4e-3
 
-METHODS = Prefilter.methods
+METHODS = [method for method in Prefilter.methods if method != "sphere_mip"]  # which filters the frame
 LOBES = ("ggx", "phong")
 MATERIALS = {
     "ggx": 'model = "metallic_roughness"\nbase_color = [1.0, 0.8, 0.3]\nmetallic = 1.0\nroughness = 0.4',

@@ -348,6 +348,20 @@ def test_light_rect_holds_every_lit_pixel(device, name):
         assert max(shares) == 0.0
 
 
+def crowd(count: int) -> tuple[scenes.Proxy, ...]:
+    """Boxes of 2 cm in rows, turned and of several heights."""
+    side = math.ceil(math.sqrt(count))
+    return tuple(
+        scenes.Proxy(
+            "box",
+            size=(0.02, 0.02, 0.01 + 0.01 * (index % 4)),
+            at=(0.04 * (index % side) - 0.02 * side, 0.04 * (index // side) - 0.1, 0.02),
+            rotate=(0.0, 0.0, 7.0 * index),
+        )
+        for index in range(count)
+    )
+
+
 SENDING = {
     "box": PROXIES,
     "wall": (PROXIES[0], scenes.Proxy("plane", size=(1.0, 0.6), at=(0.0, 0.4, 0.3), rotate=(90.0, 0.0, 0.0))),
@@ -356,6 +370,7 @@ SENDING = {
         *PROXIES,
         scenes.Proxy("box", size=(0.1, 0.3, 0.3), at=(-0.2, 0.1, 0.15), rotate=(0.0, 20.0, 0.0)),
     ),
+    "a crowd": (*PROXIES, *crowd(25)),
 }
 
 
@@ -398,6 +413,18 @@ def test_light_rect_holds_every_pixel_that_gets_bounced_light(device, name, prox
             assert inside[direct[0] : direct[1], direct[2] : direct[3]].all()
         reached += gets.sum()
     assert (reached > 0) == (len(sources) > 0 and name != "inside the box")
+
+
+def test_outlines_of_a_crowd_grow_with_it():
+    """Ten times the boxes have at most ten times the polygons, whatever sends light to whatever."""
+    lamp = scenes.Light("spot", 1.0, at=(0.0, 0.0, 0.8), target=(0.0, 0.0, 0.0), inner_angle=20.0, outer_angle=40.0)
+    counts = {}
+    for count in (10, 100):
+        scene = scenes.Scene(CAMERA, lights=(lamp,), proxies=(PROXIES[0], *crowd(count)))
+        host = HostScene(scene, wp.get_device("cpu"))
+        counts[count] = len(host.light_outline(bounced=True).polygons)
+    assert counts[10] > 60
+    assert counts[100] <= 10 * counts[10]
 
 
 def test_a_light_that_nothing_sends_on_has_the_same_rectangle(device):

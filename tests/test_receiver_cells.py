@@ -17,10 +17,23 @@ from tests.reference.environment_shadow import sphere_form_factor
 from tests.test_composite import tables
 from tests.test_environment_shadow import draw, lamp_at, list_texels, sky, with_sun
 from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, constant_environment, point, records, shape
+from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels import environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.receiver_cells import Patch
-from warp_ar.kernels.structs import BOX, DIRECTIONAL, MESH, PLANE, FrameParams, KeyLight, Light, Probe, RayScene, Shape
+from warp_ar.kernels.structs import (
+    BOX,
+    DIRECTIONAL,
+    MESH,
+    PLANE,
+    FrameParams,
+    KeyLight,
+    Light,
+    Probe,
+    RayScene,
+    Shape,
+    make_picture,
+)
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
@@ -103,32 +116,38 @@ class View:
         if irradiance is not None:
             self.surroundings = wp.array(irradiance, dtype=wp.vec3)
 
-    def desk(self, cells=None):
-        known = self.frame, tables()[0], self.table, self.probes, self.keys, self.surroundings
-        return relight.make_receiver(self.relight, *known, cells=cells)
+    def receiver(self, cells=None):
+        return relight.make_receiver(
+            self.relight,
+            make_picture(self.frame, tables()[0], self.rays),
+            table=self.table,
+            probes=self.probes,
+            key_lights=self.keys,
+            irradiance=self.surroundings,
+            cells=cells,
+        )
 
     def cells(self, stride):
         return tuple(-(-n // stride) for n in self.size)
 
-    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, parts=1):
+    def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, partials=1):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
+        written = relight.ReceiverCells()
+        written.ambient_visibility, written.ambient_surface, written.ambient_stride = share, surface, stride
         sums = None
-        if parts > 1:
+        if partials > 1:
             poison = wp.vec3(math.nan, math.nan, math.nan)
-            sums = wp.full(receiver_cells.share_sums_shape(parts, *share.shape), poison, dtype=wp.vec3)
-        receiver_cells.share_environment(
+            sums = wp.full(receiver_cells.partial_sums_shape(partials, *share.shape), poison, dtype=wp.vec3)
+        receiver_cells.estimate_ambient_visibility(
             self.config,
             self.params,
-            self.rays,
             self.scene,
             self.lights,
-            self.desk(cells),
+            self.receiver(cells),
             samples,
             count or samples.shape[0],
-            stride,
-            share,
-            surface,
+            written,
             bounced=bounced,
             sums_out=sums,
             rows=rows,
@@ -138,7 +157,7 @@ class View:
     def send(self, stride=4, rows=None, out=None, cells=None):
         patches = wp.full(self.cells(stride), Patch(), dtype=Patch) if out is None else out
         receiver_cells.send_light(
-            self.config, self.params, self.rays, self.scene, self.lights, self.desk(cells), stride, patches, rows=rows
+            self.config, self.params, self.scene, self.lights, self.receiver(cells), stride, patches, rows=rows
         )
         return patches
 
@@ -150,41 +169,17 @@ class View:
             receiver_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
         bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
+        written = relight.ReceiverCells()
+        written.bounced, written.bounced_surface, written.bounced_stride = bounced, surface, stride
+        inputs = self.config, self.params, self.scene, self.receiver(), listed, count, patch_stride
         for band in rows or [None]:
-            receiver_cells.gather_light(
-                self.config,
-                self.params,
-                self.rays,
-                self.scene,
-                self.desk(),
-                listed,
-                count,
-                patch_stride,
-                stride,
-                bounced,
-                surface,
-                rows=band,
-            )
+            receiver_cells.gather_light(*inputs, written, rows=band)
         return bounced.numpy(), surface.numpy()
 
     def light(self, cells=None, rows=None, **forms):
         out = wp.full(self.size, wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
-        relight.relight(
-            dataclasses.replace(self.relight, **forms),
-            self.params,
-            self.rays,
-            self.frame,
-            tables()[0],
-            self.table,
-            self.scene,
-            self.probes,
-            self.lights,
-            self.keys,
-            self.surroundings,
-            out,
-            cells=cells,
-            rows=rows,
-        )
+        config = dataclasses.replace(self.relight, **forms)
+        relight.relight(config, self.params, self.scene, self.lights, self.receiver(cells), out, rows=rows)
         return out.numpy()
 
 
@@ -203,12 +198,12 @@ def middles(stride, size=SIZE_OF_FRAME):
 
 def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
     cells = relight.ReceiverCells()
-    cells.share_stride = cells.bounced_stride = stride
-    for name, values in (("share", share), ("bounced", bounced)):
+    cells.ambient_stride = cells.bounced_stride = stride
+    for name, values in (("ambient_visibility", share), ("bounced", bounced)):
         if values is not None:
             values = np.broadcast_to(np.asarray(values, np.float32), (*view.cells(stride), 3)).copy()
             setattr(cells, name, wp.array(values, dtype=wp.vec3))
-    for name, values in (("share_surface", share_surface), ("bounced_surface", bounced_surface)):
+    for name, values in (("ambient_surface", share_surface), ("bounced_surface", bounced_surface)):
         values = np.zeros(view.cells(stride), np.int32) if values is None else values
         setattr(cells, name, wp.array(values, dtype=wp.int32))
     return cells
@@ -290,7 +285,7 @@ def test_only_where_light_may_fall(device):
     samples = draw(sky())[2]
     away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
     assert (View(lights=[away]).share(samples)[1] == -1).all()
-    view = View(lights=[away], share=True)
+    view = View(lights=[away], ambient_visibility=True)
     out = wp.zeros(view.cells(4), wp.vec3), wp.full(view.cells(4), -1, dtype=wp.int32)
     bounced = np.zeros((*view.cells(4), 3))
     bounced[5, 6] = 0.1
@@ -337,7 +332,7 @@ def test_share_matches_twin(device):
     """A sun, a lamp at a place, a box and a ball; the twin asks every sample at every cell."""
     environment = with_sun(9, 40, 300.0, np.float32(np.random.default_rng(1).uniform(0.2, 1, (32, 64, 3))))
     samples = draw(environment, 256)[2]
-    environment_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
+    environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), samples)
     corners, (center, radius) = ((0.1, -0.1, 0), (0.22, 0.14, 0.08)), ((-0.1, 0.03, 0.05), 0.04)
     facing = np.array([0.6, 0.5, 0.4])
     share, surface = View((DESK, box(*corners)), [ball(center, radius)], surroundings=facing).share(samples)
@@ -351,20 +346,21 @@ def test_share_matches_twin(device):
     assert expected[on_desk].min() < 0.7
 
 
-@pytest.mark.parametrize("parts", [2, 16])
-def test_threads_that_share_a_cell_find_the_same(device, parts):
+@pytest.mark.parametrize("partials", [2, 16])
+def test_threads_that_share_a_cell_find_the_same(device, partials):
     """First where a light shines, then where bounced light arrives as well; 100 samples are no multiple of 16."""
     samples = draw(with_sun(9, 40, 300.0))[2]
-    environment_samples.place_lamps(lamp_at((0.2, 0.1, 0.4)), samples)
-    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), [ball((-0.1, 0.03, 0.05), 0.04)], share=True)
+    environment_samples.place_emitters(lamp_at((0.2, 0.1, 0.4)), samples)
+    shapes = DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))
+    view = View(shapes, [ball((-0.1, 0.03, 0.05), 0.04)], ambient_visibility=True)
     away = {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}
     lit, dark = view.lights, records(Light, away)
     bounced = np.zeros((*view.cells(4), 3))
     bounced[4:8, 3:9] = 0.1
     results = []
-    for count in (1, parts):
+    for count in (1, partials):
         out = wp.full(view.cells(4), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3), wp.full(view.cells(4), 7, dtype=wp.int32)
-        more = {"count": 100, "out": out, "parts": count}
+        more = {"count": 100, "out": out, "partials": count}
         view.lights = lit
         first = [found.copy() for found in view.share(samples, **more)]
         view.lights = dark
@@ -382,10 +378,10 @@ def test_threads_that_share_a_cell_find_the_same(device, parts):
     assert 0 < (one[3] >= 0).sum() < (one[1] >= 0).sum()
 
 
-@pytest.mark.parametrize("parts", [2, 16])
-def test_cells_that_are_found_already_stay_as_they_are(device, parts):
+@pytest.mark.parametrize("partials", [2, 16])
+def test_cells_that_are_found_already_stay_as_they_are(device, partials):
     """The second pass adds to the first: it neither estimates its cells again nor reads sums of an earlier frame."""
-    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), share=True)
+    view = View((DESK, box((0.1, -0.1, 0), (0.22, 0.14, 0.08))), ambient_visibility=True)
     samples = draw(sky())[2]
     kept = np.full(view.cells(4), -1, np.int32)
     kept[2:4, 2:9] = 0
@@ -393,7 +389,7 @@ def test_cells_that_are_found_already_stay_as_they_are(device, parts):
     bounced = np.zeros((*view.cells(4), 3))
     bounced[3:8, 3:9] = 0.1
     cells = cells_of(view, 4, bounced=bounced)
-    share, surface = view.share(samples, out=out, bounced=True, cells=cells, parts=parts)
+    share, surface = view.share(samples, out=out, bounced=True, cells=cells, partials=partials)
     assert (share[kept == 0] == 7.0).all()
     added = (surface >= 0) & (kept < 0)
     assert added.sum() > 10
@@ -583,7 +579,7 @@ def look_up_kernel(
 ):
     i, j = wp.tid()
     size = wp.vec2i(found_out.shape[0], found_out.shape[1])
-    found_out[i, j] = relight.look_up_cells(values, surface, stride, key, size, i, j)
+    found_out[i, j] = frame_cells.look_up_cells(values, surface, stride, key, size, i, j)
 
 
 def look_up(values, surface, stride, key, size):
@@ -645,7 +641,7 @@ def test_surfaces_do_not_mix(device):
 @pytest.mark.parametrize("share", [0.2, 0.7, 1.0])
 def test_reflectance_of_a_shaded_desk(device, share):
     """What the camera sees over what arrives: rho = pi L / (share E), and no more than 1."""
-    view = View(share=True)
+    view = View(ambient_visibility=True)
     got = view.light(cells_of(view, 4, share=share))
     radiance = np.asarray(tables()[0].numpy()[128], float)
     kd = reference_relight.reflectance(radiance, share * np.pi)
@@ -667,8 +663,9 @@ def test_bounced_light_is_added(device):
 def test_where_nothing_is_hidden_and_nothing_bounces_nothing_changes(device):
     """To the bit on CPU; CUDA may join other products and sums where more is compiled in."""
     frame = np.random.default_rng(6).integers(60, 200, (*SIZE_OF_FRAME, 3)).astype(np.uint8)
-    view = View(frame=frame, share=True, bounced=True)
-    got, plain = view.light(cells_of(view, 4, share=1.0, bounced=0.0)), view.light(share=False, bounced=False)
+    view = View(frame=frame, ambient_visibility=True, bounced=True)
+    got = view.light(cells_of(view, 4, share=1.0, bounced=0.0))
+    plain = view.light(ambient_visibility=False, bounced=False)
     unknown = np.full(view.cells(4), -1, np.int32)
     lost = view.light(cells_of(view, 4, share=0.1, share_surface=unknown, bounced=1.0, bounced_surface=unknown))
     for one in (got, lost):
@@ -683,7 +680,7 @@ def full(view, samples=None, strides=(4, 4, 4), rows=None):
     for band in rows or [None]:
         view.share(samples, strides[0], out=share, rows=band)
     cells = relight.ReceiverCells()
-    cells.share, cells.share_surface, cells.share_stride = *share, strides[0]
+    cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride = *share, strides[0]
     patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
     for band in rows or [None]:
         view.send(strides[2], out=patches, cells=cells, rows=band)
@@ -716,11 +713,11 @@ WALL = {**shape(PLANE, (0, 0.2, 0.2), (0.3, 0.2, 0)), "rotation": np.array([[1, 
 
 
 def test_a_lit_floor_lights_the_wall_and_not_itself(device):
-    view = View((DESK, WALL), lights=[SPOT_ON_DESK], share=True, bounced=True, **tilted())
+    view = View((DESK, WALL), lights=[SPOT_ON_DESK], ambient_visibility=True, bounced=True, **tilted())
     light, _, _, bounced, surface = full(view)
     assert (bounced[surface == 0] == 0).all()
     assert (bounced[surface == 8] > 0).mean() > 0.9
-    plain = view.light(share=False, bounced=False)
+    plain = view.light(ambient_visibility=False, bounced=False)
     on_wall = (surface == 8).repeat(4, 0).repeat(4, 1) & (plain.sum(-1) == 0)
     assert (light[on_wall] > 0).mean() > 0.8
     # Patches a quarter as long say the same, but at the edge: a patch next to it is one point.
@@ -733,7 +730,8 @@ def test_a_lit_floor_lights_the_wall_and_not_itself(device):
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 7), (47, 61), (49, 65)])
 def test_any_size(device, size):
     item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], size=size, share=True, bounced=True, **tilted())
+    balls = [ball((0.15, 0, 0.03), 0.03)]
+    view = View((DESK, item), balls, size=size, ambient_visibility=True, bounced=True, **tilted())
     light, share, share_surface, bounced, surface = full(view, strides=(4, 8, 16))
     assert np.isfinite(light).all()
     assert ((share[share_surface >= 0] >= 0) & (share[share_surface >= 0] <= 1)).all()
@@ -743,7 +741,7 @@ def test_any_size(device, size):
 
 def test_bands_and_runs_give_the_same_bits(device):
     item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
-    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], share=True, bounced=True, **tilted())
+    view = View((DESK, item), [ball((0.15, 0, 0.03), 0.03)], ambient_visibility=True, bounced=True, **tilted())
     once, again, bands = full(view), full(view), full(view, rows=[(0, 5), (5, 5), (5, 6), (6, 12)])
     for one, other, third in zip(once, again, bands, strict=True):
         assert one.tobytes() == other.tobytes() == third.tobytes()
@@ -767,7 +765,7 @@ def test_garbage_in_the_environment(device, bad, where):
         samples = wp.array(values, dtype=EnvironmentSample)
     item = box((-0.1, 0.0, 0), (0.1, 0.2, 0.1))
     probes = [ball((0.15, 0, 0.03), 0.03)]
-    view = View((DESK, item), probes, irradiance=irradiance, share=True, bounced=True, **tilted())
+    view = View((DESK, item), probes, irradiance=irradiance, ambient_visibility=True, bounced=True, **tilted())
     light, share, known, bounced, surface = full(view, samples)
     assert ((share[known >= 0] >= 0) & (share[known >= 0] <= 1)).all()
     assert ((bounced[surface >= 0] >= 0) & np.isfinite(bounced[surface >= 0])).all()
@@ -797,7 +795,7 @@ def test_eager_equals_replayed(device, method):
         for name in ("noise", "noise", "white", "ramp", "noise"):
             np.testing.assert_array_equal(replayed.frame(pictures[name]), eager.frame(pictures[name]), err_msg=name)
         assert_same_bits(replayed.written("relight"), eager.written("relight"))
-        assert (eager.get("relight_share_surface") >= 0).any()
+        assert (eager.get("relight_ambient_surface") >= 0).any()
         assert eager.get("relight_bounced").max() > 0
 
 
@@ -811,9 +809,9 @@ def test_nothing_of_an_earlier_frame_is_read(device, method, rect):
         rig.pipeline.inputs.rects["light"] = rect
         found = []
         for old in (-1, 0):
-            for name in ("share", "bounced"):
+            for name, surface in (("ambient_visibility", "ambient_surface"), ("bounced", "bounced_surface")):
                 rig.poke(f"relight_{name}", 7.0)
-                rig.arrays[f"relight_{name}_surface"].fill_(old)
+                rig.arrays[f"relight_{surface}"].fill_(old)
             for name in ("patches", "listed"):
                 values = np.zeros(rig.arrays[f"relight_{name}"].shape, np.dtype(Patch.numpy_dtype()))
                 if old == 0:

@@ -531,7 +531,7 @@ def scattered(kind, count, scatter, *, lamp=None, stains=0):
     light[:stains] *= 0.3
     exact = np.ones((count, 3), bool)
     surface = np.zeros(count, np.int64)
-    return noise.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0]
+    return noise.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0][0]
 
 
 @pytest.mark.parametrize("lamp", [None, (-0.2, 0.1, 0.4)])

@@ -15,10 +15,22 @@ from warp_ar.kernels.reflect import (
     DistantLightConfig,
     make_distant_irradiance,
     make_find_in_frame,
-    make_mirrored,
+    make_reflected_radiance,
 )
-from warp_ar.kernels.structs import BOX, LAMBERT, MIRROR, PLANE, Emitter, FrameParams, Probe, RayScene, Shape
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.structs import (
+    BOX,
+    LAMBERT,
+    MIRROR,
+    PLANE,
+    Emitter,
+    FrameParams,
+    Picture,
+    Probe,
+    RayScene,
+    Shape,
+    make_picture,
+)
+from warp_ar.kernels.visibility import Hit, TraceConfig
 
 FOCAL = 60.0
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
@@ -34,6 +46,7 @@ def make_find_kernel(probes):
     def find_kernel(
         # In:
         params: wp.array[FrameParams],
+        picture: Picture,
         scene: RayScene,
         balls: wp.array[Probe],
         points: wp.array[wp.vec3],
@@ -42,7 +55,10 @@ def make_find_kernel(probes):
         found_out: wp.array[wp.vec2],
     ):
         i = wp.tid()
-        found_out[i] = find_in_frame(params[0], wp.static(H), wp.static(W), scene, balls, points[i], normals[i])
+        hit = Hit()
+        hit.point = points[i]
+        hit.geometric_normal = normals[i]
+        found_out[i] = find_in_frame(params[0], picture, scene, balls, hit)
 
     return find_kernel
 
@@ -72,6 +88,7 @@ def find(points, normals, scale=1.0, shift=(0.0, 0.0, 0.0), proxies=(), ball=Non
         dim=len(points),
         inputs=[
             camera,
+            make_picture(wp.zeros((H, W), wp.vec3ub), None, None),
             scene,
             records(Probe, *balls),
             wp.array((scale * np.array(points) + shift).astype(np.float32), dtype=wp.vec3),
@@ -133,7 +150,7 @@ LEVEL_HEIGHT = 16
 @functools.cache
 def make_environment_kernel(lamps):
     config = DistantLightConfig(TraceConfig((), ()), (LAMBERT, MIRROR), False, "sh", True, False, lamps)
-    mirrored, irradiance = make_mirrored(config), make_distant_irradiance(config)
+    mirrored, irradiance = make_reflected_radiance(config), make_distant_irradiance(config)
 
     @wp.kernel(module="unique", enable_backward=False)
     def environment_kernel(
@@ -165,7 +182,7 @@ def test_near_lamps_are_mirrored_and_light_from_where_they_are(device):
     surroundings.irradiance_sh = wp.zeros(9, wp.vec3)  # of which more than there is cannot be taken
     surroundings.levels, surroundings.level_height = wp.array(packed, dtype=wp.vec3), LEVEL_HEIGHT
     lamp = {"direction": direction, "distance": distance, "power": 3 * [power]}
-    surroundings.lamps = records(Emitter, lamp)
+    surroundings.emitters = records(Emitter, lamp)
     aside = np.array([0.25, 0.2, 0.0])
     there = (LAMP_AT - aside) / np.linalg.norm(LAMP_AT - aside)
 

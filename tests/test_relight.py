@@ -21,6 +21,7 @@ from warp_ar.kernels.structs import (
     Probe,
     RayScene,
     Shape,
+    make_picture,
 )
 from warp_ar.kernels.visibility import TraceConfig
 
@@ -104,21 +105,15 @@ def run(
     if irradiance_map is not None:
         surroundings = wp.array(irradiance_map, dtype=wp.vec3)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    relight.relight(
+    receiver = relight.make_receiver(
         config,
-        params,
-        wp.array(RAYS, dtype=wp.vec2),
-        frame_array,
-        tables()[0],
-        table,
-        scene,
-        records(Probe, *probes),
-        records(Light, *lights),
-        keys,
-        surroundings,
-        out,
-        rows=rows,
+        make_picture(frame_array, tables()[0], wp.array(RAYS, dtype=wp.vec2)),
+        table=table,
+        probes=records(Probe, *probes),
+        key_lights=keys,
+        irradiance=surroundings,
     )
+    relight.relight(config, params, scene, records(Light, *lights), receiver, out, rows=rows)
     return out.numpy()
 
 
@@ -157,18 +152,24 @@ def run_edges(
     summed_area.sum_area(frame, table)
     keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
     rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
-    known = frame, tables()[0], table
-    balls, lamps = records(Probe, *probes), records(Light, *lights)
-    surroundings = wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3)
-    out, seen = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
-    relight.relight(config, params, rays, *known, scene, balls, lamps, keys, surroundings, out, seen)
+    receiver = relight.make_receiver(
+        config,
+        make_picture(frame, tables()[0], rays),
+        table=table,
+        probes=records(Probe, *probes),
+        key_lights=keys,
+        irradiance=wp.array(constant_environment((1, 1, 1)), dtype=wp.vec3),
+    )
+    inputs = config, params, scene, records(Light, *lights), receiver
+    out, visibility = wp.zeros((height, width), dtype=wp.vec3), wp.zeros((height, width), dtype=wp.int32)
+    relight.relight(*inputs, out, visibility)
     if samples > 1:
-        desk, lists = relight.make_receiver(config, *known, balls, keys, surroundings), None
+        lists = None
         if listed:
             sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
             lists = EdgeLists(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
         for band in rows or (None,):
-            relight.smooth_edges(config, params, rays, scene, lamps, desk, seen, out, edge_lists=lists, rows=band)
+            relight.smooth_edges(*inputs, visibility, out, edge_lists=lists, rows=band)
     return out.numpy()
 
 
@@ -626,25 +627,24 @@ def test_nearer_to_the_truth_method_by_method(device, shared):
     frame, table = wp.array(camera, dtype=wp.vec3ub), wp.zeros((height, width), wp.uint32)
     summed_area.sum_area(frame, table)
     decode_table = color.decode_table("srgb")
+    rays = wp.array(pixel_rays(scene.camera), dtype=wp.vec2)
+    picture = make_picture(frame, wp.array(decode_table, dtype=wp.vec3), rays)
     before, wanted = (reference_color.decode(decode_table, image) for image in (camera, truth))
     changed = np.abs(wanted - before).max(-1) > 0.05
     left = {}
     for method in relight.METHODS:
         added = wp.zeros((height, width), wp.vec3)
-        relight.relight(
-            relight.RelightConfig(method, trace_config(scene), "sh", True),
-            records(FrameParams, {**params, "light_rect": (0, height, 0, width)}),
-            wp.array(pixel_rays(scene.camera), dtype=wp.vec2),
-            frame,
-            wp.array(decode_table, dtype=wp.vec3),
-            table,
-            host.ray_scene,
-            records(Probe, {"center": probe.center, "radius": probe.radius}),
-            wp.array(lights, dtype=Light),
-            records(KeyLight, {"direction": direction, "directionality": directionality}),
-            wp.array(sh, dtype=wp.vec3),
-            added,
+        config = relight.RelightConfig(method, trace_config(scene), "sh", True)
+        receiver = relight.make_receiver(
+            config,
+            picture,
+            table=table,
+            probes=records(Probe, {"center": probe.center, "radius": probe.radius}),
+            key_lights=records(KeyLight, {"direction": direction, "directionality": directionality}),
+            irradiance=wp.array(sh, dtype=wp.vec3),
         )
+        place = records(FrameParams, {**params, "light_rect": (0, height, 0, width)})
+        relight.relight(config, place, host.ray_scene, wp.array(lights, dtype=Light), receiver, added)
         got = np.minimum(before + added.numpy(), 1.0)
         left[method] = np.abs(got - wanted)[changed].mean() / np.abs(before - wanted)[changed].mean()
     assert left["directional"] < left["flat"]

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 import threading
 import types
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,7 +19,7 @@ import warp as wp
 from warp_ar.engine import graph
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.scheduler import Scheduler, _in_launch_order
-from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.launch import copy, launch, launch_rows
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.quality import PRESETS
@@ -144,11 +148,11 @@ def test_alone_it_stays_on_the_callers_thread(monkeypatch: pytest.MonkeyPatch) -
     arrays = inputs("cpu")
     scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), arrays, wp.get_device("cpu"), bands=3)
     threads = []
-    launch_band = scheduler._launch_band
+    launch = scheduler._launch
     monkeypatch.setattr(
         scheduler,
-        "_launch_band",
-        lambda step, rows: (threads.append(threading.get_ident()), launch_band(step, rows)),
+        "_launch",
+        lambda step, rows: (threads.append(threading.get_ident()), launch(step, rows)),
     )
     clock = scheduler.clock
     ticks = itertools.count()
@@ -158,9 +162,11 @@ def test_alone_it_stays_on_the_callers_thread(monkeypatch: pytest.MonkeyPatch) -
     assert threads == [threading.get_ident()] * 2, "each pass whole"
     np.testing.assert_array_equal(arrays["b"].numpy(), 2)
     assert scheduler.clock is clock
+    arrays["frame"].fill_(5)
     arrays.touch("frame")
     scheduler.run()
-    assert len(threads) > 4, "in bands again"
+    assert len(threads) == 2, "native threads again"
+    np.testing.assert_array_equal(arrays["b"].numpy(), 7)
     scheduler.close()
 
 
@@ -188,6 +194,107 @@ def test_a_failing_band_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RuntimeError, match="broken band"):
         scheduler.run()
     scheduler.close()
+
+
+def test_after_a_failing_step_the_next_frame_makes_up_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What had not failed may have run or not: all of it runs again."""
+    broken = [True]
+
+    class Failing(AddOne):
+        name, source, target = "fails", "a", "b"
+
+        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+            def check(rows: tuple[int, int] | None) -> None:
+                if broken[0]:
+                    raise RuntimeError("broken step")
+
+            return [Pass(check, on_host=True), *super().build(arrays, device)]
+
+    arrays = inputs("cpu")
+    plan = plan_of(monkeypatch, (*chain("a"), Failing), ("b",))
+    scheduler = Scheduler(plan, arrays, wp.get_device("cpu"), bands=2)
+    for _ in range(3):
+        with pytest.raises(RuntimeError, match="broken step"):
+            scheduler.run()
+    broken[0] = False
+    assert run_count(scheduler.run()) == 2
+    np.testing.assert_array_equal(arrays["b"].numpy(), 2)
+    scheduler.close()
+
+
+def test_a_pass_of_several_launches_and_copies_keeps_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Split into bands, whole, with a copy: on native threads as one after another."""
+
+    class Many(AddOne):
+        name, source, target = "many", "frame", "a"
+
+        def arrays(self) -> Mapping[str, ArraySpec]:
+            return {**super().arrays(), "many_scratch": ArraySpec((SIZE,), wp.int32)}
+
+        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+            scratch, target = arrays["many_scratch"], arrays["a"]
+
+            def twice(rows: tuple[int, int] | None) -> None:
+                launch_rows(add_one_kernel, (SIZE,), [arrays["frame"]], [scratch], rows=rows, device=device)
+                launch_rows(add_one_kernel, (SIZE,), [scratch], [target], rows=rows, device=device)
+
+            def whole(rows: tuple[int, int] | None) -> None:
+                launch(add_one_kernel, SIZE, [0, target], [scratch], device=device)
+
+            return [Pass(twice, rows=SIZE), Pass(whole), Pass(lambda rows: copy(target, scratch), rows=SIZE)]
+
+    for bands in (1, 2, 5, None):
+        arrays = inputs("cpu")
+        arrays["frame"].assign(np.arange(SIZE, dtype=np.int32))
+        scheduler = Scheduler(plan_of(monkeypatch, (Many,), ("a",)), arrays, wp.get_device("cpu"), bands=bands)
+        for _ in range(50):
+            arrays.touch("frame")
+            arrays["a"].zero_()
+            scheduler.run()
+            np.testing.assert_array_equal(arrays["a"].numpy(), np.arange(SIZE) + 3)
+        scheduler.close()
+
+
+def test_rows_that_are_not_due_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [(5, 11)]
+
+    class Part(AddOne):
+        name, source, target = "part", "frame", "a"
+
+        def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+            (add,) = super().build(arrays, device)
+            return [Pass(add.launch, rows=SIZE, extent=lambda: rows[0])]
+
+    for bands in (1, 3, None):
+        arrays = inputs("cpu")
+        scheduler = Scheduler(plan_of(monkeypatch, (Part,), ("a",)), arrays, wp.get_device("cpu"), bands=bands)
+        for rows[0] in ((5, 11), (20, 20), (0, SIZE), (36, 37)):
+            arrays.touch("frame")
+            arrays["a"].zero_()
+            scheduler.run()
+            expected = np.zeros(SIZE, np.int32)
+            expected[slice(*rows[0])] = 1
+            np.testing.assert_array_equal(arrays["a"].numpy(), expected)
+        scheduler.close()
+
+
+def test_progress_counts_what_is_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """First 0 of all, in the end all; a second scheduler of the kind finds everything and says nothing."""
+    script = """
+import warp as wp
+from warp_ar.device import resolve_device
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.scene import load_scene
+device = resolve_device("cpu")
+for _ in range(2):
+    said = []
+    with Pipeline(load_scene("mirror"), device="cpu", quality="paper", bands=2) as pipeline:
+        pipeline.warm_up(lambda done, total: said.append((done, total)))
+    print([done for done, _ in said] == list(range(len(said))), len(said) > 5, {total - len(said) for _, total in said})
+"""
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path)}
+    run = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines() == ["True True {-1}", "True False set()"]
 
 
 def test_two_owners_of_one_resource_are_an_error() -> None:

@@ -18,7 +18,7 @@ from warp_ar.kernels.prefilter import integrate_dfg, lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig, shade
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
-from warp_ar.kernels.visibility import Hit, TraceConfig, trace_pixels
+from warp_ar.kernels.visibility import Hit, TraceConfig, make_visible, trace_pixels
 
 SIZE = (48, 64)
 FOCAL = 60.0
@@ -110,19 +110,19 @@ def render(
     params = wp.array(params, dtype=structs.FrameParams, device=device)
     rays = wp.array(pixel_rays().astype(np.float32), dtype=wp.vec2, device=device)
     found = wp.zeros(SIZE, dtype=wp.int32, device=device)
-    depth = wp.zeros(SIZE, dtype=wp.float32, device=device)
     hits = wp.zeros(SIZE, dtype=Hit, device=device)
     virtual = wp.full(SIZE, wp.vec4(9.0), dtype=wp.vec4, device=device)
     surroundings = make_distant_light(config.distant.models, device, light_environment)
     light_array = lights(device=device) if light_array is None else light_array
-    trace_pixels(config.distant.trace, params, rays, scene, found, depth, hits)
+    visible = make_visible(found, hits)
+    trace_pixels(config.distant.trace, params, rays, scene, visible)
     lists = None
     if listed:
         samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
         count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
         lists = EdgeLists(count, edges, samples)
     for rows in bands:
-        inputs = (params, rays, scene, light_array, surroundings, found, hits)
+        inputs = (params, rays, scene, light_array, surroundings, visible)
         shade(config, *inputs, virtual, edge_lists=lists, rows=rows)
     return virtual.numpy()
 

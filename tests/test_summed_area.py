@@ -85,15 +85,21 @@ def test_matches_twin(device, size):
     check_error("summed_area", make_table(frame).numpy(), reference.sum_area(frame))
 
 
-def test_bands_give_the_same_table(device):
-    frame = wp.array(random_frame(50, 333), dtype=wp.vec3ub)
-    whole, banded = wp.zeros((50, 333), wp.uint32), wp.zeros((50, 333), wp.uint32)
-    summed_area.sum_area(frame, whole)
-    for band in ((0, 13), (13, 13), (13, 50)):
-        summed_area.sum_along_rows(frame, banded, rows=band)
-    for band in ((0, 1), (1, 200), (200, 333)):
-        summed_area.sum_along_columns(banded, columns=band)
-    np.testing.assert_array_equal(banded.numpy(), whole.numpy())
+# One slab and several, of one height and of two; rows of whole vectors, with a rest, and of a rest alone.
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (50, 333), (97, 15), (480, 640), (130, 48)])
+@pytest.mark.parametrize("threads", [1, 2, 3, 16])
+def test_slabs_match_twin(device, size, threads):
+    """In any bands of slabs, over what a table and its ends held before."""
+    frame = random_frame(*size)
+    shape = summed_area.slab_shape(*size, threads)
+    assert 1 <= shape[0] <= threads
+    table, ends = wp.full(size, 7, dtype=wp.uint32), wp.full(shape, 7, dtype=wp.uint32)
+    for band in ((0, 1), (1, 1), (1, shape[0])):
+        summed_area.sum_slabs(wp.array(frame, dtype=wp.vec3ub), table, ends, rows=band)
+    summed_area.add_ends(ends)
+    for band in ((0, shape[0] // 2), (shape[0] // 2, shape[0] - 1)):
+        summed_area.join_slabs(ends, table, rows=band)
+    np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
 
 
 def test_boxes_match_brute_force(device):

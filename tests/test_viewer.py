@@ -6,10 +6,14 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
+import gc
 import json
 import math
 import random
+import signal
 import struct
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -21,6 +25,7 @@ import aiohttp
 import cv2
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.test_budget import even_costs
 from tests.test_pipeline import make_scene
@@ -44,6 +49,7 @@ from warp_ar.scene import (
     Scene,
     SourceSpec,
     bundled_scenes,
+    dumps_scene,
     load_calibration,
     load_scene,
     loads_scene,
@@ -59,7 +65,7 @@ from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
-from warp_ar.viewer.lighting import make_target
+from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
 from warp_ar.viewer.server import MOST_VIEWERS, Address, Server, encode_jpeg, own_address
 
@@ -577,6 +583,28 @@ def test_numbers_are_edited_in_place_and_structure_is_swapped_in() -> None:
         assert ids == list(range(1, len(ids) + 1))
 
 
+def test_changes_of_quality_leave_no_arrays_behind() -> None:
+    """Even without the garbage collector; ``bench page`` watches the whole process over a thousand changes."""
+
+    def arrays(running: Running, quality: str) -> int:
+        running.edit(type="quality", name=quality)
+        running.until(lambda: running.settled and running.host.plan_message()["quality"] == quality)
+        running.next()
+        running.host._lighting.builder.submit(lambda: None).result()  # what was replaced has gone by now
+        return sum(isinstance(one, wp.array) for one in gc.get_objects())
+
+    gc.collect()
+    gc.disable()
+    try:
+        with Running(page_scene()) as running:
+            first = [arrays(running, quality) for quality in ("paper", "low")]
+            for _ in range(3):
+                last = [arrays(running, quality) for quality in ("paper", "low")]
+            assert max(last) <= max(first)
+    finally:
+        gc.enable()
+
+
 def test_pipelines_are_built_while_frames_flow(device: str) -> None:
     """On CUDA one thread captures and replays graphs while another allocates, uploads and loads kernels."""
     with Running(page_scene(), device=device) as running:
@@ -645,6 +673,75 @@ def test_without_viewers_nothing_is_lit() -> None:
         time.sleep(0.5)
         assert len(running.frames) == count
         running.host.watch(1)
+        running.next()
+
+
+def test_the_camera_is_shown_until_something_is_built_and_the_cheapest_plan_comes_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    go_on = {"low": threading.Event(), "medium": threading.Event()}
+    loaded = Lighting._warm_up
+
+    def wait(self: Lighting, pipeline: Pipeline) -> None:
+        loaded(self, pipeline)
+        assert go_on[pipeline.quality.name].wait(PATIENCE)
+
+    monkeypatch.setattr(Lighting, "_warm_up", wait)
+    running = Running(page_scene(), quality="medium")
+    running.host.watch(1)
+    running.thread.start()
+    try:
+        plain = running.next()
+        assert plain.plan == 0
+        assert plain.image is plain.frame, "somebody pretends to have lit it"
+        assert running.host.state_message()["building"]["quality"] == "low"
+        assert running.host.plan_message()["run"] == []
+        go_on["low"].set()
+        running.until(lambda: running.frames[-1].plan == 1)
+        assert running.host.plan_message()["quality"] == "low"
+        running.next()
+        assert not running.settled, "it says that it is done"
+        assert running.host.state_message()["building"]["quality"] == "medium"
+        go_on["medium"].set()
+        running.until(lambda: running.settled)
+        assert running.host.plan_message()["quality"] == "medium"
+        assert [m["quality"] for m in running.messages if m["type"] == "plan"] == ["low", "medium"]
+    finally:
+        for event in go_on.values():
+            event.set()
+        running.__exit__()
+
+
+def test_a_frame_that_is_refused_is_told_and_the_next_one_is_lit(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Running(page_scene()) as running:
+        light, refused = Pipeline.__call__, threading.Event()
+
+        def refuse(self: Pipeline, *arguments: Any, **options: Any) -> Any:
+            if not refused.is_set():
+                raise UsageError("frame 7 has an exposure that was not announced")
+            return light(self, *arguments, **options)
+
+        monkeypatch.setattr(Pipeline, "__call__", refuse)
+        running.until(lambda: running.frames[-1].plan == 0)
+        running.next(5)
+        notices = [message["text"] for message in running.messages if message["type"] == "notice"]
+        assert notices == ["frame 7 has an exposure that was not announced"], "once, not with every frame"
+        refused.set()
+        running.until(lambda: running.frames[-1].plan > 0)
+
+
+def test_what_cannot_be_built_is_undone_and_told() -> None:
+    with Running(page_scene()) as running, pytest.MonkeyPatch.context() as patch:
+
+        def fail(self: Lighting, pipeline: Pipeline) -> None:
+            raise RuntimeError("Failed to allocate 10 GB")
+
+        patch.setattr(Lighting, "_warm_up", fail)
+        running.edit(type="quality", name="paper")
+        running.until(lambda: any(message["type"] == "notice" for message in running.messages))
+        assert "'paper' cannot run here" in next(m["text"] for m in running.messages if m["type"] == "notice")
+        running.until(lambda: running.settled)
+        assert running.host.wanted().quality.name == "low"
         running.next()
 
 
@@ -1150,6 +1247,83 @@ def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixtu
     arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
     assert live.main(arguments) == 0
     assert "http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_names_do_not_reach_the_terminal_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataclasses.replace(load_scene("desk"), name="d\x1b]0;owned\x07esk")
+    (tmp_path / "scene.toml").write_text(dumps_scene(scene))
+    arguments = [str(tmp_path / "scene.toml"), "--device", "cpu", "--quality", "low"]
+    assert live.main([*arguments, "--port", "0", "--no-browser", "--frames", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "http://127.0.0.1:" in out
+    assert "\x1b" not in out
+    assert "\x07" not in out
+
+
+# The command, with frames that take ten minutes each.
+ENDLESS = """
+import sys, time
+from warp_ar.engine.pipeline import Pipeline
+def light(self, *arguments, **options):
+    print("lighting", flush=True)
+    time.sleep(600)
+Pipeline.__call__ = light
+from warp_ar.live import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_ctrl_c_does_not_wait_for_the_frame_in_hand() -> None:
+    command = [sys.executable, "-c", ENDLESS, "desk", "--device", "cpu", "--quality", "low", "--port", "0"]
+    with subprocess.Popen(
+        [*command, "--no-browser", "--frames", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert "http://" in process.stdout.readline()
+        assert process.stdout.readline() == "lighting\n"
+        process.send_signal(signal.SIGINT)
+        try:
+            _, errors = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert errors == ""
+
+
+@run
+async def test_the_page_is_there_before_anything_is_built() -> None:
+    go_on = threading.Event()
+
+    def make(**callbacks: Any) -> Host:
+        assert go_on.wait(PATIENCE)
+        return Host(page_scene(), device="cpu", quality="low", **callbacks)
+
+    ready: asyncio.Event = asyncio.Event()
+    server = Server(make, Address(port=0))
+    task = asyncio.create_task(server.serve(lambda _: ready.set()))
+    try:
+        await ready.wait()
+        async with aiohttp.ClientSession() as session:
+            for path in ("", "static/app.js"):
+                async with session.get(server.address.url + path) as response:
+                    assert response.status == 200
+            connecting = asyncio.create_task(session.ws_connect(f"{server.address.url}live", max_msg_size=1 << 24))
+            await asyncio.sleep(0.2)
+            go_on.set()
+            async with await connecting as socket:
+                await Page(socket).until("frame")
+    finally:
+        go_on.set()
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+@run
+async def test_a_host_that_cannot_be_built_ends_the_server_with_its_reason() -> None:
+    make = functools.partial(Host, dataclasses.replace(page_scene(), source=None), device="cpu")
+    with pytest.raises(UsageError, match="names no source"):
+        await Server(make, Address(port=0)).serve()
 
 
 def test_errors_are_one_of_ours() -> None:

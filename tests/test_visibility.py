@@ -11,7 +11,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import visibility as reference
 from warp_ar.kernels import structs
-from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, make_trace, offset_origin, trace_pixels
+from warp_ar.kernels.visibility import FAR, Hit, TraceConfig, make_trace, make_visible, offset_origin, trace_pixels
 from warp_ar.scene.geometry import Mesh, rotation_matrix, smooth_normals
 from warp_ar.scene.ray_scene import make_ray_mesh
 from warp_ar.scene.shapes import sphere_mesh, torus_mesh
@@ -434,35 +434,35 @@ def camera(device, *, rect, eye=(0.0, 0.0, 0.0), size=(48, 64), focal=60.0):
 def frame_of(scene, device, *, rect, bands=(None,)):
     params, rays = camera(device, rect=rect)
     found = wp.full(rays.shape, 7, dtype=wp.int32, device=device)
-    depth = wp.zeros(rays.shape, dtype=wp.float32, device=device)
     hits = wp.zeros(rays.shape, dtype=Hit, device=device)
     for rows in bands:
-        trace_pixels(GENERAL, params, rays, scene, found, depth, hits, rows=rows)
-    return found.numpy(), depth.numpy(), hits.numpy()
+        trace_pixels(GENERAL, params, rays, scene, make_visible(found, hits), rows=rows)
+    return found.numpy(), hits.numpy()
 
 
 def test_frame(device):
-    """Depth is along the camera's axis; outside the rectangle nothing is found; bands make the whole."""
+    """t is the depth along the camera's axis; outside the rectangle nothing is found; bands make the whole."""
     scene = World(device).add("sphere", extent=(0.5, 0.5, 0.5), at=(0, 0, 2)).add("box", at=(0, 0, 5), extent=(9, 9, 1))
     scene = scene.scene()
-    found, depth, hits = frame_of(scene, device, rect=(0, 48, 0, 64))
+    found, hits = frame_of(scene, device, rect=(0, 48, 0, 64))
+    depth = hits["t"]
     assert set(np.unique(found)) == {0, 1}
     np.testing.assert_allclose(depth[found == 1], 4.0, rtol=1e-6)
     assert depth[24, 32] == pytest.approx(1.5, abs=1e-3)
-    np.testing.assert_allclose(hits["point"][..., 2], depth, rtol=1e-5)
+    seen = found >= 0
+    np.testing.assert_allclose(hits["point"][seen, 2], depth[seen], rtol=1e-5)
     # The ball's outline: half angle asin(0.5 / 2), area pi (60 tan)^2.
     assert (found == 0).sum() == pytest.approx(np.pi * (60 * np.tan(np.arcsin(0.25))) ** 2, rel=0.02)
 
-    part, part_depth, _ = frame_of(scene, device, rect=(10, 20, 30, 40))
+    part, _ = frame_of(scene, device, rect=(10, 20, 30, 40))
     outside = np.ones(part.shape, bool)
     outside[10:20, 30:40] = False
     assert (part[outside] == -1).all()
-    assert np.isposinf(part_depth[outside]).all()
     np.testing.assert_array_equal(part[~outside], found[~outside])
 
-    banded, banded_depth, _ = frame_of(scene, device, rect=(0, 48, 0, 64), bands=((0, 11), (11, 40), (40, 48)))
+    banded, banded_hits = frame_of(scene, device, rect=(0, 48, 0, 64), bands=((0, 11), (11, 40), (40, 48)))
     np.testing.assert_array_equal(banded, found)
-    np.testing.assert_array_equal(banded_depth, depth)
+    np.testing.assert_array_equal(banded_hits, hits)
 
 
 def test_proxies_hide_what_is_behind_them(device):
@@ -472,10 +472,9 @@ def test_proxies_hide_what_is_behind_them(device):
         screen = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 1), rotate=(turn, 0, 0))
         scene = world.scene()
         scene.proxies = screen.scene(proxies=True).proxies
-        found, depth, _ = frame_of(scene, device, rect=(0, 48, 0, 64))
+        found, _ = frame_of(scene, device, rect=(0, 48, 0, 64))
         assert (found == -1).all() == hidden
-        assert np.isposinf(depth).all()
     touching = World(device).add("box", at=(0, 0, 3), extent=(1, 1, 1)).scene()
     touching.proxies = World(device).add("plane", extent=(9, 9, 0), at=(0, 0, 2)).scene(proxies=True).proxies
-    found, _, _ = frame_of(touching, device, rect=(0, 48, 0, 64))
+    found, _ = frame_of(touching, device, rect=(0, 48, 0, 64))
     assert found[24, 32] == 0

@@ -29,6 +29,7 @@ from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
 from warp_ar.input.response import measure_response, write_response
 from warp_ar.input.sources import open_source
+from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import Marker, load_scene, loads_scene
 
 Image = NDArray[np.uint8]
@@ -75,6 +76,8 @@ def make_parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         if output is not None:
             command.add_argument("--output", type=Path, default=Path(output), metavar="FILE", help=f"default: {output}")
+            text = "replace a file that this program did not write; one that it wrote is replaced anyway"
+            command.add_argument("--overwrite", action="store_true", help=text)
         return command.add_argument
 
     board = 'a board, as in a scene: "charuco 7x5 0.03 0.022" or "grid 4x3 0.04 0.01", lengths in metres'
@@ -136,7 +139,17 @@ def _run_ball(options: argparse.Namespace) -> None:
             say(f"probe {index}: little contrast at the ball's rim ({report.contrast:.0%}); check the result")
 
 
+def _check_output(options: argparse.Namespace) -> None:
+    """Say what is replaced; nothing is written over what is read, or over what is somebody else's unasked."""
+    pictures = [Path(path) for path in getattr(options, "pictures", ())]
+    check_places({"the picture": pictures}, {"--output": options.output})
+    if replaced := check_replaceable(options.output, overwrite=options.overwrite):
+        say(replaced)
+
+
 def _run(options: argparse.Namespace) -> int:
+    if options.command != "ball":
+        _check_output(options)
     if options.command == "card":
         write_card(_marker(options), options.output, options.paper, options.dpi)
         print(f"{options.output}: print at 100 %, without fitting to the page, and check that the bar is 100 mm")

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import faulthandler
+import gc
 import itertools
 import json
 import os
@@ -16,16 +17,16 @@ import time
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
 from warp_ar.command_line import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_TERMINATED,
+    EXIT_USAGE,
     Parser,
     Terminated,
     handling,
@@ -34,13 +35,17 @@ from warp_ar.command_line import (
 )
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
-from warp_ar.output.places import PROGRAM, check_places, check_replaceable, files_of
-from warp_ar.output.report import RunLog, print_plan
+from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_scene
-from warp_ar.session import Session, calibrated, with_light
-from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
+from warp_ar.signature import PROGRAM
+from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
+
+if TYPE_CHECKING:
+    from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.output.report import RunLog
+    from warp_ar.session import Session
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -199,6 +204,7 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.session import calibrated, with_light
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -229,8 +235,13 @@ def serve_page(options: argparse.Namespace) -> int:
 
     def make_host(**callbacks: Any) -> Any:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
+        from warp_ar.device import bound_arenas
         from warp_ar.viewer.host import Host
 
+        bound_arenas()
+        # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+        gc.collect()
+        gc.freeze()
         return Host(
             scene,
             source=options.source,
@@ -256,13 +267,17 @@ def serve_page(options: argparse.Namespace) -> int:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
     except KeyboardInterrupt as error:
         code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
-    finally:
-        if not server.ended:
-            # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped: threads
-            # would be waited for at the end of Python. All files are closed and temporary folders gone by now.
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
+    except WarpArError as error:
+        if server.ended:
+            raise
+        say(error)
+        code = EXIT_USAGE
+    if not server.ended:
+        # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
+        # would wait for its thread. All files are closed and temporary folders gone by now.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     return code
 
 
@@ -295,6 +310,25 @@ def _ball_report(scene: Scene, session: Session) -> dict[str, Any]:
     return {"balls": found} if found else {}
 
 
+def _compile(session: Session, *, shown: bool) -> None:
+    """Have the kernels ready, with a bar where some must be compiled."""
+    words = TextColumn("compiling kernels, once for this kind of scene")
+    bar = Progress(words, BarColumn(), MofNCompleteColumn(), disable=not shown)
+    task: TaskID | None = None
+
+    def tell(done: int, total: int) -> None:
+        nonlocal task
+        if task is None:
+            bar.start()
+            task = bar.add_task("compile", total=total)
+        bar.update(task, completed=done)
+
+    try:
+        session.warm_up(tell)
+    finally:
+        bar.stop()
+
+
 def _has_display() -> bool:
     """Whether a browser can open a window here."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -319,6 +353,10 @@ def run(options: argparse.Namespace) -> int:
 
 def light_clip(options: argparse.Namespace) -> int:
     """Light a source's frames without a page, and write what options name."""
+    # Here, for they load Warp: the page is to be there before.
+    from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.output.report import RunLog, print_plan
+
     scene = load_scene(options.scene)
     _check_places(options, scene)
     outputs, replaced = ["image"], []
@@ -336,6 +374,7 @@ def light_clip(options: argparse.Namespace) -> int:
             stack.enter_context(lights)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
+        _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()
         if options.output is not None:
@@ -346,7 +385,7 @@ def light_clip(options: argparse.Namespace) -> int:
                 say(words)
         log = RunLog(session.pipeline)
         try:
-            with lights or NullSink(), sink, handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"):
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
                 _light_frames(options, session, log, sink, lights, stop)
             if log.count < MARKER_PATIENCE and stop.code is None:
                 _check_marker(log, session.scene, live=source.live)
@@ -371,6 +410,8 @@ def light_clip(options: argparse.Namespace) -> int:
 
 
 def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str, ...]) -> Session:
+    from warp_ar.session import Session
+
     return Session(
         scene,
         source=options.source,

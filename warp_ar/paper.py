@@ -84,7 +84,7 @@ def write_figure(figure: PaperFigure, out: Path) -> str:
 
 def reading_rows(context: Context, progress: WorkProgress) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """The table of readings."""
-    found = compare_readings(context, advance=lambda text: progress.advance(text, 0.25))
+    found = compare_readings(context, advance=lambda text: progress.advance(text, 0.3))
     head = ("section", "open", "reading", *(f"`{scene}`" for scene in READING_SCENES))
     rows = [
         (

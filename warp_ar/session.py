@@ -8,15 +8,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, AutoPipeline
-from warp_ar.engine.pipeline import Pipeline, Result
+from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.engine.modules import Progress
+from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
+from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
 from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.stages.quality import DEFAULT_PRESET, Quality
+from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
 
 
 def _where(spec: SourceSpec) -> str | int | Path:
@@ -119,6 +121,7 @@ class Session:
             if refine_ball:
                 self.scene, self.ball_fits = refine_balls(self.scene, self.source)
             self.pipeline: Pipeline | AutoPipeline
+            self._switcher: PipelineSwitcher | None = None
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
                 self.pipeline = AutoPipeline(
@@ -131,16 +134,14 @@ class Session:
                     shown=shown,
                 )
             else:
-                self.pipeline = Pipeline(
-                    self.scene,
-                    device=device,
-                    quality=quality,
-                    size=self.source.size,
-                    outputs=outputs,
-                    exposures=self.source.exposures,
-                    shown=shown,
-                    synchronous=not self.source.live,
+                # The pipeline before a change is kept: results that were handed out may still be read.
+                self._switcher = PipelineSwitcher(
+                    device=device, keep=1, profile=False, synchronous=not self.source.live
                 )
+                self._target = Target(
+                    self.scene, resolve_quality(quality), self.source.size, outputs, self.source.exposures, shown
+                )
+                self.pipeline = self._switcher.open(self._target)
         except BaseException:
             self.source.close()
             raise
@@ -156,7 +157,43 @@ class Session:
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""
         self.source.close()
-        self.pipeline.close()
+        if self._switcher is None:
+            self.pipeline.close()
+        else:
+            self._switcher.close()
+
+    def change(self, *, scene: Scene | None = None, quality: str | Quality | None = None) -> None:
+        """Light the frames to come with another scene or quality; source, light and clock go on.
+
+        What differs in numbers alone, such as where an object is, takes effect at once. For all else a pipeline is
+        built, here and now; ``warp_ar.engine.switcher.PipelineSwitcher`` builds it beside the frames.
+
+        Args:
+            scene: What to show; None leaves it.
+            quality: A preset's name or a value; None leaves it.
+
+        Raises:
+            UsageError: The session keeps to a budget, or the quality is none or cannot run here.
+            SceneError: The scene's camera does not fit the source.
+        """
+        if self._switcher is None:
+            raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
+        target = dataclasses.replace(
+            self._target,
+            scene=self._target.scene if scene is None else scene,
+            quality=self._target.quality if quality is None else resolve_quality(quality),
+        )
+        pipeline = self._switcher.follow(target, wait=True)
+        assert pipeline is not None
+        self._target, self.scene, self.pipeline = target, target.scene, pipeline
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Compile and load what the frames need; left out, the first frame does it.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be.
+        """
+        self.pipeline.warm_up(progress)
 
     def _frames(self) -> Iterator[Frame]:
         """The source's frames; notes what they are waited for."""
@@ -174,14 +211,14 @@ class Session:
         kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
-                yield frame, pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
         try:
             for frame in self._frames():
-                result = pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                result = self.pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
                 ready.append((frame, result))
                 if len(ready) > 1:
                     yield ready.pop(0)

@@ -7,43 +7,52 @@ runs the twin tests, which note every comparison's worst error, and prints the l
 
 from __future__ import annotations
 
+import ast
 import json
+import pathlib
 import sys
 
 import pytest
 
 from tests.error_model import worst
 
-TWINS = (
-    "tests/test_unwrap.py::test_corners_match_twin",
-    "tests/test_unwrap.py::test_gather_matches_twin",
-    "tests/test_accumulate.py::test_accumulation_matches_twin",
-    "tests/test_fill.py::test_fill_matches_twin",
-    "tests/test_key_lights.py::test_irradiance_is_that_of_a_facing_surface",
-    "tests/test_bracket.py::test_twin",
-    "tests/test_recover.py::test_transfer_agrees_with_its_twin",
-    "tests/test_irradiance.py::test_projection_is_the_twin_s",
-    "tests/test_irradiance.py::test_the_reference_is_the_twin_s",
-    "tests/test_prefilter.py::test_the_reference_is_the_twin_s",
-    "tests/test_visibility.py::test_matches_reference",
-    "tests/test_summed_area.py::test_matches_twin",
-    "tests/test_relight.py::test_matches_twin",
-    "tests/test_environment_shadow.py::test_cumulative_sums_match_their_twin",
-    "tests/test_environment_shadow.py::test_reference_method_matches_the_twin",
-    "tests/test_near_field.py::test_matches_the_twin",
-    "tests/test_materials.py::test_phong_matches_reference",
-    "tests/test_materials.py::test_ggx_matches_reference",
-    "tests/test_shade.py::test_matches_reference",
-    "tests/test_mirror_ball.py::test_matches_twin",
-    "tests/test_composite.py::test_matches_twin",
-    "tests/test_declip.py::test_matches_twin",
-    "tests/test_expose.py::test_boxes_match_their_twins",
-)
-"""Tests that call ``tests.error_model.check_error``."""
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+
+def find_twins() -> dict[str, set[str]]:
+    """Tests that compare a stage with its float64 twin, themselves or by a function of their file.
+
+    Returns:
+        Their ids, and the stages that ``check_error`` is told.
+    """
+    found: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "tests").glob("test_*.py")):
+        functions = [node for node in ast.parse(path.read_text("utf-8")).body if isinstance(node, ast.FunctionDef)]
+        checked = {function.name: _checked_stages(function) for function in functions}
+        for function in functions:
+            if function.name.startswith("test_"):
+                helpers = (checked.get(name, set()) for name in _called_names(function))
+                if stages := checked[function.name].union(*helpers):
+                    found[f"{path.relative_to(ROOT).as_posix()}::{function.name}"] = stages
+    return found
+
+
+def _calls(function: ast.FunctionDef) -> list[tuple[str, ast.Call]]:
+    calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+    return [(call.func.id, call) for call in calls if isinstance(call.func, ast.Name)]
+
+
+def _called_names(function: ast.FunctionDef) -> set[str]:
+    return {name for name, _ in _calls(function)}
+
+
+def _checked_stages(function: ast.FunctionDef) -> set[str]:
+    stages = [call.args[0] for name, call in _calls(function) if name == "check_error"]
+    return {str(stage.value) for stage in stages if isinstance(stage, ast.Constant)}
 
 
 def main() -> int:
-    code = pytest.main([*TWINS, "-q", "-p", "no:cacheprovider"])
+    code = pytest.main([*find_twins(), "-q", "-p", "no:cacheprovider"])
     print(json.dumps({stage: float(f"{error:.2g}") for stage, error in worst.items()}, indent=1))
     return int(code)
 

@@ -40,6 +40,7 @@ from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
 from warp_ar.stages.request import Request
+from warp_ar.stages.shared.settled import PUBLISHED
 
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""
@@ -171,6 +172,12 @@ METHODS: dict[str, tuple[str, ...]] = {
     for stage in STAGES
 }
 """Every method on which a stage does something, by stage; ``none`` of a stage is that it is left out."""
+EXACT = tuple(method for method in METHODS["unwrap"] if method != "sphere_map")
+"""Methods of ``unwrap`` that know where the ball's points are; the paper's has its tests beside its kernel."""
+FILTERS = [
+    (stage, method) for stage in ("irradiance", "prefilter") for method in METHODS[stage] if method != "sphere_mip"
+]
+"""Filters of the environment's map; the paper's filters the frame, and has its tests beside its kernel."""
 STAGE_METHODS = [(stage, method) for stage, methods in METHODS.items() for method in methods]
 
 
@@ -244,6 +251,10 @@ class Rig:
             values = np.full((*array.shape, *_lanes(array)), values, np.float32)
         array.assign(np.ascontiguousarray(values))
         self.arrays.touch(name)
+        if name == "environment":
+            for copy in PUBLISHED:  # what filters read of it
+                if copy in self.arrays:
+                    self.arrays[copy].assign(array)
 
     def get(self, name: str) -> np.ndarray:
         """A copy of an array's contents."""

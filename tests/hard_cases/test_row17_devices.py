@@ -51,7 +51,7 @@ BOUNDS = {
     "expose": Bound(0.0, "as composite", 0.001),
 }
 DEFAULT = Bound(1e-3, "a stage that states no bound of its own", 0.02)
-SEEN_ONLY = ("hits", "object_irradiance", "object_mirrored")
+SEEN_ONLY = ("hits", "near_irradiance", "near_reflected")
 """Arrays that are defined only where an object is seen."""
 
 

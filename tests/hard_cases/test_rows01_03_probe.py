@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.hard_cases import generators
-from tests.hard_cases.rig import METHODS, SIZE, assert_finite, look_at
+from tests.hard_cases.rig import EXACT, SIZE, assert_finite, look_at
 from warp_ar.kernels.color import decode_table
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
@@ -43,7 +43,7 @@ def assert_sane(outputs, low=0.0, high=1.0):
 @pytest.mark.atlas(row=1, stage="unwrap")
 @pytest.mark.atlas(row=4, stage="unwrap")
 @pytest.mark.atlas(row=5, stage="unwrap")
-@pytest.mark.parametrize("method", METHODS["unwrap"])
+@pytest.mark.parametrize("method", EXACT)
 @pytest.mark.parametrize("axis", AXES, ids=str)
 def test_light_straight_back_along_an_axis(rig_for, method, axis):
     """The camera where R = -view falls exactly on a pole, the seam or a texel's corner; the proxies out of the way."""
@@ -73,7 +73,7 @@ def hide_proxies(rig):
 @pytest.fixture(autouse=True)
 def _proxies_back(request, rig_for):
     yield
-    for method in METHODS["unwrap"]:
+    for method in EXACT:
         rig = rig_for("unwrap", method)
         records = rig.pipeline.inputs.host_scene._proxies
         rig.pipeline.inputs.host_scene.ray_scene.proxies.assign(records)
@@ -82,7 +82,7 @@ def _proxies_back(request, rig_for):
 @pytest.mark.atlas(row=1, stage="unwrap")
 @pytest.mark.atlas(row=2, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="unwrap")
-@pytest.mark.parametrize("method", METHODS["unwrap"])
+@pytest.mark.parametrize("method", EXACT)
 @given(
     log_distance=st.floats(-8, 8),
     direction=st.sampled_from(list(map(tuple, generators.directions().tolist()))),
@@ -101,7 +101,7 @@ def test_from_anywhere(rig_for, method, log_distance, direction, name):
 
 @pytest.mark.atlas(row=18, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="unwrap")
-@pytest.mark.parametrize("method", METHODS["unwrap"])
+@pytest.mark.parametrize("method", EXACT)
 @pytest.mark.parametrize(
     "eye", [(0.02, -0.3, 0.35), (-0.09, 0.02, 0.1), (0.3, 0.02, 0.04), (-0.09, -2.0, 0.5)], ids=str
 )
@@ -120,7 +120,7 @@ def test_a_constant_frame_is_a_constant_map(rig_for, method, eye, code):
 
 @pytest.mark.atlas(row=3, stage="unwrap")
 @pytest.mark.atlas(row=3, stage="fill")
-@pytest.mark.parametrize("method", METHODS["unwrap"])
+@pytest.mark.parametrize("method", EXACT)
 def test_a_ball_that_is_not_to_be_seen_leaves_the_light_alone(rig_for, method):
     """Documented fallback: no confidence, and the map stays as it was."""
     rig = rig_for("unwrap", method)

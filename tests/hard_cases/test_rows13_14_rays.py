@@ -209,8 +209,8 @@ def render(device, stage, method, scale, shift):
                 rig.run(name)
         outputs = rig.written(stage)
     assert_finite(outputs)
-    if "object_irradiance" in outputs:  # of a white surface: what is seen of it
-        outputs["object_irradiance"] /= np.pi
+    if "near_irradiance" in outputs:  # of a white surface: what is seen of it
+        outputs["near_irradiance"] /= np.pi
     return outputs
 
 

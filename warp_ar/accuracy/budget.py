@@ -49,7 +49,6 @@ from warp_ar.accuracy.cost_table import (
 from warp_ar.accuracy.costs import (
     BASE,
     Costs,
-    cache_folder,
     cost_key,
     make_method_costs,
     measure_costs,
@@ -57,16 +56,13 @@ from warp_ar.accuracy.costs import (
     time_alone,
     write_costs,
 )
+from warp_ar.cache_folder import cache_folder
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
-from warp_ar.stages.quality import Quality
-
-AUTO = "auto"
-"""Name of the quality that this file is about."""
-DEFAULT_BUDGET_MS = 33.0
-"""Thirty frames per second."""
+from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 
 AIM = 0.9
 """Share of the budget that is planned for at first, and when there is too much to do."""
@@ -425,6 +421,10 @@ class AutoPipeline:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """As ``Pipeline.warm_up``, for the settings of the first frame."""
+        self.pipeline.warm_up(progress)
 
     def close(self) -> None:
         """Stop the threads; arrays go when the last result that refers to them does."""

@@ -271,17 +271,6 @@ def worked_ms(seconds: float, clock: Callable[[], float]) -> float:
     return seconds * 1e3 / (1 if clock is WORK else cores)
 
 
-def cache_folder() -> Path:
-    """Where this user's programs keep what they can make again."""
-    if os.environ.get("XDG_CACHE_HOME"):
-        return Path(os.environ["XDG_CACHE_HOME"]) / "warp_ar"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "warp_ar" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "warp_ar"
-    return Path.home() / ".cache" / "warp_ar"
-
-
 def cost_key(plan: Plan, device: Any, settings: Sequence[Setting]) -> str:
     """What costs depend on: device and cores, versions, what the scene calls for, the frames' size, the methods."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

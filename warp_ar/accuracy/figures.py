@@ -37,10 +37,10 @@ _FIGURES = (
         "darken",
         ("dark_25", "dark_50"),
         "expose",
-        ("plain", "box", "ball"),
+        ("plain", "paper", "ball"),
         "A shorter exposure, simulated: what clips in the frame must not just turn grey. Plain scaling; the paper's "
         "box filter, which lets clipped pixels darken less where their surroundings clip too; ours, which estimates "
-        "what the clipped pixels had from the glow around them and from the mirror ball's view of the same lamps.",
+        "what the clipped pixels had from the glow around them and from the mirror ball's view of the same emitters.",
     ),
     (
         "Figure 8",
@@ -48,9 +48,9 @@ _FIGURES = (
         (),
         "relight",
         ("flat", "paper", "reflectance"),
-        "A virtual spotlight from where the room's own lamp shines, over wires that no model knows. Flat light; the "
-        "paper's blend, which takes the frame's brightness for relief; ours, which divides the frame by the light that "
-        "falls there and lights the reflectance that remains.",
+        "A virtual spotlight from where the environment's own light comes, over wires that no model knows. Flat light; "
+        "the paper's blend, which takes the frame's brightness for relief; ours, which divides the frame by the light "
+        "that falls there and lights the reflectance that remains.",
     ),
     (
         "Figure 9",
@@ -58,7 +58,7 @@ _FIGURES = (
         ("light",),
         "relight",
         ("flat", "paper", "reflectance"),
-        "The same against the environment's lamp: what the frame shows bright now lies in shadow.",
+        "The same against the environment's light: what the frame shows bright now lies in shadow.",
     ),
 )
 """Title, bundled scene, versions of cases that show the same with its truth, setting, its plain, paper's and best

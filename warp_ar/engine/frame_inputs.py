@@ -16,13 +16,14 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.kernels.color import decode_table, encode_table
+from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
+from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
-from warp_ar.stages.base import Arrays, Rows
+from warp_ar.stages.base import Arrays, Reach, Rows
 
 RECTS = ("object", "light", "shadow", "ball")
 """Parts of the screen to whose rows passes keep; the frame's values hold them whole."""
@@ -70,6 +71,9 @@ class FrameInputs:
         self.transfers = None if device.is_cpu else Transfers(shape, device)
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
+        self.saturation = SaturationLevels()
+        """Codes at which channels saturate, as frames have told so far."""
+        self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
         values = self.block.host("params")
@@ -89,11 +93,12 @@ class FrameInputs:
         add("light_array", self.block.device_array("lights"))
         add("ray_scene", self.host_scene.ray_scene)
         add("probes", wp.array(_probe_values(scene), dtype=Probe, device=device))
-        add("decode", wp.array(self.decode, dtype=wp.vec3, device=device))
+        add("decode", wp.array(camera_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
         for name in RECTS:
             add(f"{name}_rows", functools.partial(self._rows, name))
+        add("reach", self.reach)
         add("seconds", lambda: float(params["time"][0]))
 
     def close(self) -> None:
@@ -138,10 +143,21 @@ class FrameInputs:
         params["frame_index"][0] = frame.index
         params["environment_reset"][0] = reset
         self.block.upload()
+        self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
         for name in touched:
             self._arrays.touch(name)
+
+    def _note_saturation(self, frame: SeenFrame) -> None:
+        """Look where channels saturate, if the frame is on the host and shows a ball."""
+        if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
+            return
+        if frame.index >= WATCHED and frame.index % PERIOD:
+            return
+        if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
+            table = camera_table(self._camera.transfer, self.saturation.levels)
+            self._arrays["decode"].assign(table)
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
         """Move lights and objects to where they are now; gives the inputs that changed."""
@@ -182,6 +198,14 @@ class FrameInputs:
     def _rows(self, name: str) -> Rows:
         """Rows of one of ``RECTS`` in this frame."""
         return self.rects[name][:2]
+
+    def reach(self) -> Reach:
+        """What of this frame virtual things can reach."""
+        rects = (self.rects[name] for name in RECTS)
+        objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
+        shines = bool(self.block.host("lights")["intensity"].any())
+        falls = bool(self.host_scene.light_outline().polygons)
+        return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

@@ -17,10 +17,11 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_ar.device import exclusive, resolve_device
+from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
+from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
@@ -88,6 +89,7 @@ class Pipeline:
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
 
@@ -104,6 +106,7 @@ class Pipeline:
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -135,9 +138,11 @@ class Pipeline:
         self._short: ShortFrames | None = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
-        with exclusive(self.device), wp.ScopedDevice(self.device):
+        with translating(self.device), wp.ScopedDevice(self.device):
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
-            self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile)
+            self._scheduler = Scheduler(
+                self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
+            )
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.features, self._arrays, self.device)
 
@@ -210,10 +215,15 @@ class Pipeline:
         self.scene, self.plan = scene, plan
         return True
 
-    def warm_up(self) -> None:
-        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline."""
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Load every kernel, so that the first frame takes no longer than others; may run beside another pipeline.
+
+        Args:
+            progress: Called with how many of how many modules are compiled, first with 0, if any must be: kernels are
+                compiled once for a kind of scene and kept. On the caller's thread.
+        """
         self._check_usable()
-        self._scheduler.warm_up()
+        self._scheduler.warm_up(progress)
 
     def continue_from(self, other: Pipeline) -> None:
         """Go on where another pipeline stopped: its clock and, where they fit, its track and its light."""
@@ -362,6 +372,7 @@ class Pipeline:
         timings: Mapping[str, StageTiming] = frame.timings
         start = time.perf_counter()
         if not frame.lost:
+            self._scheduler.prepare()
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._light.known = False

@@ -2,38 +2,33 @@
 
 On CUDA the stages that must run are captured once as a graph and replayed; a different set of stages is a different
 graph. In the graph a stage waits only for those whose output it reads, and for those that it runs after, so that
-short kernels, which leave most of the device idle, run beside others. On CPU it is the same: threads take bands of
-whatever stage has its inputs, the first in order first, so that nobody waits for a pass that cannot be split, or for
-the last band of one that can.
+short kernels, which leave most of the device idle, run beside others. On CPU it is the same: native threads (see
+``crew``) take rows of whatever stage has its inputs, the first in order first, so that nobody waits for a pass that
+cannot be split, or for the last rows of one that can.
 """
 
 from __future__ import annotations
 
-import bisect
-import collections
 import contextlib
 import dataclasses
 import itertools
-import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
-from warp_ar.device import capturing, exclusive, translating
+from warp_ar.device import capturing, exclusive, translating, usable_cores
+from warp_ar.engine.crew import Crew
+from warp_ar.engine.demand import Demand
 from warp_ar.engine.graph import Plan
-from warp_ar.stages.base import Arrays, Pass, Rows, Stage
+from warp_ar.engine.modules import Progress, load_modules
+from warp_ar.kernels.bands import serve_kernel
+from warp_ar.kernels.launch import Note, noting
+from warp_ar.stages.base import Arrays, Pass, Reach, Rows, Stage
 
 Step = tuple[Stage, list[Pass]]
 """A stage and those of its passes that are launched."""
-
-# Bands shorter than this cost more in launching than they save.
-MIN_BAND_ROWS = 8
-# From this height on there are two bands per thread: rows are not alike, and who is done first takes what is left.
-UNEVEN_ROWS = 96
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +39,9 @@ class StageTiming:
     """On CPU the stage's share of the time that all took, by the time that its bands took; on CUDA, unless the pipeline
     profiles, an equal share of the time that launching took the host."""
     skipped: bool
-    """True: nothing that it reads had changed."""
+    """True: nothing that it reads had changed, or it was left out of this frame."""
+    left_out: str | None = None
+    """Why it could change no pixel of this frame; None where that was not so."""
 
 
 SKIPPED = StageTiming(0.0, True)
@@ -54,7 +51,14 @@ class Scheduler:
     """Runs the stages of one plan on one device."""
 
     def __init__(
-        self, plan: Plan, arrays: Arrays, device: Any, *, bands: int | None = None, profile: bool = False
+        self,
+        plan: Plan,
+        arrays: Arrays,
+        device: Any,
+        *,
+        bands: int | None = None,
+        profile: bool = False,
+        culling: bool = True,
     ) -> None:
         """Allocate what the stages declared and build their passes.
 
@@ -64,16 +68,22 @@ class Scheduler:
             device: Warp device.
             bands: Bands per CPU pass; None means one or two per core that this process may use.
             profile: On CUDA wait for every frame and time each stage on the device; stages then run one by one.
+            culling: Whether stages that can change no pixel of a frame are left out of it.
         """
         self.plan = plan
         self.arrays = arrays
         self.device = device
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         self.bands = bands
         self._threads = min(cores, bands or cores)
-        helpers = max(self._threads - 1, 1)
-        self._pool = ThreadPoolExecutor(helpers, "warp_ar") if device.is_cpu and (bands or cores) > 1 else None
+        if bands is not None and bands > 1:
+            self._threads = max(self._threads, 2)  # so that bands run side by side on one core, too
+        self._crew: Crew | None = None
+        self._alone = False
+        self._ran: set[str] = set()
+        self._prepared = False
         self._stages: list[Step] = []
+        self._first_launches: list[Note] = []
         self._fills: dict[str, Any] = {}
         self._seen: dict[str, tuple[int, ...]] = {}
         self._translated: set[int] = set()
@@ -90,7 +100,14 @@ class Scheduler:
                 for name, spec in stage.arrays().items():
                     arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
                     self._fills[name] = spec.fill
-                self._stages.append((stage, stage.build(arrays, device)))
+                with noting() as notes:
+                    self._stages.append((stage, stage.build(arrays, device)))
+                self._first_launches += notes
+        self._culling = culling
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._unneeded: Mapping[str, str] = {}
+        """Why stages can change no pixel of this frame."""
+        self._passes = {stage.name: passes for stage, passes in self._stages}
         self._readers = _find_readers([stage for stage, _ in self._stages])
         self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
@@ -98,10 +115,16 @@ class Scheduler:
 
     def close(self) -> None:
         """Stop the worker threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        if self._crew is not None:
+            self._crew.close()
+            self._crew = None
         for stage, _ in self._stages:
             stage.close()
+
+    @property
+    def crew(self) -> Crew | None:
+        """The native threads that it has; None until it is prepared, and on CUDA."""
+        return self._crew
 
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
@@ -124,16 +147,64 @@ class Scheduler:
         """Arrays of a stage that carry over; a method need not have all of them."""
         return [name for name in stage.remembers if name in self.arrays]
 
-    def warm_up(self) -> None:
-        """Launch everything once on whatever the arrays hold, so that the first frame finds its kernels loaded.
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Compile and load every kernel, side by side, and have the stages' tables made; nothing on a second call.
+
+        Args:
+            progress: Told how many of how many modules are compiled, if any must be.
+        """
+        if self._prepared:
+            return
+        notes: dict[int, list[Note]] = {}
+        host_kernels: list[wp.Kernel] = []
+        with wp.ScopedDevice(self.device), translating(self.device):
+            for stage, passes in self._stages:
+                host_kernels += stage.host_kernels()
+                for step in passes:
+                    if not step.on_host:
+                        with noting() as noted:
+                            step.launch(None if step.rows is None else (0, step.rows))
+                        if noted:  # else it did its work by other means, as it will in each frame
+                            notes[id(step)] = noted
+        found = [*self._first_launches, *(note for each in notes.values() for note in each)]
+        kernels = [note.kernel for note in found if note.kernel is not None and self._loads_ahead(note)]
+        own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []
+        load_modules([*own, *kernels, *host_kernels], self.device, progress)
+        with wp.ScopedDevice(self.device), translating(self.device):
+            for note in self._first_launches:
+                note.do()
+            self._first_launches.clear()
+            if own:
+                self._crew = Crew(
+                    self._stages,
+                    notes,
+                    self._readers,
+                    threads=self._threads,
+                    bands_per_pass=self.bands,
+                    decide=self._enter,
+                    finish=self._publish,
+                )
+        self._prepared = True
+
+    def _loads_ahead(self, note: Note) -> bool:
+        """On CUDA a module is compiled for a size of block; those of another than the usual load as they launch."""
+        return bool(self.device.is_cpu) or note.block_dim == note.kernel.module.options["block_dim"]
+
+    def warm_up(self, progress: Progress | None = None) -> None:
+        """Have every kernel compiled and loaded; on CUDA launch everything once, on whatever the arrays hold.
 
         The host's own steps are left out. On CUDA it runs on a stream of its own, and frames of others come between
         its steps.
+
+        Args:
+            progress: As for ``prepare``.
         """
-        stream = None
-        if self.device.is_cuda:
-            with exclusive(self.device):
-                stream = wp.Stream(self.device)
+        self.prepare(progress)
+        self._demand.forget()
+        if self.device.is_cpu:
+            return
+        with exclusive(self.device):
+            stream = wp.Stream(self.device)
         for stage, passes in self._stages:
             for step in passes:
                 if not step.on_host:
@@ -143,69 +214,129 @@ class Scheduler:
             with exclusive(self.device), wp.ScopedStream(stream):
                 for name in self._remembered(stage):
                     self.arrays[name].fill_(self._fills[name])
-        if stream is not None:
-            with exclusive(self.device):
-                wp.synchronize_stream(stream)
+        with exclusive(self.device):
+            wp.synchronize_stream(stream)
 
     @contextlib.contextmanager
     def alone(self, clock: Callable[[], float]) -> Iterator[None]:
         """On CPU run stages one after another on the caller's thread, timed by its clock."""
-        before = self._pool, self.clock
-        self._pool, self.clock = None, clock
+        before = self._alone, self.clock
+        self._alone, self.clock = True, clock
         try:
             yield
         finally:
-            self._pool, self.clock = before
+            self._alone, self.clock = before
 
     def run(self) -> Mapping[str, StageTiming]:
-        """Run the stages whose inputs changed since they last ran; returns the time of each."""
-        if self.device.is_cpu:
-            return self._run_eager()
-        return self._run_captured()
+        """Run the stages that this frame needs and whose inputs changed since they ran; returns the time of each."""
+        self.prepare()
+        self._look()
+        if not self.device.is_cpu:
+            return self._run_captured()
+        return self._run_eager() if self._crew is None or self._alone else self._run_side_by_side(self._crew)
+
+    def _look(self) -> None:
+        """Find out what this frame needs."""
+        reach = self.arrays["reach"]() if "reach" in self.arrays else Reach()
+        self._unneeded, clearing = self._demand.look(reach)
+        for stage, _ in self._stages:
+            if stage.name in self._unneeded:
+                stage.rest()
+        for name in clearing:
+            self._seen.pop(name, None)
+
+    def _timing_of_skipped(self, stage: Stage) -> StageTiming:
+        reason = self._unneeded.get(stage.name) if self._culling else None
+        return SKIPPED if reason is None else StageTiming(0.0, True, reason)
 
     def _due(self, stage: Stage) -> tuple[int, ...] | None:
-        """Versions of what ``stage`` reads, or None if it has already seen them."""
+        """Versions of what ``stage`` reads, or None if it has already seen them or this frame does not need it."""
+        if self._culling and stage.name in self._unneeded:
+            return None
         versions = self.arrays.versions(stage.wiring.reads)
         return None if self._seen.get(stage.name) == versions else versions
 
+    def _begin(self, stage: Stage, passes: list[Pass]) -> list[Pass]:
+        """Passes of a stage that take part in this frame."""
+        if stage.name not in self._unneeded:
+            stage.begin()
+        return [step for step in passes if step.enabled is None or step.enabled()]
+
     def _publish(self, stage: Stage) -> None:
+        if stage.name in self._unneeded and type(stage).changed is not Stage.changed:
+            return  # what readers may miss is decided in frames that have readers, whether others are left out or not
         for name in stage.wiring.writes:
-            if self.arrays.version(name) == 0 or stage.changed(name):
+            if stage.changed(name) or self.arrays.version(name) == 0:
                 self.arrays.touch(name)
 
     def _run_eager(self) -> dict[str, StageTiming]:
-        """Stage after stage, or side by side where there are threads for it."""
-        if self._pool is not None:
-            return SideBySide(self, self._pool, self._threads).run()
+        """Stage after stage, on this thread."""
         timings: dict[str, StageTiming] = {}
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
             start = self.clock()
-            for step in _enabled_passes(stage, passes):
+            for step in self._begin(stage, passes):
                 # Extents are a saving of the CPU's; elsewhere a pass runs whole, as a captured graph replays it.
-                self._launch_band(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
+                self._launch(step, step.extent() if step.extent is not None and self.device.is_cpu else None)
             self._seen[stage.name] = versions
             self._publish(stage)
             timings[stage.name] = StageTiming((self.clock() - start) * 1e3, False)
         return timings
 
-    def _split(self, step: Pass) -> list[Rows | None]:
-        """Bands of a pass in this frame."""
-        if step.rows is None:
-            return [step.extent() if step.extent is not None else None]
-        start, stop = step.extent() if step.extent is not None else (0, step.rows)
-        if stop <= start:
-            return []
-        if id(step) not in self._translated:
-            return [(start, stop)]
-        wanted = self.bands or self._threads * (2 if stop - start >= UNEVEN_ROWS else 1)
-        bands = min(wanted, max(1, (stop - start) // MIN_BAND_ROWS))
-        return list(itertools.pairwise(start + (stop - start) * band // bands for band in range(bands + 1)))
+    def _run_side_by_side(self, crew: Crew) -> dict[str, StageTiming]:
+        """Native threads take bands of rows; whether a stage is due is decided before they begin, where that is known.
 
-    def _launch_band(self, step: Pass, rows: Rows | None) -> None:
+        It is not where a stage that comes before says only in the end whether it changed anything.
+        """
+        start = self.clock()
+        crew.reset()
+        self._ran.clear()
+        open_ended: set[str] = set()
+        for stage, _ in self._stages:
+            if stage.name in open_ended:
+                crew.ask(stage)
+                open_ended.update(self._readers[stage.name])
+            elif self._enter(stage) and _says_in_the_end(stage):
+                open_ended.update(self._readers[stage.name])
+        try:
+            times = crew.run()
+        except BaseException:
+            self.forget()  # some of what was to be done was not
+            raise
+        whole = (self.clock() - start) * 1e3
+        busy = sum(times.values()) or 1.0
+        timings: dict[str, StageTiming] = {}
+        for stage, _ in self._stages:
+            spent = times[stage.name]
+            ran = stage.name in self._ran
+            timings[stage.name] = StageTiming(whole * spent / busy, False) if ran else self._timing_of_skipped(stage)
+        return timings
+
+    def _enter(self, stage: Stage) -> bool:
+        """Tell the crew what is due of a stage; False if nothing is."""
+        versions = self._due(stage)
+        if versions is None:
+            return False
+        assert self._crew is not None
+        late = _says_in_the_end(stage)
+        due = [(step, self._rows_of(step)) for step in self._begin(stage, self._passes[stage.name])]
+        self._crew.begin(stage, due, tell=late)
+        self._seen[stage.name] = versions
+        self._ran.add(stage.name)
+        if not late:
+            self._publish(stage)
+        return True
+
+    def _rows_of(self, step: Pass) -> Rows:
+        """Rows of a pass in this frame; (0, 1) where it has none."""
+        if step.rows is None:
+            return (0, 1)
+        return step.extent() if step.extent is not None else (0, step.rows)
+
+    def _launch(self, step: Pass, rows: Rows | None) -> None:
         if step.on_host or id(step) in self._translated:
             step.launch(rows)
             return
@@ -220,9 +351,9 @@ class Scheduler:
         for stage, passes in self._stages:
             versions = self._due(stage)
             if versions is None:
-                timings[stage.name] = SKIPPED
+                timings[stage.name] = self._timing_of_skipped(stage)
                 continue
-            chosen = _enabled_passes(stage, passes)
+            chosen = self._begin(stage, passes)
             due.append((stage, chosen))
             pattern.append((stage.name, *map(id, chosen)) if stage.name in self._changing else stage.name)
             self._seen[stage.name] = versions
@@ -310,123 +441,6 @@ class Segment:
     """Of its passes."""
 
 
-class _Running:
-    """A stage in one frame on CPU."""
-
-    def __init__(self, stage: Stage, steps: list[Pass], waits: int) -> None:
-        self.stage, self.steps = stage, steps
-        self.waits = waits
-        """Stages whose output it reads and that are not done."""
-        self.versions: tuple[int, ...] = ()
-        self.left: collections.deque[Pass] = collections.deque()
-        self.step: Pass | None = None
-        self.bands: collections.deque[Rows | None] = collections.deque()
-        self.out = 0
-        """Bands under way."""
-        self.seconds = 0.0
-
-
-class SideBySide:
-    """One frame on CPU: threads take the next band of the first stage that has one ready."""
-
-    def __init__(self, scheduler: Scheduler, pool: ThreadPoolExecutor, threads: int) -> None:
-        """Prepare; stages without unfinished inputs are ready at once."""
-        self._scheduler, self._pool, self._threads = scheduler, pool, threads
-        self._changed = threading.Condition()
-        readers = scheduler._readers
-        counts = collections.Counter(reader for found in readers.values() for reader in found)
-        self._stages = {stage.name: _Running(stage, steps, counts[stage.name]) for stage, steps in scheduler._stages}
-        self._timings: dict[str, StageTiming] = {}
-        self._open = len(self._stages)
-        self._ready: list[_Running] = []  # in the stages' order
-        self._error: BaseException | None = None
-
-    def run(self) -> dict[str, StageTiming]:
-        """Run all; this thread works too. The first error ends it, once bands under way are done."""
-        start = self._scheduler.clock()
-        with self._changed:
-            for running in [first for first in self._stages.values() if first.waits == 0]:
-                self._begin(running)
-        helpers = [self._pool.submit(self._work) for _ in range(self._threads - 1)] if self._open else []
-        self._work()
-        for helper in helpers:
-            helper.result()
-        if self._error is not None:
-            raise self._error
-        whole = (self._scheduler.clock() - start) * 1e3
-        busy = sum(running.seconds for running in self._stages.values()) or 1.0
-        for name, running in self._stages.items():
-            if name not in self._timings:
-                self._timings[name] = StageTiming(whole * running.seconds / busy, False)
-        return {name: self._timings[name] for name in self._stages}
-
-    def _begin(self, running: _Running) -> None:
-        """All inputs are there: ready, or done at once where none of them changed."""
-        versions = self._scheduler._due(running.stage)
-        if versions is None:
-            self._timings[running.stage.name] = SKIPPED
-            self._end(running)
-            return
-        running.versions = versions
-        running.left.extend(_enabled_passes(running.stage, running.steps))
-        order = self._scheduler._order
-        bisect.insort(self._ready, running, key=lambda other: order[other.stage.name])
-        self._advance(running)
-
-    def _advance(self, running: _Running) -> None:
-        """Go to the next pass that has rows, or to the end."""
-        while running.left:
-            running.step = running.left.popleft()
-            running.bands.extend(self._scheduler._split(running.step))
-            if running.bands:
-                return
-        self._ready.remove(running)
-        self._scheduler._seen[running.stage.name] = running.versions
-        self._scheduler._publish(running.stage)
-        self._end(running)
-
-    def _end(self, running: _Running) -> None:
-        self._open -= 1
-        for name in self._scheduler._readers[running.stage.name]:
-            reader = self._stages[name]
-            reader.waits -= 1
-            if reader.waits == 0:
-                self._begin(reader)
-
-    def _work(self) -> None:
-        """Take bands until no stage is left."""
-        clock = self._scheduler.clock
-        with self._changed:
-            while self._error is None and self._open:
-                chosen = next((running for running in self._ready if running.bands), None)
-                if chosen is None:
-                    self._changed.wait()
-                    continue
-                rows, step = chosen.bands.popleft(), chosen.step
-                chosen.out += 1
-                assert step is not None
-                self._changed.release()
-                start = clock()
-                error: BaseException | None = None
-                try:
-                    self._scheduler._launch_band(step, rows)
-                except BaseException as caught:  # handed to the thread that asked for the frame
-                    error = caught
-                spent = clock() - start
-                self._changed.acquire()
-                chosen.seconds += spent
-                chosen.out -= 1
-                if error is None and not chosen.bands and chosen.out == 0 and self._error is None:
-                    try:
-                        self._advance(chosen)
-                    except BaseException as caught:
-                        error = caught
-                    self._changed.notify_all()
-                if error is not None:
-                    self._error = self._error or error
-                    self._changed.notify_all()
-
-
 def _make_marks(device: Any) -> tuple[Any, Any]:
     return wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
 
@@ -435,10 +449,9 @@ def _ids(steps: list[Pass]) -> tuple[int, ...]:
     return tuple(map(id, steps))
 
 
-def _enabled_passes(stage: Stage, passes: list[Pass]) -> list[Pass]:
-    """Passes of a stage that take part in this frame."""
-    stage.begin()
-    return [step for step in passes if step.enabled is None or step.enabled()]
+def _says_in_the_end(stage: Stage) -> bool:
+    """Whether a stage may find that it changed nothing: its readers then rest."""
+    return type(stage).changed is not Stage.changed
 
 
 def _in_launch_order(part: list[Step]) -> list[Step]:

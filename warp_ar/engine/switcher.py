@@ -138,8 +138,12 @@ class PipelineSwitcher:
         if wait and target is not self._shown:
             self._drop_building()
             self._wanted = target
-            ready = self._ready()
-            self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            try:
+                ready = self._ready()
+                self._go_over(self._build(target, prepare)[0] if ready is None else ready)
+            except WarpArError:
+                self._wanted = self._shown
+                raise
             return self.pipeline
         self.want(target, prepare)
         return self.take()
@@ -254,10 +258,11 @@ def let_go(pipeline: Pipeline) -> None:
     Its arrays, stages and scheduler refer to each other, so they would wait for the garbage collector, which counts
     objects: a pipeline is few objects and many megabytes. Results that refer to arrays keep those.
     """
-    device, owners = pipeline.device, (pipeline.arrays, pipeline.scheduler, pipeline)
+    device, scheduler = pipeline.device, pipeline.scheduler
     pipeline.close()
+    crew = scheduler.crew
     with exclusive(device):
-        for owner in owners:
+        for owner in (pipeline.arrays, scheduler, pipeline, *([] if crew is None else [crew])):
             vars(owner).clear()
     release_memory()
 

@@ -53,6 +53,8 @@ HOLDS = 0.12
 """Logarithm of the factor by which a step may be off what the pixels say."""
 CONTRADICTS = 0.3
 """The same where a response is estimated with it: beyond, no response explains the exposures."""
+FEATURELESS = 6.0
+"""Standard deviation of codes below which a picture shows nothing."""
 MOVED = 0.75
 """Correlation over well exposed pixels below which a picture shows something else."""
 HATS = 8
@@ -142,7 +144,10 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
         if told.sum() < LEAST_PIXELS:
             return math.nan
         wanted = np.interp(first[told], np.arange(256), _tone_curve(first[told], seen[told]))
-        return float(np.corrcoef(wanted, seen[told])[0, 1]) if np.ptp(wanted) > 0 else math.nan
+        if np.ptp(wanted) == 0.0:
+            # Nothing to see in either, or much that the first does not have.
+            return math.nan if np.std(seen[told]) < FEATURELESS else 0.0
+        return float(np.corrcoef(wanted, seen[told])[0, 1])
 
     move = np.zeros(3)
     for coarse in (4.0, 2.0, 0.0, 0.0):

@@ -16,9 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import write_whole
 from warp_ar.input.markers import make_board
 from warp_ar.scene import Camera, CharucoBoard, Marker
+from warp_ar.signature import PROGRAM
 
 Image = NDArray[np.uint8]
 
@@ -213,16 +215,14 @@ def write_camera(report: CameraReport, path: Path) -> None:
     if not path.parent.is_dir():
         raise SinkError(f"{path}: cannot be written: no folder {path.parent}")
     camera = report.camera
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-        opened = storage.isOpened()
-    except (cv2.error, SystemError):  # the latter is how OpenCV's constructor reports a file that does not open
-        opened = False
-    if not opened:
-        raise SinkError(f"{path}: cannot be written")
+    storage = cv2.FileStorage(path.suffix.lower(), cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("program", PROGRAM)
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
     storage.write("camera_matrix", camera.matrix())
     storage.write("distortion_coefficients", np.array(camera.distortion)[None])
     storage.write("avg_reprojection_error", report.error)
-    storage.release()
+    try:
+        write_whole(path, storage.releaseAndGetString().encode())
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error

@@ -10,9 +10,11 @@ import imageio.v3
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import write_whole
 from warp_ar.input.markers import find_dictionary, make_board
 from warp_ar.scene import CharucoBoard, Marker
+from warp_ar.signature import sign_png
 
 Image = NDArray[np.uint8]
 
@@ -105,6 +107,7 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
     place = (round(_MARGIN * mm), bottom - round(3 * mm))
     cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, mm / 9, 0, max(1, round(mm / 5)), cv2.LINE_AA)
     try:
-        imageio.v3.imwrite(path, page, extension=".png", dpi=(per_metre * 0.0254, per_metre * 0.0254))
+        density = (per_metre * 0.0254, per_metre * 0.0254)
+        write_whole(path, sign_png(imageio.v3.imwrite("<bytes>", page, extension=".png", dpi=density)))
     except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error

@@ -1,7 +1,7 @@
 """Response curve of a camera from pictures of one still scene at several exposures.
 
 A response file is text: 256 lines of three numbers, the linear red, green and blue value of each 8-bit code, 1 for code
-255.
+255; a line that begins with # is a comment.
 
 References:
     [DM97] P. Debevec and J. Malik. Recovering high dynamic range radiance maps from photographs. SIGGRAPH 1997.
@@ -17,7 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.errors import SinkError, UsageError
+from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.files import write_whole
+from warp_ar.signature import PROGRAM
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -68,6 +70,7 @@ def write_response(curve: Array, path: Path) -> None:
         SinkError: if the file cannot be written.
     """
     try:
-        path.write_text("".join(f"{r:.9g} {g:.9g} {b:.9g}\n" for r, g, b in curve))
+        text = f"# {PROGRAM}\n" + "".join(f"{r:.9g} {g:.9g} {b:.9g}\n" for r, g, b in curve)
+        write_whole(path, text.encode())
     except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {error.strerror}") from error
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error

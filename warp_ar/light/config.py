@@ -65,6 +65,10 @@ class PriorConfig:
     """Relative standard deviation of regions about their component's mean."""
     hue: float = 0.5
     """Relative standard deviation of one channel's distribution about that of all."""
+    colour: float = 3.0
+    """Ratio of one channel to the median of all that light which all of them lack may have: lamps are nearly white."""
+    own_clipping: float = 3.0
+    """Ratio of what a channel lacks to what the others do from which it clips for itself, as a blue sky does."""
     least: float = 0.3
     """Radiance below which relative deviations are no longer relative."""
     surface_excess: float = 0.5
@@ -77,6 +81,10 @@ class SearchConfig:
 
     evidence: float = 7.0
     """Fall of the cost (twice a log likelihood) that a peak must be worth."""
+    even: float = 1.6
+    """Ratio of how far surfaces scatter to what is expected of them above which they are textured."""
+    textured: float = 4.0
+    """Exponent of what exceeds it, in the fall that is asked for there."""
     better: float = 0.1
     """Fall of the cost for which a peak that is being added goes to a neighbouring place."""
     worth_moving: float = 1.0
@@ -127,6 +135,56 @@ class SolverConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CardConfig:
+    """What is asked of a card before its white is believed."""
+
+    least_cells: int = 4
+    """White cells, and ink cells, that must be seen."""
+    least_contrast: float = 2.5
+    """Median ratio of paper to ink: print has 10 to 30, blur and veiling glare lower it."""
+    darker: float = 1.6
+    """Ratio from which an ink cell is darker than the paper beside it."""
+    least_share: float = 0.75
+    """Share of ink cells that must be."""
+    held: int = 15
+    """Estimates, of some five a second, for which light that was found holds while a hand or an object hides it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvidenceConfig:
+    """How far problems are varied to see what an estimate rests on, and what it may add."""
+
+    draws: int = 12
+    """Problems that are solved."""
+    seed: int = 1
+    """Of their random numbers: equal input gives equal output."""
+    directions: int = 32
+    """In which irradiance counts."""
+    block: float = 0.12
+    """Metres of a surface that count, or not, together."""
+    response: float = 0.02
+    """Standard deviation of the logarithm of the response's exponent."""
+    white: float = 0.02
+    """The same of the card's reflectance."""
+    ball: float = 0.02
+    """The same of the ball's."""
+    usual_contrast: float = 30.0
+    """Ratio of paper to ink above which no print is known: the response is steeper than it is taken to be."""
+    doubt: float = 2.0
+    """Standard deviation of the card's logarithm per logarithm of contrast beyond that."""
+    share: float = 0.1
+    """Of draws that an estimate may be too much for."""
+    safety: float = 1.0
+    """Of what the others allow."""
+    interval: float = 2.5
+    """Standard deviations of the draws that an interval of irradiance reaches to either side."""
+    capture: float = 0.15
+    """Relative error of the captured irradiance: the ball's reflectance, the unseen cone, the response."""
+    clipped: float = 60.0
+    """Radiance that what clips may have on average where nothing tells: 19 of 20 rooms have less."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RecoveryConfig:
     """All numbers of the recovery."""
 
@@ -136,6 +194,10 @@ class RecoveryConfig:
     """Of what clips."""
     search: SearchConfig = SearchConfig()
     """Of emitters."""
+    card: CardConfig = CardConfig()
+    """Of the card."""
+    evidence: EvidenceConfig = EvidenceConfig()
+    """Of what estimates rest on."""
     solver: SolverConfig = SolverConfig()
     """Of the solution."""
 

@@ -25,6 +25,9 @@ class EmitterSearch:
     def __init__(self, problem: Problem, c: int) -> None:
         """Look for emitters of ``problem`` in channel ``c``."""
         self.problem, self.c = problem, c
+        search = CONFIG.search
+        self.evidence = search.evidence * max(problem.texture / search.even, 1.0) ** search.textured
+        """Fall of the cost that an emitter must be worth here: on textured surfaces stains look like shadows."""
 
     def fit(self, z: Array, iterations: int) -> Fit:
         """Fit of the channel that is searched by."""
@@ -55,7 +58,7 @@ class EmitterSearch:
         seen: list[Peak] = []
         for place in np.argsort(-gain, kind="stable"):
             peak = candidates[place]
-            if gain[place] < 0.5 * CONFIG.search.evidence or len(seen) == 5:
+            if gain[place] < 0.5 * self.evidence or len(seen) == 5:
                 break
             if any(
                 peak.distance == s.distance
@@ -67,7 +70,7 @@ class EmitterSearch:
             cost = self.tried(peak, fit.z, 4).cost
             if best is None or cost < best[1]:
                 best = (peak, cost)
-        if best is None or best[1] > fit.cost - CONFIG.search.evidence:
+        if best is None or best[1] > fit.cost - self.evidence:
             return None
         self.problem.push(self.settled(*best, fit, CONFIG.search.better))
         return self.fit(self.problem.with_peak(fit.z), CONFIG.solver.iterations)

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 def measured_noise(
     points: NDArray[Any], surface: NDArray[np.int64], kinds: NDArray[np.int64], light: Array, exact: NDArray[np.bool_]
-) -> Array:
+) -> tuple[Array, Array]:
     """Relative standard deviation of one equation, by surface: how far its points scatter about a smooth course.
 
     The course is a quadratic in the surface's own coordinates, of the logarithm: a lamp's light falls off like that.
@@ -28,9 +28,11 @@ def measured_noise(
         exact: Where that does not clip and says something, (n, 3).
 
     Returns:
-        Between ``LEAST_NOISE`` and what is usual for the kind, (surfaces,).
+        Between ``least_noise`` and what is usual for the kind, (surfaces,): cast shadows scatter as well, and they are
+        what is looked for. And how far points scatter, at least what is usual, (surfaces,).
     """
     noise = np.array(CONFIG.surfaces.noise)[kinds]
+    texture = noise.copy()
     for number in range(len(kinds)):
         own = np.flatnonzero((surface == number) & exact.all(axis=1))
         if len(own) < CONFIG.surfaces.scatter_points:
@@ -47,8 +49,9 @@ def measured_noise(
             scatter = 1.4826 * float(np.median(off))
             weights = 1.0 / np.sqrt(1.0 + (off / (2.0 * scatter + 1e-6)) ** 2)
         scatter *= np.sqrt(len(own) / (len(own) - terms.shape[1]))
+        texture[number] = max(scatter, noise[number])
         noise[number] = np.clip(scatter, CONFIG.surfaces.least_noise, noise[number])
-    return noise
+    return noise, texture
 
 
 def shared_errors(overlap: NDArray[np.float32], kind: NDArray[np.int64], seen: NDArray[np.bool_]) -> Array:

@@ -98,7 +98,9 @@ class Problem:
         self.direction = cells["direction"].reshape(-1, 3).astype(float)
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         self.modelled = cells["modelled"].ravel() > 0.5
-        self.may_hold_peak = (self.lost.max(axis=1) > 0.1) & ~self.modelled
+        # None where nothing is seen: shading may say that light is missing, hardly where it comes from.
+        seen = cells["hidden"].ravel() <= 0.0
+        self.may_hold_peak = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - cells["hidden"].ravel(), np.float64)
 
     def _group_cells(self, clipped: Array) -> None:
@@ -125,6 +127,7 @@ class Problem:
         seen = observations["visible"] > 0.8
         self.index = np.flatnonzero(seen)
         shown = observations[seen]
+        self.points = surfaces.points["position"][seen].astype(float)
         self.surface = surfaces.surface[seen]
         self.kinds, self.groups, self.white = surfaces.kinds, surfaces.groups, white
         self.kind = self.kinds[self.surface]
@@ -134,7 +137,11 @@ class Problem:
         even = np.pi * shown["deviation"] < 0.25 * self.light + 0.01
         self.exact = (self.light > CONFIG.surfaces.dark) & even & (shown["clipped"] < 0.01)
         self.bound = shown["clipped"] > 0.5
-        self.noise = measured_noise(surfaces.points[seen], self.surface, self.kinds, self.light, self.exact)
+        points = surfaces.points[seen]
+        self.noise, scatter = measured_noise(points, self.surface, self.kinds, self.light, self.exact)
+        told = self.surface[self.exact.all(axis=1) & (self.kind >= Kind.PLANE)]
+        self.texture = float(np.median(scatter[told] / self.noise[told])) if len(told) else 1.0
+        """How much more than ``noise`` surfaces beside the card scatter: at least 1."""
 
     def _aim_transfer(
         self,
@@ -193,6 +200,26 @@ class Problem:
                 mean = max(0.0, float((weights * gain * missing).sum() / (weights * gain**2).sum()))
             means[c] = mean
         return means, (bounds[0], bounds[1], bounds[2])
+
+    def card_factor(self, bounds: tuple[bool, bool, bool], doubt: float) -> float:
+        """Share of what makes the card right that is believed, 0 to 1.
+
+        The card's irradiance errs by its white, the response and the ball. What is missing of it is at least the
+        measured less that error, and up to twice the missing is no worse than nothing.
+
+        Args:
+            bounds: From ``card_means``.
+            doubt: Standard deviation of the card's logarithm.
+        """
+        config = CONFIG.evidence
+        shares = []
+        for c in range(3):
+            use = (self.kind == Kind.CARD) & (self.exact[:, c] | (self.bound[:, c] & bounds[c]))
+            if use.any():
+                shares.append(1.0 - float(np.median(self.captured[use, c] * self.white / self.light[use, c])))
+        missing = float(np.mean(shares)) if shares else 0.0
+        error = 1.28 * float(np.linalg.norm([doubt, config.response, config.ball]))
+        return float(np.clip(2.0 * config.safety * (missing - error) / max(missing, 1e-9), 0.0, 1.0))
 
     # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of each surface.
 

@@ -48,8 +48,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from warp_ar.light.card import NO_CARD, CardCheck, check_card
 from warp_ar.light.config import CONFIG
 from warp_ar.light.emitters import EmitterSearch
+from warp_ar.light.evidence import (
+    Interval,
+    allowed_factor,
+    blocks_of,
+    doubt_of,
+    draw_missing,
+    irradiance_form,
+    irradiance_interval,
+    likely_gain,
+    spread_directions,
+)
 from warp_ar.light.fit import fit_channel
 from warp_ar.light.problem import Peak, Problem, Trace, mirroring_points
 from warp_ar.light.solver import ONE_BLAS_THREAD
@@ -85,6 +97,14 @@ class Estimate:
     """Channels in which the card clips or is not seen: there the total is a lower bound, or rests on priors."""
     lamps: tuple[Lamp, ...] = ()
     """Peaks, by falling power."""
+    method: str = "clipped"
+    """What the estimate rests on: that which was asked for, or what evidence was left for."""
+    factor: float = 0.0
+    """Share of the method's own solution that evidence allows, 0 to 1; ``excess`` and ``lamps`` hold it."""
+    card: CardCheck = NO_CARD
+    """What speaks for the card being in the picture."""
+    irradiance: Interval | None = None
+    """Of light from all directions."""
 
 
 class Recovery:
@@ -118,6 +138,10 @@ class Recovery:
         self._peaks: list[Peak] = []
         self._frames = 0
         self._stillness = Stillness()
+        self._blocks = blocks_of(surfaces)
+        self._evidence: _Evidence | None = None
+        self._held: Estimate | None = None
+        self._unseen = 0
 
     def rests(self, cells: NDArray[Any], observations: NDArray[Any]) -> bool:
         """Whether the last estimate still holds, as far as the light tells: then there is nothing to solve for.
@@ -158,16 +182,22 @@ class Recovery:
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
+        card = check_card(problem.points, problem.kind, problem.light)
+        if not card.holds:
+            return self._without_card(problem, card)
         self._frames += 1
+        self._unseen = 0
         means, bounds = problem.card_means()
+        by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
         if self.method == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
-            excess = problem.member @ (problem.expected[problem.component][:, None] * means)
-            return self._estimate(problem, excess, bounds)
+            factor = problem.card_factor(bounds, doubt_of(card.contrast))
+            self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
+            return self._held
         means = np.maximum(means, 0.05)
         # The channel that surfaces show best.
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
-        self._search(problem, best, means[best])
-        solution = _solve_channels(problem, best, means, bounds)
+        is_turn = self._search(problem, best, means[best])
+        solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
         # A lamp that gives nothing in any channel has gone out, or never was.
         powers = solution[problem.parts :]
         self._peaks = [peak for peak, power in zip(problem.peaks, powers, strict=True) if power.any()]
@@ -177,10 +207,35 @@ class Recovery:
             excess += problem.patch(peak.cell) * power
             lamps.append(Lamp(problem.origin[peak.cell], problem.direction[peak.cell], peak.distance, power))
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
-        return self._estimate(problem, excess, bounds, tuple(lamps))
+        if is_turn or self._evidence is None:
+            start = fit_channel(problem, best, problem.start(means[best]), CONFIG.solver.iterations).z
+            self._evidence = _weigh(problem, best, start, (excess, by_card), self._blocks, doubt_of(card.contrast))
+        evidence = self._evidence
+        if evidence.method == "shading":
+            self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
+        else:
+            self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
+        return self._held
 
-    def _search(self, problem: Problem, best: int, mean: float) -> None:
-        """Peaks of former frames, one of them moved, and new ones where it is their turn to be looked for."""
+    def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
+        """What is held while the card is hidden for a while, else the light as captured.
+
+        Without a surface of known reflectance only the shape of shadows tells how bright a lamp is, and texture,
+        gloss and clutter look like shadows.
+        """
+        self._unseen += 1
+        if self._held is not None and self._unseen <= CONFIG.card.held:
+            return self._held
+        self._held, self._peaks, self._evidence = None, [], None
+        nothing = np.zeros((len(problem.solid_angle), 3))
+        return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
+
+    def _search(self, problem: Problem, best: int, mean: float) -> bool:
+        """Peaks of former frames, one of them moved, and new ones where it is their turn to be looked for.
+
+        Returns:
+            Whether it was.
+        """
         config = CONFIG.search
         for peak in self._peaks:
             if problem.may_hold_peak[peak.cell]:
@@ -196,12 +251,77 @@ class Recovery:
         elif before % (config.later_every if settled else config.every) == 1:
             candidates = config.candidates if before < config.first else config.later_candidates
             search.find_peaks(start, min(left, 1), candidates=candidates, turn=before // config.every)
+        else:
+            return False
+        return True
 
-    @staticmethod
     def _estimate(
-        problem: Problem, excess: Array, bounds: tuple[bool, bool, bool], lamps: tuple[Lamp, ...] = ()
+        self,
+        problem: Problem,
+        excess: Array,
+        bounds: tuple[bool, bool, bool],
+        method: str,
+        factor: float,
+        card: CardCheck,
+        lamps: tuple[Lamp, ...] = (),
     ) -> Estimate:
-        return Estimate(excess.reshape(*problem.shape, 3).astype(np.float32), bounds, lamps)
+        """The share ``factor`` of a solution, and between which bounds that leaves irradiance."""
+        if factor == 0.0:
+            method, lamps = "clipped", ()
+        lamps = tuple(dataclasses.replace(lamp, power=factor * lamp.power) for lamp in lamps)
+        spread = self._evidence.spread if self._evidence is not None else None
+        interval = irradiance_interval(problem, excess, factor, bounds, spread)
+        cells = (factor * excess).reshape(*problem.shape, 3).astype(np.float32)
+        return Estimate(cells, bounds, lamps, method, factor, card, interval)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Evidence:
+    """What draws say of a frame's solutions."""
+
+    method: str
+    factor: float
+    spread: float
+    """Standard deviation of the missing irradiance over its mean."""
+
+    @property
+    def parts(self) -> tuple[str, float]:
+        return self.method, self.factor
+
+
+def _weigh(
+    problem: Problem, c: int, z: Array, solutions: tuple[Array, Array], blocks: NDArray[np.int64], doubt: float
+) -> _Evidence:
+    """Which of two solutions, by shading and by the card alone, to take, and how much of it."""
+    form = irradiance_form(problem, spread_directions(CONFIG.evidence.directions))
+    missing = draw_missing(problem, c, z, blocks, doubt) @ form.T
+    total = missing.sum(axis=1)
+    spread = float(total.std() / max(total.mean(), 1e-9))
+    found = []
+    for method, excess in zip(("shading", "white_card"), solutions, strict=True):
+        added = form @ (excess[:, c] * problem.lacking[:, c])
+        factor = allowed_factor(added, missing)
+        found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
+    return max(found, key=lambda one: one[0])[1]
+
+
+def tie_channels(problem: Problem, solution: Array) -> Array:
+    """A solution without light of one channel only, unless that channel clips where others do not, (parts + peaks, 3).
+
+    What lamps look like in one channel is told by surfaces that show that channel: texture, or another response in it,
+    makes lamps of one colour. Where all channels lack light, none is more than some times the median of the three.
+
+    Args:
+        problem: The equations.
+        solution: Radiance of parts, then power of peaks, (parts + peaks, 3).
+    """
+    config = CONFIG.priors
+    cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
+    cells += [np.array([peak.cell]) for peak in problem.peaks]
+    lacking = np.array([problem.solid_angle[own] @ problem.lacking[own] for own in cells]).reshape(-1, 3)
+    most = config.colour * np.median(solution, axis=1, keepdims=True)
+    alone = lacking > config.own_clipping * np.median(lacking, axis=1, keepdims=True)
+    return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:

@@ -67,7 +67,7 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 
     Args:
         scene: What is modelled.
-        card_only: Leave out all but the card's paper.
+        card_only: Leave out all but the card: its paper and its ink.
     """
     found = _Collector()
     cells, white, side, outline = printed_cells(scene.marker)
@@ -81,10 +81,9 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     paper = [*cells[white], *np.column_stack([ring, np.zeros(len(ring))])]
     if scene.has_marker:
         found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
+        found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
     if card_only:
         return found.result()
-    if scene.has_marker:
-        found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
     margin = 0.3 * float((high - low).max())
     for number, proxy in enumerate(scene.proxies):
         rotation, at = rotation_matrix(proxy.rotate), np.array(proxy.at)

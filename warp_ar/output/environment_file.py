@@ -12,7 +12,8 @@ import OpenEXR
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import is_file, limits, too_much, write_whole
 from warp_ar.output.folder_sink import FolderSink
-from warp_ar.output.places import PROGRAM, check_replaceable
+from warp_ar.output.places import check_replaceable
+from warp_ar.signature import PROGRAM
 
 
 class EnvironmentSink(FolderSink):

@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of, write_whole
-from warp_ar.output.places import earlier_frames, sign_png
+from warp_ar.output.places import earlier_frames
 from warp_ar.output.sink import ThreadedSink, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES
+from warp_ar.signature import sign_png
 
 FOLDER_THREADS = 2
 """Threads that compress the frames of a folder."""

@@ -1,8 +1,7 @@
 """Where output may go: never onto what is read, and onto a file of somebody else's only where that is allowed.
 
-What this program writes says so: a PNG in its text, an OpenEXR in its header, a video in its comment, a report in its
-first key. Such a file is replaced, and the sink says that it was; any other is left alone unless overwriting is asked
-for.
+What this program wrote, by its signature, is replaced, and the sink says that it was; any other file is left alone
+unless overwriting is asked for.
 """
 
 from __future__ import annotations
@@ -10,54 +9,15 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import struct
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import av
-
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import is_same_file, kind_of
+from warp_ar.signature import is_signed
 
-PROGRAM = "warp_ar"
-"""How this program signs what it writes."""
-
-_HEAD = 4096
-"""Bytes at the start of a file in which its signature stands, but for videos."""
 _NUMBERED = re.compile(r"[0-9]{4,}\.(png|exr)")
-
-
-def sign_png(data: bytes) -> bytes:
-    """A PNG with the signature as its ``Software``, behind the header, which takes 33 bytes."""
-    body = b"tEXtSoftware\0" + PROGRAM.encode()
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-    return data[:33] + chunk + data[33:]
-
-
-def is_signed(path: str | os.PathLike[str]) -> bool:
-    """Whether this program wrote a file; what cannot be read, it did not."""
-    try:
-        if kind_of(path) != "file":
-            return False
-        with open(path, "rb") as stream:
-            head = stream.read(_HEAD)
-    except OSError:
-        return False
-    name = PROGRAM.encode()
-    if head.startswith(b"\x89PNG"):
-        return b"tEXtSoftware\0" + name in head
-    if head.startswith(b"\x76\x2f\x31\x01"):
-        return b"software\0string\0" + struct.pack("<I", len(name)) + name in head
-    if head[4:8] == b"ftyp" or head.startswith(b"\x1a\x45\xdf\xa3"):
-        try:
-            options = {"format_whitelist": "mov,mp4,matroska,webm", "protocol_whitelist": "file"}
-            with av.open(str(path), options=options) as container:
-                return str(container.metadata.get("comment", container.metadata.get("COMMENT", ""))) == PROGRAM
-        except (av.FFmpegError, OSError, ValueError):
-            return False
-    return re.match(rb'\s*\{\s*"program":\s*"%s"' % name, head) is not None
 
 
 def check_replaceable(path: Path, *, overwrite: bool) -> str:

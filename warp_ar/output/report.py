@@ -38,6 +38,7 @@ class RunLog:
         self._pipeline = pipeline
         self._frames: list[dict[str, Any]] = []
         self._skipped: dict[str, int] = {}
+        self._left_out: dict[str, dict[str, int]] = {}
         self._steps: list[dict[str, float]] = []
         self._first = 0.0
         self._last = 0.0
@@ -71,8 +72,13 @@ class RunLog:
             self.never_posed = False
         stages = {name: round(timing.milliseconds, 4) for name, timing in result.stages.items() if not timing.skipped}
         for name, timing in result.stages.items():
-            self._skipped[name] = self._skipped.get(name, 0) + timing.skipped
-        self._frames.append({"index": self.count, "pose": _pose_record(result.pose), "stages": stages})
+            self._skipped[name] = self._skipped.get(name, 0) + (timing.skipped and timing.left_out is None)
+            if timing.left_out is not None:
+                reasons = self._left_out.setdefault(name, {})
+                reasons[timing.left_out] = reasons.get(timing.left_out, 0) + 1
+        frame = {"index": self.count, "pose": _pose_record(result.pose), "stages": stages}
+        left_out = {name: timing.left_out for name, timing in result.stages.items() if timing.left_out is not None}
+        self._frames.append({**frame, "left_out_of_this_frame": left_out} if left_out else frame)
 
     def median_ms(self, stage: str) -> float | None:
         """Median milliseconds of ``stage`` over the frames in which it ran, warm-up excluded where there is enough."""
@@ -83,6 +89,10 @@ class RunLog:
     def skipped(self, stage: str) -> int:
         """Frames in which ``stage`` was skipped because nothing that it reads had changed."""
         return self._skipped.get(stage, 0)
+
+    def left_out(self, stage: str) -> dict[str, int]:
+        """Frames of which ``stage`` was left out because it could change no pixel of them, by reason."""
+        return self._left_out.get(stage, {})
 
     def steps(self) -> dict[str, float]:
         """Median milliseconds of each step of a frame's way; different frames take different steps side by side."""
@@ -128,6 +138,17 @@ def left_out(plan: Plan) -> list[tuple[str, str]]:
     return [*tracking, *plan.left_out]
 
 
+def _state(stage: str, log: RunLog | None) -> str:
+    """Whether a stage of the plan ran in all frames."""
+    if log is None:
+        return "runs"
+    skipped, left_out = log.skipped(stage), sum(log.left_out(stage).values())
+    words = [f"skipped {skipped}x"] * bool(skipped) + [f"left out {left_out}x"] * bool(left_out)
+    if log.count in (skipped, left_out) and len(words) == 1:
+        return words[0].split()[0] if skipped else "left out"
+    return ", ".join(words) or "runs"
+
+
 def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     """Print the table of stages: what runs, with ``log`` its median times too, and what is left out and why."""
     request = plan.request
@@ -142,12 +163,10 @@ def print_plan(plan: Plan, log: RunLog | None = None) -> None:
     methods = {stage.name: stage.method_for(plan.features) for stage, _ in plan.stages} | {TRACK: "default"}
     for name in stage_names(plan):
         milliseconds = log.median_ms(name) if log is not None else None
-        skipped = log.skipped(name) if log is not None else 0
-        state = (
-            "runs" if not skipped else "skipped" if log is not None and skipped == log.count else f"skipped {skipped}x"
-        )
         time_text = "" if milliseconds is None else f"{milliseconds:.2f}"
-        table.add_row(name, methods[name], state, time_text, summaries[name])
+        table.add_row(name, methods[name], _state(name, log), time_text, summaries[name])
+        for reason, frames in (log.left_out(name) if log is not None else {}).items():
+            table.add_row("", "", "", "", f"left out of {frames} frames: {reason}", style="dim")
     for name, reason in left_out(plan):
         table.add_row(name, "", "left out", "", reason, style="dim")
     Console().print(table)

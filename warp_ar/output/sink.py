@@ -7,6 +7,7 @@ A sink encodes while the next frame is being made, a few frames deep at most. Wh
 from __future__ import annotations
 
 import collections
+import concurrent.futures
 import contextlib
 import pathlib
 import tempfile
@@ -124,14 +125,28 @@ class ThreadedSink(Sink):
         if self._closed:
             return
         self._closed = True
+        # Finished on a thread, for a signal interrupts what the main thread does wherever it is.
+        last = self._executor.submit(self._finish_after, list(self._pending))
         try:
             self._settle(0)
         finally:
+            self._wait_out()
+        last.result()
+
+    def _finish_after(self, pending: list[Future[None]]) -> None:
+        concurrent.futures.wait(pending)
+        self._finish()
+
+    def _wait_out(self) -> None:
+        """Wait for the threads' end, which one interrupt does not cut short."""
+        try:
             self._executor.shutdown(wait=True)
-            self._finish()
+        except KeyboardInterrupt:
+            self._executor.shutdown(wait=True)
+            raise
 
     def _finish(self) -> None:
-        """Close what is open, after the last frame has been stored."""
+        """Close what is open, after the last frame has been stored; runs on a thread."""
 
 
 class NullSink(Sink):

@@ -18,9 +18,10 @@ import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.output.places import PROGRAM, check_replaceable
+from warp_ar.output.places import check_replaceable
 from warp_ar.output.sink import ThreadedSink, make_folder
 from warp_ar.output.whole_fragments import WholeFragments
+from warp_ar.signature import PROGRAM
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 VIDEO_SUFFIXES = tuple(_FORMATS)

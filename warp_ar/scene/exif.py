@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import logging
 import math
 import re
+import struct
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +15,8 @@ import exifread
 from PIL import Image, UnidentifiedImageError
 
 from warp_ar.errors import SceneError
+from warp_ar.files import read_bytes
+from warp_ar.pictures import check_picture
 from warp_ar.scene.description import Camera
 
 FULL_FRAME_DIAGONAL: Final = math.hypot(36.0, 24.0)
@@ -25,6 +29,23 @@ LEAST_SIDE: Final = 400
 """Pixels along the shorter side below which a picture is a cut-out or a thumbnail."""
 _TURNED: Final = (5, 6, 7, 8)
 """EXIF orientations that exchange width and height."""
+
+# What exifread and Pillow have been seen to raise on damaged files; they do not document it.
+_READING_ERRORS: Final = (
+    OSError,
+    UnidentifiedImageError,
+    Image.DecompressionBombError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    RecursionError,
+    MemoryError,
+    SyntaxError,
+    struct.error,
+)
 
 # It logs that a picture has no EXIF: that is no event.
 logging.getLogger("exifread").setLevel(logging.ERROR)
@@ -92,12 +113,13 @@ def read_exif(path: str | Path) -> PhotoInfo:
         SceneError: The file is missing or no picture.
     """
     path = Path(path)
+    data = read_bytes(path, "picture_bytes", SceneError, f"{path}: the photograph")
+    check_picture(data, SceneError, f"{path}: the photograph")
     try:
-        with Image.open(path) as picture:
+        with Image.open(io.BytesIO(data)) as picture:
             width, height = picture.size
-        with path.open("rb") as file:
-            tags = exifread.process_file(file, details=False)
-    except (OSError, UnidentifiedImageError, ValueError, Image.DecompressionBombError) as error:
+        tags = exifread.process_file(io.BytesIO(data), details=False)
+    except _READING_ERRORS as error:
         raise SceneError(f"{path}: no photograph whose EXIF can be read ({' '.join(str(error).split())})") from error
     if _number(tags, "Image Orientation") in _TURNED:
         width, height = height, width

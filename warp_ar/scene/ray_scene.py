@@ -23,7 +23,8 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.mesh_files import load_mesh, load_texture
+from warp_ar.scene.mesh_cache import load_kept_mesh
+from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
 
@@ -312,7 +313,7 @@ class HostScene:
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
-            mesh = load_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
+            mesh = load_kept_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
             ray_mesh = make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
@@ -388,13 +389,18 @@ class HostScene:
         """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
             faces = [box_faces(record) for record in self._proxies]
-            self._lit = Outline([part for light in self._lights for own in faces for part in lit_faces(light, own)])
+            shining = self._shining()
+            self._lit = Outline([part for light in shining for own in faces for part in lit_faces(light, own)])
             self._bounced = None
         if not bounced:
             return self._lit
         if self._bounced is None:
-            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._lights, self._proxies)])
+            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), self._proxies)])
         return self._bounced
+
+    def _shining(self) -> npt.NDArray[Any]:
+        """Records of the lights that have power: no other falls anywhere."""
+        return self._lights[self._lights["intensity"].any(axis=1)]
 
     def ball_outline(self) -> Outline:
         """Where mirror balls are."""

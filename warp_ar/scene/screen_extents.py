@@ -39,6 +39,8 @@ _CONE_SIDES: Final = 8
 # From this half angle on a pyramid would be nearly flat; the cone is then taken to reach everything.
 _WIDE_CONE: Final = math.radians(75.0)
 
+# A face that more lit faces reach than this is taken to be reached all over: each part costs a clipped polygon.
+_MOST_PARTS: Final = 8
 # Faces of a box as (2, 2, 2) corner indices; the first is that of a plane, whose box has no height.
 _FACES: Final = (
     (0, 2, 6, 4),
@@ -146,18 +148,27 @@ def bounced_faces(lights: npt.NDArray[Any], proxies: npt.NDArray[Any]) -> list[F
                 directional = light["kind"] == structs.DIRECTIONAL
                 if (float(-direction @ facing) if directional else float((at - face[0]) @ facing)) > 0.0:
                     sources += [(part, facing) for part in lit_faces(light, [face])]
+    if not sources:
+        return []
+    # Of all sources at once: a scene of a hundred boxes has as many sources as faces.
+    most = max(len(part) for part, _ in sources)
+    corners = np.stack([part[np.minimum(np.arange(most), len(part) - 1)] for part, _ in sources])
+    normals = np.stack([np.zeros(3) if normal is None else normal for _, normal in sources])
+    offsets = np.einsum("ij,ij->i", normals, corners[:, 0]) - 1e-9
     reached: list[FloatArray] = []
     for record in proxies:
         faces, rotation = box_faces(record), np.array(record["rotation"], np.float64)
         center = np.mean([face.mean(axis=0) for face in faces], axis=0)
         for face in faces:
-            inward = -_outward(face, center, int(record["kind"]), rotation)
-            for part, normal in sources:
-                if record["kind"] != structs.MESH and (part @ inward >= float(face[0] @ inward) - 1e-9).all():
-                    continue
-                seen = face if normal is None else _clip(face, normal, float(normal @ part[0]) - 1e-9)
-                if len(seen):
-                    reached.append(seen)
+            before = normals @ face.T >= offsets[:, None]
+            reaching = before.any(axis=1)
+            if record["kind"] != structs.MESH:
+                inward = -_outward(face, center, int(record["kind"]), rotation)
+                reaching &= (corners @ inward < float(face[0] @ inward) - 1e-9).any(axis=1)
+            if (reaching & before.all(axis=1)).any() or np.count_nonzero(reaching) > _MOST_PARTS:
+                reached.append(face)
+            else:
+                reached += [_clip(face, normals[k], float(offsets[k])) for k in np.flatnonzero(reaching)]
     return reached
 
 

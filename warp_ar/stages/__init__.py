@@ -1,48 +1,51 @@
-"""The stages, in the order in which they may run."""
+"""The stages, in the order in which they may run.
+
+They are imported when ``STAGES`` is first asked for: presets and words of this room can be read without loading Warp.
+"""
 
 from __future__ import annotations
 
-from warp_ar.stages.accumulate import Accumulate
-from warp_ar.stages.base import Stage
-from warp_ar.stages.bracket import Bracket
-from warp_ar.stages.captured import Captured
-from warp_ar.stages.composite import Composite
-from warp_ar.stages.declip import Declip
-from warp_ar.stages.environment_samples import EnvironmentSamples
-from warp_ar.stages.environment_shadow import EnvironmentShadow
-from warp_ar.stages.expose import Expose
-from warp_ar.stages.fill import Fill
-from warp_ar.stages.irradiance import Irradiance
-from warp_ar.stages.key_lights import KeyLights
-from warp_ar.stages.mirror_ball import MirrorBall
-from warp_ar.stages.near_field import NearField
-from warp_ar.stages.prefilter import Prefilter
-from warp_ar.stages.recover import Recover
-from warp_ar.stages.relight import Relight
-from warp_ar.stages.shade import Shade
-from warp_ar.stages.summed_area import SummedArea
-from warp_ar.stages.unwrap import Unwrap
-from warp_ar.stages.visibility import Visibility
+import importlib
+from typing import TYPE_CHECKING, Any
 
-STAGES: tuple[type[Stage], ...] = (
-    Captured,
-    Unwrap,
-    Bracket,
-    Accumulate,
-    Fill,
-    Recover,
-    KeyLights,
-    Irradiance,
-    Prefilter,
-    Visibility,
-    SummedArea,
-    EnvironmentSamples,
-    Relight,
-    EnvironmentShadow,
-    NearField,
-    Shade,
-    MirrorBall,
-    Composite,
-    Declip,
-    Expose,
+if TYPE_CHECKING:
+    from warp_ar.stages.base import Stage
+
+_ORDER = (
+    "captured.Captured",
+    "sphere_map.SphereMap",
+    "unwrap.Unwrap",
+    "bracket.Bracket",
+    "accumulate.Accumulate",
+    "fill.Fill",
+    "recover.Recover",
+    "key_lights.KeyLights",
+    "irradiance.Irradiance",
+    "prefilter.Prefilter",
+    "visibility.Visibility",
+    "summed_area.SummedArea",
+    "environment_samples.EnvironmentSamples",
+    "relight.Relight",
+    "environment_shadow.EnvironmentShadow",
+    "near_field.NearField",
+    "shade.Shade",
+    "mirror_ball.MirrorBall",
+    "composite.Composite",
+    "declip.Declip",
+    "expose.Expose",
 )
+"""Module and class of every stage: a new one is registered here."""
+
+STAGES: tuple[type[Stage], ...]
+"""Every stage's class."""
+
+
+def __getattr__(name: str) -> Any:
+    if name != "STAGES":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    stages = tuple(
+        getattr(importlib.import_module(f"{__name__}.{module}"), kind)
+        for module, kind in (entry.split(".") for entry in _ORDER)
+    )
+    globals()["STAGES"] = stages
+    return stages

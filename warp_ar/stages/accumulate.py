@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import accumulate
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
 
@@ -20,6 +20,7 @@ class Accumulate(Stage):
     summary: ClassVar[str] = "steadies the light over time and remembers what is out of sight"
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; m + a (x - m), exact where x = m",
         bound=1e-5,
@@ -33,7 +34,7 @@ class Accumulate(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
         if not features.observed:
-            return LeftOut(features.unobserved)
+            return LeftOut(unobserved(features))
         seen = "merged" if features.merged else "probe"
         return Wiring(
             (*(f"{seen}_{part}" for part in UNWRAPPED), "clock"),

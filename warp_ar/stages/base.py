@@ -48,6 +48,28 @@ class ArraySpec:
 
 
 @dataclasses.dataclass(frozen=True)
+class Reach:
+    """What of a frame virtual things can reach, known on the host before any stage runs."""
+
+    objects: bool = True
+    """A virtual object may be in the picture."""
+    shines: bool = True
+    """A virtual light has power."""
+    falls: bool = True
+    """Virtual light may fall on the receiver, in the picture or beside it."""
+    light: bool = True
+    """Virtual light may fall on the receiver in the picture."""
+    shadows: bool = True
+    """A virtual object may change the environment on the receiver in the picture."""
+    balls: bool = True
+    """A mirror ball may be in the picture."""
+
+
+OUT_OF_PICTURE = "no virtual object is in the picture"
+"""Reason of several stages to be idle."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Pass:
     """One launch (or a short fixed series): everything in it may run side by side, the next pass waits for it."""
 
@@ -128,8 +150,14 @@ class Arrays(Mapping[str, Any]):
         return tuple(map(self._versions.__getitem__, names))
 
 
+NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
-"""Reason that several stages give."""
+"""Reasons that several stages give."""
+
+
+def unobserved(features: Features) -> str:
+    """Why nothing is read off a mirror ball, where no ball shows the environment."""
+    return NO_BALL if features.request.scene.captured is None else "the environment comes from a file"
 
 
 class Stage(abc.ABC):
@@ -156,6 +184,9 @@ class Stage(abc.ABC):
     """Method for frames that nobody looks at, where the stage only shows the light; None: as in all frames."""
     remembers: ClassVar[tuple[str, ...]] = ()
     """Its arrays that carry over from frame to frame, and so to the pipeline of another quality."""
+
+    follows: ClassVar[bool] = False
+    """Whether it runs in every frame, read or not: what it remembers is a sum over all of them."""
 
     def __init__(self, features: Features, wiring: Wiring) -> None:
         self.features, self.wiring = features, wiring
@@ -189,6 +220,25 @@ class Stage(abc.ABC):
 
     def begin(self) -> None:  # noqa: B027  (most stages treat all frames alike)
         """Called once in every frame in which the stage runs, before any of its passes."""
+
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Kernels that its steps on the host launch: they are compiled with the others."""
+        return ()
+
+    def idle(self, reach: Reach) -> str | None:
+        """Why what the stage writes is as if it did nothing in a frame; None where it may do something.
+
+        Its passes then write just that, whatever the stage reads. What it says may change only when something that it
+        reads does.
+        """
+        return None
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        """Those of the resources that it reads on which what it writes may depend in a frame; as ``idle``."""
+        return self.wiring.reads
+
+    def rest(self) -> None:  # noqa: B027
+        """Called instead of ``begin`` in a frame in which nothing reads what the stage writes."""
 
     def runs_after(self) -> tuple[str, ...]:
         """Names of stages that are slower beside this one than before it: on CUDA it waits for them.

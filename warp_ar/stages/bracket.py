@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import bracket as kernels
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.kernels.launch import copy
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
 
@@ -19,6 +20,7 @@ class Bracket(Stage):
     name: ClassVar[str] = "bracket"
     summary: ClassVar[str] = "merges alternating exposures: what clips in the long one comes from the short one"
     unread: ClassVar[str] = "nothing asks for the environment"
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=2e-6,
@@ -32,7 +34,7 @@ class Bracket(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball, and a source whose frames alternate between exposures."""
         if not features.observed:
-            return LeftOut(features.unobserved)
+            return LeftOut(unobserved(features))
         if len(features.request.exposures) < 2:
             return LeftOut("the source tells of no alternating exposures")
         if not features.merged:
@@ -61,7 +63,7 @@ class Bracket(Stage):
 
         def store(rows: Rows | None) -> None:
             for target, source in own:
-                wp.copy(target, source)
+                copy(target, source)
 
         def spread(rows: Rows | None) -> None:
             kernels.spread_clipping(

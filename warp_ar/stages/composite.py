@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import composite
 from warp_ar.kernels.codes import by_warps
+from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.layers import composite_config, layers_of
@@ -48,7 +49,8 @@ class Composite(Stage):
         """On CPU a plain copy, then a pass over the rows that a layer can reach; on CUDA one pass over all."""
         config = composite_config(self.features.layers)
         width, height = self.request.size
-        composite.make_composite_kernel(config, by_warps(device, width))
+        if not device.is_cpu:
+            composite.make_composite_kernel(config, by_warps(device, width))
         image, frame, layers = arrays["image"], arrays["frame"], layers_of(arrays)
 
         def launch(rows: Rows | None) -> None:
@@ -67,4 +69,4 @@ class Composite(Stage):
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
         extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
-        return [Pass(lambda rows: wp.copy(image, frame)), Pass(launch, rows=height, extent=union_of(extents))]
+        return [Pass(lambda rows: copy(image, frame), rows=height), Pass(launch, rows=height, extent=union_of(extents))]

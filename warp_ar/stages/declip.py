@@ -11,6 +11,7 @@ from warp_ar.kernels import declip
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Declip(Stage):
@@ -46,7 +47,8 @@ class Declip(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Twice up and down the pyramid: for pixels that clip in some channels, then for those that clip in all."""
         ball = self.features.declipped_by_ball
-        config = declip.DeclipConfig(ball, trace_config(self.request.scene).proxies if ball else ())
+        kinds = trace_variant(trace_config(self.request.scene), device).proxies
+        config = declip.DeclipConfig(ball, kinds if ball else ())
         declip.make_complete_core_kernel(config)
         frame, decode, out, levels = (arrays[name] for name in ("frame", "decode", "declipped", "declip_levels"))
         marked, active = arrays["declip_marked"], arrays["declip_active"]

@@ -9,9 +9,10 @@ import warp as wp
 
 from warp_ar.kernels import environment_samples, pyramid
 from warp_ar.kernels.environment_samples import EnvironmentSample
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, SAMPLES, lists_texels, sample_names
+from warp_ar.stages.shared.settled import settled_environment
 
 
 class EnvironmentSamples(Stage):
@@ -62,7 +63,7 @@ class EnvironmentSamples(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Sum, then invert; and list the texels of a small map."""
-        environment, samples = arrays["environment"], arrays["environment_samples"]
+        environment, samples = settled_environment(arrays, device), arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples
         probes = self.request.scene.probes

@@ -15,12 +15,25 @@ from warp_ar.kernels import environment_shadow_wavefront as wavefront
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
+from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import distant_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +117,10 @@ class EnvironmentShadow(Stage):
             reads.append("frame")
         return Wiring(tuple(reads), ("shadow_ratio",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Far from objects the environment is as it was."""
+        return None if reach.shadows else "no virtual object is near anything in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
@@ -131,7 +148,7 @@ class EnvironmentShadow(Stage):
         distant = make_distant_light(self.features, arrays, self.name)
         distant.environment = arrays["environment"]
         params, scene, cells = arrays["params"], arrays["ray_scene"], self._cells(arrays)
-        picture = make_picture(arrays, frame=config.bounce == "traced")
+        picture = find_picture(arrays, frame=config.bounce == "traced")
         sets = SampleSets()
         sets.directions, sets.flux, sets.samples = (arrays[name] for name in sample_names(self.features))
 
@@ -166,7 +183,7 @@ class EnvironmentShadow(Stage):
         method = METHODS[self.method]
         partials = 1 if device.is_cpu else count_partials(*arrays["environment_shadow_ratio"].shape)
         return EnvironmentShadowConfig(
-            self.features.distant,
+            distant_variant(self.features, device),
             method.count,
             method.side,
             method.bounce,

@@ -12,6 +12,7 @@ from warp_ar.kernels.codes import by_warps
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.layers import composite_config, layers_of
+from warp_ar.stages.shared.variants import composite_variant
 
 
 class Expose(Stage):
@@ -67,7 +68,7 @@ class Expose(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The scale, the codes, the picture."""
-        composed = composite_config(self.features.layers)
+        composed = composite_variant(composite_config(self.features.layers), device)
         config = expose.ExposeConfig(
             self.method if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
         )

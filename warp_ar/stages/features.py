@@ -24,10 +24,6 @@ from warp_ar.scene.ray_scene import (
 from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 
-NO_BALL = "the scene has no mirror ball, so the environment is unknown"
-"""Why a stage is left out that needs the environment."""
-CAPTURED = "the environment comes from a file"
-"""Why a stage is left out that would read it off a ball."""
 FLAT = "flat"
 """Method of ``relight`` that needs nothing of the environment."""
 LOCAL = ("bounce", "brute_force")
@@ -74,11 +70,6 @@ class Features:
     """Resource that holds the environment's irradiance."""
     distant: DistantLightConfig
     """Forms of the environment that the objects reflect."""
-
-    @property
-    def unobserved(self) -> str:
-        """Why no ball tells of the environment, where none does."""
-        return CAPTURED if self.request.scene.captured is not None else NO_BALL
 
     @property
     def shadowed(self) -> bool:
@@ -165,4 +156,5 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLi
         specular=environment and any(map(reflects_glossily, materials)),
         probes=bool(scene.probes),
         emitters=emitters,
+        captured=scene.captured is not None,
     )

@@ -1,4 +1,4 @@
-"""What no ball shows is filled in from what it does."""
+"""What no ball shows is filled in from what the camera sees beyond it, and from what it does show."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import change, fill
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.kernels import change, fill, fill_frame
+from warp_ar.scene.ray_scene import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 
 
@@ -17,7 +18,9 @@ class Fill(Stage):
     """The complete map: what everything downstream reads, or what ``recover`` starts from."""
 
     name: ClassVar[str] = "fill"
-    summary: ClassVar[str] = "completes the blind cone and hidden parts from confident neighbours"
+    summary: ClassVar[str] = (
+        "completes the blind cone and hidden parts from the frame itself and from confident neighbours"
+    )
     unread: ClassVar[str] = "nothing asks for the environment"
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
     numerics: ClassVar[Numerics] = Numerics(
@@ -32,9 +35,9 @@ class Fill(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
         if not features.observed:
-            return LeftOut(features.unobserved)
+            return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
-        return Wiring(("environment_radiance", "environment_confidence"), (written,))
+        return Wiring(("environment_radiance", "environment_confidence", "frame", "pose"), (written,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the fill pyramid, and what readers have seen."""
@@ -62,6 +65,22 @@ class Fill(Stage):
                 arrays["environment_radiance"], arrays["environment_confidence"], arrays["fill_levels"], rows=rows
             )
 
+        proxies = trace_config(self.request.scene).proxies
+
+        def see(rows: Rows | None) -> None:
+            fill_frame.fill_frame(
+                arrays["frame"],
+                arrays["decode"],
+                arrays["params"],
+                arrays["probes"],
+                arrays["ray_scene"],
+                arrays["fill_levels"],
+                height,
+                2 * height,
+                proxies=proxies,
+                rows=rows,
+            )
+
         def push_pull(rows: Rows | None) -> None:
             fill.push_pull(arrays["fill_levels"], height, 2 * height, most=most)
 
@@ -73,7 +92,7 @@ class Fill(Stage):
                 arrays[self.wiring.writes[0]], arrays["fill_published"], arrays["fill_difference"], rows=rows
             )
 
-        passes = [Pass(seed, rows=height), Pass(push_pull), Pass(finish, rows=height)]
+        passes = [Pass(seed, rows=height), Pass(see, rows=height), Pass(push_pull), Pass(finish, rows=height)]
         return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
 
     def changed(self, name: str) -> bool:

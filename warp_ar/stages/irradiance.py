@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import irradiance, pyramid
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.kernels import irradiance, pyramid, sphere_map
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
-TOP_MIP_SIZE = (4, 8)  # the paper's diffuse map: the last level of the pyramid that still tells directions apart
+TOP_MIP_SIZE = (4, 8)  # the last level of the pyramid that still tells directions apart
 MAP_SIZE = (32, 64)  # bilinear error of a cosine lobe: (pi / 32)^2 / 8 = 0.12 % of its peak
 CLUSTERS = (10, 20)
 
@@ -22,7 +23,8 @@ class Irradiance(Stage):
 
     name: ClassVar[str] = "irradiance"
     methods: ClassVar[Mapping[str, str]] = {
-        "top_mip": "a 4x8 map (the paper)",
+        "sphere_mip": "a 4x4 level of the sphere map, background included (the paper)",
+        "top_mip": "a 4x8 map of means over solid angles",
         "sh2": "spherical harmonics of order 2",
         "sh4": "of order 4",
         "clusters": "200 clusters of the environment, summed for every direction",
@@ -43,13 +45,24 @@ class Irradiance(Stage):
     )
 
     @classmethod
+    def method_for(cls, features: Features) -> str:
+        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        method = super().method_for(features)
+        return "top_mip" if method == "sphere_mip" and not features.observed else method
+
+    @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Read the environment, write irradiance in the form of the method."""
-        return Wiring(("environment",), (features.irradiance,)) if features.environment else LeftOut(NO_BALL)
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        by_texture = cls.method_for(features) == "sphere_mip"
+        return Wiring(("sphere_map", "pose") if by_texture else ("environment",), (features.irradiance,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance, and sums on the way to it."""
         height = self.request.quality.environment_height
+        if self.method == "sphere_mip":
+            return {"irradiance_map": ArraySpec(MAP_SIZE, wp.vec3)}
         if self.method == "top_mip":
             size = (min(TOP_MIP_SIZE[0], height), min(TOP_MIP_SIZE[1], 2 * height))
             return {"irradiance_map": ArraySpec(size, wp.vec3)}
@@ -75,7 +88,13 @@ class Irradiance(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Launches of the method, and the tables that they need."""
-        environment = arrays["environment"]
+        if self.method == "sphere_mip":
+            level = int(math.log2(sphere_map.SIZE // sphere_map.DIFFUSE_SIZE))
+            known, out = (arrays["params"], arrays["sphere_map"], level, MAP_SIZE), arrays["irradiance_map"].flatten()
+            return [
+                Pass(lambda rows: sphere_map.look_up_level(*known, out, scale=math.pi, rows=rows), rows=MAP_SIZE[0])
+            ]
+        environment = settled_environment(arrays, device)
         if self.method == "top_mip":
             top = arrays["irradiance_map"]
             return [Pass(lambda rows: pyramid.reduce_latlong(environment, top, scale=math.pi))]

@@ -9,8 +9,9 @@ import warp as wp
 
 from warp_ar.kernels import key_lights
 from warp_ar.kernels.structs import KeyLight
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
 
 class KeyLights(Stage):
@@ -45,10 +46,11 @@ class KeyLights(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One short series of launches."""
+        environment = settled_environment(arrays, device)
 
         def find(rows: Rows | None) -> None:
             key_lights.find_key_lights(
-                arrays["environment"], arrays["key_lights_sums"], arrays["key_lights_sectors"], arrays["key_lights"]
+                environment, arrays["key_lights_sums"], arrays["key_lights_sectors"], arrays["key_lights"]
             )
 
         return [Pass(find)]

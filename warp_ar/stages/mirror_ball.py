@@ -11,14 +11,16 @@ import warp as wp
 from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
+from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
+from warp_ar.stages.shared.variants import relight_variant, shade_variant, shares_kernels, trace_variant
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
 """Rays per pixel, by method; cheapest first, after ``none``."""
@@ -27,10 +29,7 @@ SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
 def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     """What the mirrored part of a request's scene calls for."""
     layers = features.layers
-    # What a ball shows of an object is too small for what surrounds it at close range.
-    shading = None
-    if "virtual" in layers:
-        shading = dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
+    shading = mirrored_shading(features) if "virtual" in layers else None
     lit = "physical_added" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(features.request.scene),
@@ -41,9 +40,41 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     )
 
 
+def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallConfig:
+    """What is compiled: where any scene shares it, a scene without objects or lights finds none when it looks."""
+    if not shares_kernels(device):
+        return mirror_config(features)
+    return mirror_ball.MirrorBallConfig(
+        trace_variant(trace_config(features.request.scene), device),
+        SAMPLES[features.request.quality.method("mirror_ball")],
+        shade_variant(mirrored_shading(features), features, device),
+        relight_variant(mirrored_relighting(features), features, device),
+        ratio=True,
+    )
+
+
+def mirrored_shading(features: Features) -> ShadeConfig:
+    """How objects look: what a ball shows of one is too small for what surrounds it at close range."""
+    return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
+
+
 def mirrored_relighting(features: Features) -> RelightConfig:
     """How the desk that a ball shows responds: cells of the frame say nothing about it."""
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
+
+
+def _reads(features: Features, *, lit: bool) -> set[str]:
+    """What objects and, if ``lit``, the receiver are lit by."""
+    reads = {"pose", "frame"}
+    if "virtual" in features.layers:
+        reads |= {"objects", *distant_light_reads(features)}
+        reads |= {"lights"} if shade_config(features).lights else set()
+    if lit:
+        # The ball shows the receiver too small for a pixel's surroundings to mean anything.
+        reads |= set(relight_reads(features)) - {"summed_area", "environment_samples"}
+    if features.shadowed:
+        reads.add("shadow_ratio")
+    return reads
 
 
 class MirrorBall(Stage):
@@ -76,19 +107,23 @@ class MirrorBall(Stage):
             return LeftOut("the scene has no mirror ball")
         if quality.method(cls.name) not in SAMPLES:
             return LeftOut(f"the quality {quality.name!r} leaves the ball as the camera saw it")
-        layers = features.layers
-        if "mirrored" not in layers:
+        if "mirrored" not in features.layers:
             return LeftOut("the scene has nothing virtual that a ball could mirror")
-        reads = {"pose", "frame"}
-        if "virtual" in layers:
-            reads |= {"objects", *distant_light_reads(features)}
-            reads |= {"lights"} if shade_config(features).lights else set()
-        if "physical_added" in layers:
-            # The ball shows the desk too small for a pixel's surroundings to mean anything.
-            reads |= set(relight_reads(features)) - {"summed_area", "environment_samples"}
-        if "shadow_ratio" in layers:
-            reads.add("shadow_ratio")
-        return Wiring(tuple(sorted(reads)), ("mirrored",))
+        return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirrored",))
+
+    def idle(self, reach: Reach) -> str | None:
+        """A ball may show what is out of the picture itself."""
+        if not reach.balls:
+            return "no mirror ball is in the picture"
+        dark = not reach.falls and not self.request.scene.objects
+        return "virtual light falls on nothing" if dark else None
+
+    def reads_for(self, reach: Reach) -> tuple[str, ...]:
+        """How the receiver responds matters only where virtual light falls on it."""
+        if reach.falls:
+            return self.wiring.reads
+        unlit = _reads(self.features, lit=False)
+        return tuple(name for name in self.wiring.reads if name in unlit)
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The change, and the table of reflectance where materials need it."""
@@ -101,14 +136,15 @@ class MirrorBall(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows in which a ball can be."""
         config = mirror_config(self.features)
-        mirror_ball.make_mirror_ball_kernel(config)
+        variant = mirror_variant(self.features, device)
+        mirror_ball.make_mirror_ball_kernel(variant)
         reads = self.wiring.reads
         relighting = mirrored_relighting(self.features)
         irradiance = self.features.irradiance
         lit = config.relight is not None
         receiver = make_receiver(
             relighting,
-            make_picture(arrays),
+            find_picture(arrays),
             probes=arrays["probes"],
             key_lights=arrays["key_lights"] if "key_lights" in reads else None,
             irradiance=arrays[irradiance] if lit and irradiance in reads else None,
@@ -126,6 +162,6 @@ class MirrorBall(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(config, *inputs, arrays["mirrored"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirrored"], rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]

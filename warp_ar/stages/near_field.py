@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -11,10 +12,24 @@ import warp as wp
 from warp_ar.kernels import near_field
 from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.stages.base import (
+    NO_BALL,
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
+from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import make_picture, make_visible
+from warp_ar.stages.shared.picture import find_picture, find_visible
+from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
 """Pixels along a tile."""
@@ -63,6 +78,10 @@ class NearField(Stage):
         reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
         return Wiring(tuple(reads), features.near_names)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture nothing shows its surroundings."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Irradiance and what is mirrored, before and after averaging."""
         width, height = self.request.size
@@ -77,11 +96,11 @@ class NearField(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Estimates, then their mean."""
-        config = self._config()
+        config = self._config(device)
         near_field.make_near_field_kernel(config)
         near_field.make_filter_kernel(config)
-        params, scene, visible = arrays["params"], arrays["ray_scene"], make_visible(arrays)
-        picture, layers = make_picture(arrays), near_field.ReceiverLayers()
+        params, scene, visible = arrays["params"], arrays["ray_scene"], find_visible(arrays)
+        picture, layers = find_picture(arrays), near_field.ReceiverLayers()
         if config.ratio:
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:
@@ -106,13 +125,15 @@ class NearField(Stage):
         extent = arrays["object_rows"]
         return [Pass(estimate, rows=height, extent=extent), Pass(average, rows=height, extent=extent)]
 
-    def _config(self) -> near_field.NearFieldConfig:
+    def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
         layers = self.features.layers
         widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
+        # The forms themselves stay the scene's: they are what the kernel writes.
+        forms, variant = self.features.distant, distant_variant(self.features, device)
         return near_field.NearFieldConfig(
-            self.features.distant,
+            dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
             COUNT,
             0 if all(sharp) else LOBE_COUNT,
             MIRROR_SAMPLES if any(sharp) else 0,

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_ar.kernels import prefilter, pyramid
+from warp_ar.kernels import prefilter, pyramid, sphere_map
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.ray_scene import reflects_glossily
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
-from warp_ar.stages.features import NO_BALL, Features
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.settled import settled_environment
 
 
 def glossy_materials(scene: Scene) -> list[Material]:
@@ -31,7 +33,8 @@ class Prefilter(Stage):
 
     name: ClassVar[str] = "prefilter"
     methods: ClassVar[Mapping[str, str]] = {
-        "box_mip": "a pyramid of means (the paper)",
+        "sphere_mip": "mip levels of the sphere map, background included (the paper)",
+        "box_mip": "a pyramid of means over solid angles",
         "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
         "fis32": "32 importance samples per texel",
         "fis128": "128 importance samples per texel",
@@ -52,9 +55,18 @@ class Prefilter(Stage):
     )
 
     @classmethod
+    def method_for(cls, features: Features) -> str:
+        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        method = super().method_for(features)
+        return "box_mip" if method == "sphere_mip" and not features.observed else method
+
+    @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Read the environment, write the levels."""
-        return Wiring(("environment",), ("prefilter_levels",)) if features.environment else LeftOut(NO_BALL)
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        by_texture = cls.method_for(features) == "sphere_mip"
+        return Wiring(("sphere_map", "pose") if by_texture else ("environment",), ("prefilter_levels",))
 
     @property
     def _mirrors_only(self) -> bool:
@@ -66,6 +78,8 @@ class Prefilter(Stage):
         """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
         specs = {"prefilter_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
+        if self.method == "sphere_mip":
+            return specs
         if self.method != "brute_force" and not self._mirrors_only:
             specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
             specs["prefilter_blocks_done"] = ArraySpec((1,), wp.int32)
@@ -78,7 +92,9 @@ class Prefilter(Stage):
         """Launches of the method; weights and samples are made here, once."""
         height = self.request.quality.environment_height
         lobe = scene_lobe(self.request.scene)
-        environment, levels = arrays["environment"], arrays["prefilter_levels"]
+        if self.method == "sphere_mip":
+            return self._look_up(arrays)
+        environment, levels = settled_environment(arrays, device), arrays["prefilter_levels"]
         if self._mirrors_only:
             return [Pass(lambda rows: pyramid.copy_safe(environment, levels, rows=rows), rows=height)]
         texels = levels.shape[0]
@@ -108,4 +124,19 @@ class Prefilter(Stage):
                 Pass(lambda rows: prefilter.measure_energy(levels, height, row_energy, energy)),
                 Pass(lambda rows: prefilter.scale_levels(energy, height, levels, rows=rows), rows=texels),
             ]
+        return passes
+
+    def _look_up(self, arrays: Arrays) -> list[Pass]:
+        """Every lobe's directions in a level of the sphere map; mirrors alone need no more than the first."""
+        height = self.request.quality.environment_height
+        lobes = prefilter.lobe_count(height)
+        known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]
+        passes = []
+        for lobe in range(1 if self._mirrors_only else lobes):
+            size = prefilter.lobe_size(height, lobe)
+            place = sphere_map.glossy_level(lobe, lobes), size, out
+            look_up = functools.partial(
+                sphere_map.look_up_level, *known, *place, first=prefilter.lobe_offset(height, lobe)
+            )
+            passes.append(Pass(lambda rows, look_up=look_up: look_up(rows=rows), rows=size[0]))  # type: ignore[misc]
         return passes

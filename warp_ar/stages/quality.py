@@ -42,9 +42,9 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
                 "paper",
                 64,
                 1,
-                unwrap="bilinear",
-                irradiance="top_mip",
-                prefilter="box_mip",
+                unwrap="sphere_map",
+                irradiance="sphere_mip",
+                prefilter="sphere_mip",
                 light_shadow="hard",
                 relight="paper",
                 recover="clipped",
@@ -113,6 +113,10 @@ PRESETS: Mapping[str, Quality] = MappingProxyType(
     }
 )
 DEFAULT_PRESET = "medium"
+AUTO = "auto"
+"""Name of the quality that is chosen to keep to a budget."""
+DEFAULT_BUDGET_MS = 33.0
+"""Milliseconds per frame of that budget, where none is given: thirty frames per second."""
 BUDGETS: Mapping[str, float] = MappingProxyType({"low": 1e3 / 30.0, "medium": 50.0, "high": 250.0})
 """Milliseconds per frame of the bundled scene ``desk`` at 640x480 on two CPU cores, tracking included. A preset errs
 least by the cost table within ``SHARE`` of its budget: docs/accuracy.md gives the rule and what departs from it,

@@ -18,9 +18,10 @@ from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
+from warp_ar.stages.shared.variants import trace_variant
 
 EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
@@ -47,6 +48,8 @@ class _Progress:
     """Frames since the last estimate was begun."""
     last: float = 0.0
     """When that was, seconds."""
+    rested: bool = False
+    """Whether nothing has read the environment since."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +89,7 @@ class Recover(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball and a method that does something."""
         if not features.observed:
-            return LeftOut(features.unobserved)
+            return LeftOut(unobserved(features))
         if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
@@ -123,7 +126,7 @@ class Recover(Stage):
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         scene = self.request.scene
         height = self.request.quality.environment_height
-        proxies = trace_config(scene).proxies
+        proxies = self._proxies = trace_variant(trace_config(scene), device).proxies
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
         ball = scene.probes[0]
@@ -218,25 +221,31 @@ class Recover(Stage):
         ]
         return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
 
+    def host_kernels(self) -> tuple[Any, ...]:
+        """Of the solver: irradiance from lamps, at whatever places it tries."""
+        return (kernels.make_kernels(self._proxies)[2],) if self.method == "shading" else ()
+
     def begin(self) -> None:
         """Decide whether an estimate is begun in this frame, and whether one takes effect."""
         now, seconds = self._progress, self._arrays["seconds"]()
         now.frames += 1
         now.waited += 1
+        rested, now.rested = now.rested, False
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
-        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and now.waited >= EVERY_FRAME)
+        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and (rested or now.waited >= EVERY_FRAME))
         if self._asks:
             now.waited, now.last = 0, seconds
+
+    def rest(self) -> None:
+        """No estimate is begun or takes effect; the first frame that needs one begins it at once."""
+        self._asks = self._arrives = False
+        self._progress.rested = True
 
     def _ask(self, rows: Rows | None) -> None:
         """Begin to solve, and wait for it where it takes effect at once."""
         if self._worker is None:
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
-            if self.method == "shading":
-                # Now, not in the worker later: kernels are translated by one thread at a time.
-                proxies = trace_config(self.request.scene).proxies
-                wp.load_module(kernels.make_kernels(proxies)[2].module, device=self._device)
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.pending = self._worker.submit(self._solve, now.solver)
@@ -277,7 +286,7 @@ class Recover(Stage):
             arrays["probes"],
             arrays["ray_scene"],
             target,
-            proxies=trace_config(self.request.scene).proxies,
+            proxies=self._proxies,
             stream=self._stream,
         )
         received = self._lamps["recover_lamp_transfer"]
@@ -340,4 +349,15 @@ class Recover(Stage):
             }
             for lamp in estimate.lamps
         ]
-        return {"lower_bound": list(estimate.lower_bound), "lamps": lamps}
+        report: dict[str, Any] = {
+            "method": estimate.method,
+            "factor": round(estimate.factor, 3),
+            "card_contrast": round(estimate.card.contrast, 2),
+            "lower_bound": list(estimate.lower_bound),
+            "lamps": lamps,
+        }
+        if estimate.irradiance is not None:
+            for name in ("low", "value", "high"):
+                axes = getattr(estimate.irradiance, name)
+                report[f"irradiance_{name}"] = [[round(float(x), 4) for x in axis] for axis in axes]
+        return report

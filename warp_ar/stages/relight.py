@@ -12,14 +12,17 @@ import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.launch import count_partials
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.kernels.structs import PLANE
+from warp_ar.scene.ray_scene import trace_config
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
-from warp_ar.stages.shared.picture import make_picture
+from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import relight_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +90,12 @@ class Relight(Stage):
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
         return () if self.features.near_field else ("environment_shadow",)
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without power, or out of the picture, light adds nothing."""
+        if not reach.shines:
+            return "no virtual light has any power"
+        return None if reach.light else "virtual light falls on nothing in the picture"
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
@@ -110,7 +119,7 @@ class Relight(Stage):
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Cells, then one pass over the rows that light can reach."""
-        config = relight_config(self.features)
+        config = relight_variant(relight_config(self.features), self.features, device)
         relight.make_relight_kernel(config)
         receiver = self._receiver(config, arrays)
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
@@ -145,7 +154,7 @@ class Relight(Stage):
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)
-        return relight.make_receiver(config, make_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+        return relight.make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
 
     def _cell_passes(
         self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any
@@ -153,7 +162,7 @@ class Relight(Stage):
         """Ambient visibility and bounced light of cells, where the method knows them."""
         params, scene, _, receiver = inputs
         cells, light_rows = receiver.cells, arrays["light_rows"]
-        place = receiver_cells.CellConfig(config)
+        place = receiver_cells.CellConfig(_keep_planes(config, self.request))
         passes: list[Pass] = []
 
         def rows_of(size: int, count: int, margin: int) -> Callable[[], Rows]:
@@ -206,6 +215,14 @@ class Relight(Stage):
                 again = functools.partial(estimate, bounced=True)
                 passes.append(Pass(again, rows=shape[0], extent=ambient_rows))
         return passes
+
+
+def _keep_planes(config: relight.RelightConfig, request: Request) -> relight.RelightConfig:
+    """Where all proxies are planes, cells know that: most of their rays are then left out."""
+    proxies = trace_config(request.scene).proxies
+    if not set(proxies) <= {int(PLANE)}:
+        return config
+    return dataclasses.replace(config, trace=dataclasses.replace(config.trace, proxies=proxies))
 
 
 def _grain(features: Features) -> Grain:

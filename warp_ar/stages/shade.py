@@ -9,13 +9,26 @@ import warp as wp
 
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.shade import shade
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import shade_config
+from warp_ar.stages.shared.variants import shade_variant
 
 
 class Shade(Stage):
@@ -55,6 +68,10 @@ class Shade(Stage):
             reads += features.near_names
         return Wiring(tuple(reads), ("virtual",))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture nothing is covered."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The shaded objects, lists of edges and, for metallic-roughness, the table of its reflectance."""
         width, height = self.request.size
@@ -67,6 +84,7 @@ class Shade(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
         config = shade_config(self.features)
+        variant = shade_variant(config, self.features, device)
         lists = make_edge_lists(arrays, device, self.name)
         inputs = (
             arrays["params"],
@@ -74,7 +92,7 @@ class Shade(Stage):
             arrays["ray_scene"],
             arrays["light_array"] if config.lights else None,
             make_distant_light(self.features, arrays, self.name),
-            make_visible(arrays),
+            find_visible(arrays),
         )
         near = NearLight()
         for name in self.features.near_names if config.near_field else ():
@@ -82,7 +100,7 @@ class Shade(Stage):
 
         def launch(rows: Rows | None) -> None:
             shade(
-                config,
+                variant,
                 *inputs,
                 arrays["virtual"],
                 near=near,

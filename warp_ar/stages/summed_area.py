@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import warp as wp
 
+from warp_ar.device import usable_cores
 from warp_ar.kernels import summed_area
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -32,22 +33,27 @@ class SummedArea(Stage):
         return Wiring(("frame",), ("summed_area",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The table, and the sums on the way to it by strips."""
+        """The table, and the sums on the way to it by strips, or by slabs."""
         width, height = self.request.size
+        ends = summed_area.slab_shape(height, width, usable_cores())
         names = ("summed_area_sums", "summed_area_group_sums", "summed_area_state")
         shapes = zip(names, summed_area.strip_shapes(height, width), strict=True)
         sums = {name: ArraySpec(shape, wp.uint32) for name, shape in shapes}
+        sums["summed_area_ends"] = ArraySpec(ends, wp.uint32)
         return {"summed_area": ArraySpec((height, width), wp.uint32), **sums}
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """On CPU rows in bands of rows, then columns in bands of columns; on CUDA by strips."""
+        """On CPU by slabs, a thread each; on CUDA by strips."""
         width, height = self.request.size
         frame, table = arrays["frame"], arrays["summed_area"]
         if not device.is_cpu:
             sums = [arrays[f"summed_area_{name}"] for name in ("sums", "group_sums", "state")]
             summed_area.make_sum_strips_kernel(summed_area.strip_config(height, width, device))
             return [Pass(lambda rows: summed_area.sum_area_by_strips(frame, *sums, table))]
-        return [
-            Pass(lambda rows: summed_area.sum_along_rows(frame, table, rows=rows), rows=height),
-            Pass(lambda columns: summed_area.sum_along_columns(table, columns=columns), rows=width),
-        ]
+        ends = arrays["summed_area_ends"]
+        passes = [Pass(lambda rows: summed_area.sum_slabs(frame, table, ends, rows=rows), rows=len(ends))]
+        if len(ends) == 1:
+            return passes
+        passes.append(Pass(lambda rows: summed_area.add_ends(ends)))
+        passes.append(Pass(lambda rows: summed_area.join_slabs(ends, table, rows=rows), rows=len(ends) - 1))
+        return passes

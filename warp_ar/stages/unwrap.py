@@ -7,10 +7,11 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels import unwrap
+from warp_ar.kernels import sphere_map, unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
-from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
 
@@ -20,7 +21,8 @@ class Unwrap(Stage):
 
     name: ClassVar[str] = "unwrap"
     methods: ClassVar[Mapping[str, str]] = {
-        "bilinear": "one sample between pixels (the paper)",
+        "sphere_map": "OpenGL's sphere mapping, as if ball and light were far away (the paper)",
+        "bilinear": "one sample between pixels, at its exact place",
         "area": "the mean over what a texel covers",
     }
     summary: ClassVar[str] = "reads the light off the mirror ball, exactly for a camera nearby"
@@ -28,6 +30,7 @@ class Unwrap(Stage):
     unread: ClassVar[str] = "nothing asks for the environment"
     converges: ClassVar[bool] = True
     settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    follows: ClassVar[bool] = True
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32; running means",
         bound=1e-4,
@@ -38,32 +41,43 @@ class Unwrap(Stage):
 
     @classmethod
     def method_for(cls, features: Features) -> str:
-        """The exact one where the quality names none."""
+        """The exact one where the quality names none.
+
+        Exact too for frames of several exposures: the sphere map is a texture of one.
+        """
         method = super().method_for(features)
+        if method == "sphere_map" and features.merged:
+            return "bilinear"
         return method if method in cls.methods else "area"
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
         if not features.observed:
-            return LeftOut(features.unobserved)
-        return Wiring(("frame", "pose"), ("probe_radiance", "probe_confidence", "probe_clipped"))
+            return LeftOut(unobserved(features))
+        texture = ("sphere_map",) if cls.method_for(features) == "sphere_map" else ()
+        return Wiring(("frame", "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, and where its texels' corners are seen."""
         height = self.request.quality.environment_height
         width = 2 * height
-        return {
+        specs = {
             "probe_radiance": ArraySpec((height, width), wp.vec3),
             "probe_confidence": ArraySpec((height, width), wp.float32),
             "probe_clipped": ArraySpec((height, width), wp.vec3),
-            "unwrap_corners": ArraySpec((height + 1, width + 1, len(self.request.scene.probes)), wp.vec3),
         }
+        if self.method != "sphere_map":
+            specs["unwrap_corners"] = ArraySpec((height + 1, width + 1, len(self.request.scene.probes)), wp.vec3)
+        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Corners first, then texels between them."""
+        """Corners first, then texels between them; or texels looked up in the sphere map."""
+        if self.method == "sphere_map":
+            return self._look_up(arrays)
         kinds = sorted({_KINDS[proxy.shape] for proxy in self.request.scene.proxies})
         config = unwrap.ProjectConfig(tuple(kinds))
+        config = config.general() if shares_kernels(device) else config
         method = self.method
         height = self.request.quality.environment_height
 
@@ -92,3 +106,14 @@ class Unwrap(Stage):
             )
 
         return [Pass(project, rows=height + 1), Pass(gather, rows=height)]
+
+    def _look_up(self, arrays: Arrays) -> list[Pass]:
+        """Every direction's place in the sphere map."""
+        height = self.request.quality.environment_height
+        shape = height, 2 * height
+        params, texture, out = arrays["params"], arrays["sphere_map"], arrays["probe_radiance"].flatten()
+        seen = params, arrays["probes"], arrays["frame"], arrays["probe_confidence"], arrays["probe_clipped"]
+        return [
+            Pass(lambda rows: sphere_map.look_up_level(params, texture, 0, shape, out, rows=rows), rows=height),
+            Pass(lambda rows: sphere_map.trust_ball(*seen, rows=rows), rows=height),
+        ]

@@ -9,10 +9,23 @@ import warp as wp
 
 from warp_ar.kernels.visibility import Hit, trace_pixels
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_OBJECT, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import (
+    NO_OBJECT,
+    OUT_OF_PICTURE,
+    Arrays,
+    ArraySpec,
+    LeftOut,
+    Numerics,
+    Pass,
+    Reach,
+    Rows,
+    Stage,
+    Wiring,
+)
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import make_visible
+from warp_ar.stages.shared.picture import find_visible
 from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.variants import trace_variant
 
 
 class Visibility(Stage):
@@ -35,20 +48,23 @@ class Visibility(Stage):
             return LeftOut(NO_OBJECT)
         return Wiring(reads=("pose", "objects"), writes=("hit_object", "hits"))
 
+    def idle(self, reach: Reach) -> str | None:
+        """Without an object in the picture no pixel sees one."""
+        return None if reach.objects else OUT_OF_PICTURE
+
     def arrays(self) -> Mapping[str, ArraySpec]:
         """One hit per pixel."""
         width, height = self.request.size
         return {
             "hit_object": ArraySpec((height, width), wp.int32, -1),
-            "hit_depth": ArraySpec((height, width), wp.float32, float("inf")),
             "hits": ArraySpec((height, width), Hit, Hit()),
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """One pass over the rows where objects are or were."""
-        config = trace_config(self.request.scene)
+        config = trace_variant(trace_config(self.request.scene), device)
         inputs = [arrays[name] for name in ("params", "rays", "ray_scene")]
-        visible = make_visible(arrays)
+        visible = find_visible(arrays)
 
         def launch(rows: Rows | None) -> None:
             trace_pixels(config, *inputs, visible, rows=rows)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 from warp_ar.input.sources import QueueSource
+from warp_ar.pictures import decode_picture
 from warp_ar.scene import Camera
 from warp_ar.viewer import protocol
 from warp_ar.viewer.controls import Controls, Feed, Notify
@@ -102,12 +103,7 @@ class BrowserCamera:
         Raises:
             ProtocolError: It cannot be decoded.
         """
-        try:
-            picture = cv2.imdecode(np.frombuffer(taken.jpeg, np.uint8), cv2.IMREAD_COLOR_RGB)
-        except cv2.error as error:
-            raise protocol.ProtocolError("picture cannot be decoded") from error
-        if picture is None:
-            raise protocol.ProtocolError("picture cannot be decoded")
+        picture = decode_picture(taken.jpeg, cv2.IMREAD_COLOR_RGB, protocol.ProtocolError, "picture")
         feed = self._controls.newest_feed
         if feed.owner is not owner or feed.source.size != (picture.shape[1], picture.shape[0]):
             return  # switched off meanwhile

@@ -18,14 +18,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.budget import AUTO, DEFAULT_BUDGET_MS, Controller
+from warp_ar.accuracy.budget import Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings, turn
-from warp_ar.accuracy.costs import BASE, Costs, cache_folder, cost_key, measure_steps, read_costs, write_costs
+from warp_ar.accuracy.costs import BASE, Costs, cost_key, measure_steps, read_costs, write_costs
+from warp_ar.cache_folder import cache_folder
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import WarpArError
 from warp_ar.scene import Pose
-from warp_ar.stages.quality import PRESETS, Quality
+from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, PRESETS, Quality
 from warp_ar.viewer.controls import Notify
 
 _COST_FRAMES: Final = 30

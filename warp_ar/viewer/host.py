@@ -13,12 +13,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.budget import AUTO
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import UsageError
 from warp_ar.output.sinks import write_environment
 from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
-from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
+from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.viewer import calibration, edits, messages, protocol
 from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting

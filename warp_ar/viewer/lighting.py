@@ -102,7 +102,8 @@ class Lighting:
         """What is being built, for a line on the page; None while nothing is."""
         if not self.busy:
             return None
-        name, done, count = self._progress or (self._now.quality.name, 0, 0)
+        target = self._then if self._then is not None and not self.changing else self._first or self._now
+        name, done, count = self._progress or (target.quality.name, 0, 0)
         return {"quality": name, "done": done, "count": count}
 
     def _aim(self, wanted: Wanted, compare: str, feed: Feed) -> None:
@@ -160,9 +161,15 @@ class Lighting:
     def _warm_up(self, pipeline: Pipeline) -> None:
         """Load the kernels of a new pipeline; viewers are told how far that is."""
         name = pipeline.quality.name
-        self._progress = (name, 0, 0)
-        pipeline.warm_up()
-        self._progress = None
+
+        def tell(done: int, count: int) -> None:
+            self._progress = (name, done, count)
+
+        tell(0, 0)
+        try:
+            pipeline.warm_up(tell)
+        finally:
+            self._progress = None
 
     def other(self, frame: Frame, now: float) -> Image | None:
         """What the picture is compared with; None without a comparison, or until it is built."""

@@ -19,6 +19,8 @@ from typing import Any, Final, TypeAlias
 
 from warp_ar.errors import WarpArError
 
+SCHEMA: Final = 2
+"""Number of what both sides may say, told in ``hello``; it grows when keys change."""
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
 MAX_PICTURE: Final = 1 << 20

@@ -401,7 +401,8 @@ class Server:
         sender = asyncio.create_task(self._send_safely(viewer))
         try:
             viewer.tell(json.dumps(self._hello()))
-            for message in host.greetings():
+            # Not here: to tell how large a mesh is, its file is read.
+            for message in await asyncio.get_running_loop().run_in_executor(self._hands, host.greetings):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(host.light()))
             await self._receive(viewer)
@@ -436,6 +437,7 @@ class Server:
     def _hello(self) -> dict[str, Any]:
         return {
             "type": "hello",
+            "protocol": protocol.SCHEMA,
             "scenes": list(bundled_scenes()),
             "presets": list(PRESETS),
             "effects": list(protocol.EFFECTS),
@@ -498,9 +500,9 @@ class Server:
             viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
 
     @staticmethod
-    async def _drop(viewer: _Viewer, code: int, reason: str) -> None:
+    async def _drop(viewer: _Viewer, code: int, reason: str, seconds: float = 5.0) -> None:
         with contextlib.suppress(ConnectionError, TimeoutError):
-            await asyncio.wait_for(viewer.socket.close(code=code, message=reason.encode()[:120]), 5.0)
+            await asyncio.wait_for(viewer.socket.close(code=code, message=reason.encode()[:120]), seconds)
 
     # --------------------------------------------------------------------------------------------------------- running
 
@@ -515,7 +517,7 @@ class Server:
             UsageError: The address cannot be listened on.
         """
         self._loop = asyncio.get_running_loop()
-        runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        runner = web.AppRunner(self.app, access_log=None, handle_signals=False, shutdown_timeout=0.5)
         running: asyncio.Future[None] | None = None
         ticker: asyncio.Task[None] | None = None
         try:
@@ -534,10 +536,15 @@ class Server:
         finally:
             if ticker is not None:
                 ticker.cancel()
-            await self._end(running)
-            self._loop = None
+            if self._host is not None:
+                self._host.stop()
+            reason = "the program has ended"
+            drops = [self._drop(viewer, WSCloseCode.GOING_AWAY, reason, 0.5) for viewer in tuple(self._viewers)]
+            await asyncio.gather(*drops)
             await self.gate.close()
             await runner.cleanup()
+            await self._end(running)
+            self._loop = None
 
     def _run_frames(self, host: Host) -> asyncio.Future[None]:
         """Start the thread of the frames."""
@@ -562,12 +569,8 @@ class Server:
         return done
 
     async def _end(self, running: asyncio.Future[None] | None) -> None:
-        """End the host and the viewers; what takes too long is left behind."""
+        """End the host; what takes too long is left behind."""
         host = self._host
-        if host is not None:
-            host.stop()
-        for viewer in tuple(self._viewers):
-            await self._drop(viewer, WSCloseCode.GOING_AWAY, "the program has ended")
         ended = True
         waited: asyncio.Future[Any] | None = running if running is not None else self._starting
         if waited is not None:

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from warp_ar.kernels.structs import Picture
-from warp_ar.kernels.visibility import VisibleObjects
+from warp_ar.kernels.structs import Picture, make_picture
+from warp_ar.kernels.visibility import VisibleObjects, make_visible
 from warp_ar.stages.base import Arrays
 
 
-def make_picture(arrays: Arrays, *, frame: bool = True) -> Picture:
+def find_picture(arrays: Arrays, *, frame: bool = True) -> Picture:
     """The frame with its decode table and rays; without the frame for a stage that does not read it."""
-    picture = Picture()
-    if frame:
-        picture.frame = arrays["frame"]
-    picture.decode_table, picture.rays = arrays["decode"], arrays["rays"]
-    return picture
+    return make_picture(arrays["frame"] if frame else None, arrays["decode"], arrays["rays"])
 
 
-def make_visible(arrays: Arrays) -> VisibleObjects:
+def find_visible(arrays: Arrays) -> VisibleObjects:
     """The objects that pixels show, of the stage ``visibility``."""
-    visible = VisibleObjects()
-    visible.objects, visible.hits = arrays["hit_object"], arrays["hits"]
-    return visible
+    return make_visible(arrays["hit_object"], arrays["hits"])

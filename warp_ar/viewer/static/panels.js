@@ -265,7 +265,7 @@ export class TimePanel {
   }
 
   frame(frame) {
-    if (!this.#plan || frame.plan !== this.#plan.plan) return;
+    if (!frame.plan || frame.plan !== this.#plan?.plan) return;
     const stages = [...frame.stages, ["encode", frame.encode_ms, false]];
     for (const [name, ms, skipped] of stages) {
       const mean = this.#means.get(name);

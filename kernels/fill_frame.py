@@ -1,0 +1,143 @@
+"""What the camera itself sees of the directions that no ball shows.
+
+Behind the ball, and near its rim, where a pixel is many degrees, the map of the environment is filled from neighbours.
+A good part of it stands in the picture, beyond and beside the ball. A direction d from the ball's centre is looked up
+
+- where a proxy is in the way: at the pixel of the point that is hit, if the camera sees that point;
+- elsewhere at infinity: at the pixel in which the camera looks along d, if it sees past balls and proxies there.
+
+What is near and not modelled is seen from another side than the ball would see it, so the picture is trusted less than
+the ball, ``FRAME_TRUST``, and only for that part of a texel's trust which the ball leaves open. A texel is the mean of
+``SIDE`` x ``SIDE`` directions, by the share that is seen.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import warp as wp
+
+from warp_ar.kernels.camera import project
+from warp_ar.kernels.color import decode
+from warp_ar.kernels.latlong import direction_from_latlong
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
+
+wp.set_module_options({"enable_backward": False})
+
+SIDE = wp.constant(3)
+"""Directions along the side of a texel."""
+FRAME_TRUST = wp.constant(wp.float32(0.8))
+"""Of what the picture shows, beside 1 of what a ball shows."""
+BALL_MARGIN = wp.constant(wp.float32(1.08))
+"""How much larger a ball is taken to be where it hides what is behind it: its outline's blur."""
+CLOSE = wp.constant(wp.float32(1.0e-3))
+"""Relative distance within which what a camera ray meets is the surface itself."""
+ENOUGH = wp.constant(wp.float32(0.999))
+"""Trust from which a ball tells all."""
+
+
+@wp.func
+def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, reach: wp.float32) -> wp.bool:
+    """Whether a ray of unit direction meets no ball up to a distance."""
+    for k in range(probes.shape[0]):
+        to_center = probes[k].center - origin
+        along = wp.dot(to_center, direction)
+        off = to_center - along * direction
+        radius = BALL_MARGIN * probes[k].radius
+        if along > 0.0 and along < reach and wp.dot(off, off) < radius * radius:
+            return False
+    return True
+
+
+@functools.cache
+def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def fill_frame_kernel(
+        # In:
+        row_start: wp.int32,
+        frame: wp.array2d[wp.vec3ub],
+        table: wp.array[wp.vec3],
+        params: wp.array[FrameParams],
+        probes: wp.array[Probe],
+        scene: RayScene,
+        height: wp.int32,
+        width: wp.int32,
+        # In and out:
+        levels_out: wp.array[wp.vec4],
+    ):
+        band_row, j = wp.tid()
+        i = row_start + band_row
+        known = levels_out[i * width + j]
+        if known[3] >= ENOUGH:
+            return
+        camera = params[0]
+        total = wp.vec3(0.0, 0.0, 0.0)
+        count = wp.float32(0.0)
+        for sample in range(wp.static(SIDE * SIDE)):
+            y = wp.float32(i) + (wp.float32(sample // SIDE) + 0.5) / wp.float32(SIDE)
+            x = wp.float32(j) + (wp.float32(sample % SIDE) + 0.5) / wp.float32(SIDE)
+            direction = direction_from_latlong(y, x, height, width)
+            ray = direction
+            reach = wp.float32(FAR)
+            hit = trace.closest_proxy(scene, probes[0].center, direction, FAR)
+            if hit.shape >= 0:
+                ray = hit.point - camera.camera_position
+                reach = wp.length(ray)
+                ray = ray / reach
+            at = project(camera, ray)
+            row = wp.int32(wp.round(wp.clamp(at[1], -1.0, 1.0e6)))
+            column = wp.int32(wp.round(wp.clamp(at[0], -1.0, 1.0e6)))
+            inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
+            if inside and passes_balls(probes, camera.camera_position, ray, reach):
+                if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
+                    total += decode(table, frame[row, column])
+                    count += 1.0
+        if count > 0.0:
+            weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
+            trust = known[3] + weight
+            mixed = (known[3] * wp.vec3(known[0], known[1], known[2]) + (weight / count) * total) / trust
+            levels_out[i * width + j] = wp.vec4(mixed[0], mixed[1], mixed[2], trust)
+
+    return fill_frame_kernel
+
+
+def fill_frame(
+    frame: wp.array,
+    decode_table: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    levels_out: wp.array,
+    height: int,
+    width: int,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Put what the frame shows into a seeded fill pyramid, where balls left trust open.
+
+    Args:
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
+        decode_table: Linear value of each code, ``wp.vec3`` (256 or more).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P), at least one: the map is the light at the first; all hide what is behind them.
+        scene: Its proxies are seen where they are.
+        levels_out: From ``fill.seed_fill``; its level 0 changes.
+        height: Of the map.
+        width: Of the map.
+        proxies: Kinds of proxy in the scene.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        make_fill_frame_kernel(proxies),
+        (height, width),
+        [frame, decode_table, params, probes, scene, height, width],
+        [levels_out],
+        rows=rows,
+        device=levels_out.device,
+    )

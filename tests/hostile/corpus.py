@@ -1,0 +1,197 @@
+"""Real files, one for each format that is read, small, and the same in every run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+
+from warp_ar.input.sources import FrameFolder, Synthetic, open_source
+from warp_ar.kernels.color import decode_table
+from warp_ar.output.sinks import open_sink, read_environment, write_environment
+from warp_ar.scene import load_calibration, load_scene
+from warp_ar.scene.exif import read_exif
+from warp_ar.scene.mesh_files import load_mesh, load_texture
+from warp_ar.scene.shapes import torus_mesh
+
+SCENE = """schema = 1
+name = "small"
+[camera]
+width = 64
+height = 48
+fx = 60.0
+fy = 60.0
+cx = 31.5
+cy = 23.5
+[source]
+synthetic = "card"
+[marker]
+size = 0.08
+[probe]
+center = [-0.1, 0.03, 0.03]
+radius = 0.03
+[[object]]
+shape = "torus"
+major_radius = 0.03
+minor_radius = 0.01
+at = [0.1, 0.0, 0.03]
+[object.material]
+model = "metallic_roughness"
+base_color = [0.5, 0.5, 0.5]
+[[light]]
+kind = "point"
+intensity = 0.5
+at = [0.0, 0.0, 0.5]
+"""
+CALIBRATION = {"image_width": 64, "image_height": 48, "camera_matrix": [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]}
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """A way in: a file that is read, and by what."""
+
+    name: str
+    """In the table."""
+    file: str
+    """Name of the file, in a folder of its own."""
+    read: Callable[[pathlib.Path], object]
+    """Reads all of it."""
+    make: Callable[[pathlib.Path], object]
+    """Writes a sound one, and what it names beside it."""
+
+
+def _frames(path: pathlib.Path) -> int:
+    with open_source(path) as source:
+        return sum(frame.image.size for frame in source)
+
+
+def _beside(path: pathlib.Path) -> int:
+    with FrameFolder(path.parent) as source:
+        return sum(frame.image.size for frame in source)
+
+
+def picture(size: tuple[int, int] = (24, 16)) -> np.ndarray:
+    y, x = np.mgrid[: size[1], : size[0]]
+    return np.stack([10 * x, 15 * y, 5 * (x + y)], axis=-1).astype(np.uint8)
+
+
+def _image(path: pathlib.Path) -> None:
+    assert cv2.imwrite(str(path), picture())
+
+
+def _photograph(path: pathlib.Path) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0110] = "A camera"
+    exif[0x0112] = 6
+    inner = exif.get_ifd(0x8769)
+    inner.update({0x829A: (1, 125), 0x829D: (28, 10), 0x8827: 200, 0xA405: 28, 0x920A: (43, 10)})
+    Image.fromarray(picture()).save(path, exif=exif)
+
+
+def _video(path: pathlib.Path) -> None:
+    with open_sink(path, fps=24) as sink:
+        for index in range(14):
+            sink.write(np.roll(picture((32, 32)), index, axis=1))
+
+
+def _calibration(path: pathlib.Path) -> None:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 64)
+    storage.write("image_height", 48)
+    storage.write("camera_matrix", np.array(CALIBRATION["camera_matrix"], float))
+    storage.write("distortion_coefficients", np.zeros((1, 5)))
+    storage.release()
+
+
+def _trimesh() -> Any:
+    import trimesh
+    from PIL import Image
+
+    mesh = torus_mesh(0.03, 0.01, 0.004)
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture()))
+    visual = trimesh.visual.TextureVisuals(uv=mesh.uvs, material=material)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, visual=visual, process=False)
+
+
+def _mesh(path: pathlib.Path) -> None:
+    mesh = _trimesh()
+    kind = path.suffix[1:]
+    if kind == "gltf":
+        for name, data in mesh.export(file_type="gltf").items():
+            (path if name == "model.gltf" else path.parent / name).write_bytes(data)
+    elif kind == "obj":
+        path.write_text(mesh.export(file_type="obj", include_texture=False, mtl_name="m.mtl"))
+        text = path.read_text()
+        path.write_text("mtllib m.mtl\nusemtl m\n" + text if "mtllib" not in text else text)
+        (path.parent / "m.mtl").write_text("newmtl m\nmap_Kd wood.png\n")
+        _image(path.parent / "wood.png")
+    else:
+        path.write_bytes(mesh.export(file_type=kind) if kind != "off" else mesh.export(file_type=kind).encode())
+
+
+def _sidecar(path: pathlib.Path) -> None:
+    for index in range(3):
+        _image(path.parent / f"{index}.png")
+    path.write_text(json.dumps({"0.png": 0.01, "1.png": 0.002}))
+
+
+def _response(path: pathlib.Path) -> None:
+    path.write_text("".join(f"{v:.6g} {v:.6g} {v:.6g}\n" for v in np.linspace(0, 1, 256)))
+
+
+def _environment(path: pathlib.Path) -> None:
+    write_environment(path, picture().astype(np.float32))
+
+
+def _material(path: pathlib.Path) -> None:
+    _mesh(path.parent / "a.obj")
+
+
+def _buffer(path: pathlib.Path) -> None:
+    """The first file that a glTF names, under a name of its own."""
+    _mesh(path.parent / "a.gltf")
+    text = (path.parent / "a.gltf").read_text()
+    name = json.loads(text)["buffers"][0]["uri"]
+    (path.parent / name).rename(path)
+    (path.parent / "a.gltf").write_text(text.replace(name, path.name))
+
+
+def _texture_of_gltf(path: pathlib.Path) -> None:
+    _mesh(path.parent / "a.gltf")
+    tree = json.loads((path.parent / "a.gltf").read_text())
+    tree["images"] = [{"uri": path.name}]
+    (path.parent / "a.gltf").write_text(json.dumps(tree))
+    _image(path)
+
+
+READERS = (
+    *(Reader(f"frame, {kind.upper()}", f"a.{kind}", _frames, _image) for kind in ("png", "jpg", "bmp", "tiff", "webp")),
+    *(Reader(f"video, {kind.upper()}", f"a.{kind}", _frames, _video) for kind in ("mp4", "mov", "mkv")),
+    Reader("exposures.json", "exposures.json", _beside, _sidecar),
+    Reader("scene, TOML", "scene.toml", load_scene, lambda path: path.write_text(SCENE)),
+    *(
+        Reader(f"calibration, {kind.upper()}", f"camera.{kind}", load_calibration, _calibration)
+        for kind in ("yml", "json", "xml")
+    ),
+    Reader("response", "response.txt", decode_table, _response),
+    Reader("texture", "a.png", load_texture, _image),
+    *(Reader(f"mesh, {kind.upper()}", f"a.{kind}", load_mesh, _mesh) for kind in ("ply", "obj", "stl", "off")),
+    Reader("mesh, GLB", "a.glb", load_mesh, _mesh),
+    Reader("mesh, glTF", "a.gltf", load_mesh, _mesh),
+    Reader("OBJ's materials", "m.mtl", lambda path: load_mesh(path.parent / "a.obj"), _material),
+    Reader("OBJ's texture", "wood.png", lambda path: load_mesh(path.parent / "a.obj"), _material),
+    Reader("glTF's buffer", "a.bin", lambda path: load_mesh(path.parent / "a.gltf"), _buffer),
+    Reader("glTF's texture", "a.png", lambda path: load_mesh(path.parent / "a.gltf"), _texture_of_gltf),
+    Reader("photograph with EXIF", "a.jpg", read_exif, _photograph),
+    Reader("photograph with EXIF, TIFF", "a.tiff", read_exif, _photograph),
+    Reader("environment, EXR", "a.exr", read_environment, _environment),
+)
+
+assert Synthetic.NAMES  # the scene's source is one of them

@@ -1,0 +1,153 @@
+"""Kills a process at random moments while it writes, and looks at what it leaves.
+
+    python -m tests.hostile.kill 50      # so often for each sink; prints a table
+
+Each attempt is a fork of this process that writes frames; half of them stand on what an earlier run left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from warp_ar.command_line import Terminated, ended_by_signals
+from warp_ar.errors import WarpArError
+from warp_ar.files import write_whole
+from warp_ar.input.sources import open_source
+from warp_ar.output.environment_file import EnvironmentSink
+from warp_ar.output.sinks import open_sink, read_environment
+
+SIZE = (96, 128)
+FRAMES = 180
+EARLIER = 40
+"""Frames that an earlier run left, so many levels brighter."""
+TOLERANCE = 3
+"""Levels that a video may be off."""
+
+
+def frame(index: int, brighter: int = 0) -> np.ndarray:
+    """A flat picture whose level is its number; noise in a corner makes files of some size."""
+    image = np.full((*SIZE, 3), brighter + index, np.uint8)
+    image[:32, :32] = np.random.default_rng(index).integers(0, 256, (32, 32, 3))
+    return image
+
+
+def write_frames(place: pathlib.Path, count: int, brighter: int = 0) -> None:
+    """Write a run's frames."""
+    with EnvironmentSink(place) if place.name == "light" else open_sink(place, fps=24) as sink:
+        for index in range(count):
+            image = frame(index, brighter)
+            sink.write(image.astype(np.float32) if place.name == "light" else image)
+
+
+def write_reports(place: pathlib.Path, count: int, brighter: int = 0) -> None:
+    """Write a report again and again, each time a longer one."""
+    for index in range(count):
+        write_whole(place, json.dumps({"program": "warp_ar", "run": brighter, "frames": [0] * (200 * index)}).encode())
+
+
+def check_frames(place: pathlib.Path, *, finished: bool) -> int:
+    """Frames that are there; an error says what is not whole."""
+    if not place.exists():
+        assert not finished
+        return 0
+    numbers = [int(path.stem) for path in sorted(place.glob("????.*"))] if place.is_dir() else None
+    if place.name == "light":
+        found = [float(np.median(read_environment(path))) for path in sorted(place.glob("????.exr"))]
+    elif numbers == []:
+        found = []
+    else:
+        with open_source(place) as source:
+            found = [float(np.median(picture.image)) for picture in source]
+    numbers = list(range(len(found))) if numbers is None else numbers
+    # All of this run, or all of the earlier one.
+    brighter = EARLIER if found and found[0] - numbers[0] > TOLERANCE else 0
+    expected = [number + brighter for number in numbers]
+    assert np.allclose(found, expected, rtol=0.0, atol=TOLERANCE), (found, expected)
+    return len(found)
+
+
+def check_report(place: pathlib.Path, *, finished: bool) -> int:
+    """Whether there is a report, whole."""
+    if not place.exists():
+        assert not finished
+        return 0
+    assert json.loads(place.read_text())["program"] == "warp_ar"
+    return 1
+
+
+Writer = Callable[[pathlib.Path, int, int], None]
+SINKS: dict[str, tuple[Writer, Callable[..., int]]] = {
+    **dict.fromkeys(("clip.mp4", "clip.mov", "clip.mkv", "frames", "light"), (write_frames, check_frames)),
+    "run.json": (write_reports, check_report),
+}
+
+
+def attempt(name: str, number: int, kind: signal.Signals, folder: pathlib.Path) -> int:
+    """Kill one run; returns how many frames it left.
+
+    Raises:
+        AssertionError: What it left is not whole.
+    """
+    chance = random.Random(f"{name} {number}")
+    write, check = SINKS[name]
+    place = folder / name
+    if number % 2:
+        write(place, EARLIER, EARLIER)
+    begin, begun = os.pipe()
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            with ended_by_signals():
+                os.write(begun, b"x")
+                write(place, FRAMES, 0)
+                code = 0
+        except Terminated:
+            code = 143
+        finally:
+            os._exit(code)
+    os.read(begin, 1)
+    os.close(begin)
+    os.close(begun)
+    time.sleep(chance.uniform(0.0, 0.5))
+    os.kill(child, kind)
+    _, status = os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(status)
+    assert code in (0, -kind if kind == signal.SIGKILL else 143), code
+    count = check(place, finished=bool(number % 2))
+    if kind == signal.SIGTERM:
+        assert not list(folder.rglob(".*")), "a file that was being written was left"
+    return count
+
+
+def main(times: int) -> int:
+    """Kill each sink so often by either signal; prints what held, and returns 1 if anything did not."""
+    failed = 0
+    print("| sink | signal | kills | whole | frames left, least to most |\n| --- | --- | --: | --: | --: |")
+    for name in SINKS:
+        for kind in (signal.SIGKILL, signal.SIGTERM):
+            counts = []
+            for number in range(times):
+                with tempfile.TemporaryDirectory() as folder:
+                    try:
+                        counts.append(attempt(name, number, kind, pathlib.Path(folder)))
+                    except (AssertionError, WarpArError, ValueError) as error:
+                        print(f"{name} {kind.name} {number}: {error}", file=sys.stderr)
+            failed += times - len(counts)
+            span = f"{min(counts, default=0)} to {max(counts, default=0)}"
+            print(f"| {name} | {kind.name} | {times} | {len(counts)} | {span} |", flush=True)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1])))

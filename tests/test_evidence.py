@@ -1,0 +1,147 @@
+"""What recovered light rests on: the card's print, problems that are a little wrong, channels that agree."""
+
+from __future__ import annotations
+
+import types
+
+import numpy as np
+import pytest
+
+from tests.test_recover import DistantLight, lit_environment, scene  # noqa: F401
+from warp_ar.light.card import check_card
+from warp_ar.light.config import CONFIG, Kind
+from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions
+from warp_ar.light.recovery import Recovery, tie_channels
+
+LAMP = ((-0.5, -0.6, 0.6), 0.985, 30.0)
+
+
+def printed(ink, *, paper=0.5, gradient=0.0):
+    """An 8 x 8 checkerboard of paper and ink, lit ``gradient`` times stronger from one side to the other."""
+    x, y = np.meshgrid(np.arange(8.0), np.arange(8.0))
+    points = np.column_stack([0.01 * x.ravel(), 0.01 * y.ravel(), np.zeros(64)])
+    kind = np.where((x + y).ravel() % 2 > 0, Kind.INK, Kind.CARD)
+    light = np.where(kind == Kind.INK, ink, paper) * (1.0 + gradient * x.ravel() / 7.0)
+    return points, kind, light[:, None] * np.ones(3)
+
+
+def test_print_shows_in_any_light():
+    assert check_card(*printed(0.05)).contrast == pytest.approx(10.0)
+    assert check_card(*printed(0.05)).holds
+    assert check_card(*printed(0.05, gradient=5.0)).holds
+
+
+def test_a_table_or_a_stool_is_no_card():
+    """Even, or brighter from one side to the other, or speckled: the print is not in it."""
+    assert not check_card(*printed(0.5)).holds
+    assert not check_card(*printed(0.5, gradient=5.0)).holds
+    points, kind, light = printed(0.5)
+    assert not check_card(points, kind, light * np.random.default_rng(0).lognormal(0.0, 0.6, (64, 1))).holds
+
+
+def test_too_few_cells_are_no_card():
+    points, kind, light = printed(0.05)
+    few = np.concatenate([np.flatnonzero(kind == Kind.INK)[:3], np.flatnonzero(kind == Kind.CARD)])
+    assert not check_card(points[few], kind[few], light[few]).holds
+
+
+def test_directions_are_spread_evenly():
+    d = spread_directions(64)
+    assert np.linalg.norm(d, axis=1) == pytest.approx(1.0)
+    assert np.abs(d.mean(axis=0)).max() < 0.01
+    assert d.T @ d / 64 == pytest.approx(np.eye(3) / 3, abs=0.01)
+
+
+def test_a_factor_is_what_nearly_all_draws_allow():
+    added = np.array([1.0, 1.0])
+    agreed = np.ones((20, 2))
+    assert allowed_factor(added, agreed) == 1.0
+    assert allowed_factor(added, 0.2 * agreed) == pytest.approx(0.4)
+    # A quarter of the draws find nothing: then nothing is added.
+    assert allowed_factor(added, np.repeat([0.0, 1.0], [5, 15])[:, None] * agreed) == 0.0
+    # Light from elsewhere is no evidence.
+    assert allowed_factor(np.array([1.0, 0.0]), agreed * [0.0, 5.0]) == 0.0
+    assert allowed_factor(np.zeros(2), agreed) == 0.0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
+def test_what_a_factor_leaves_is_no_worse_than_nothing(share):
+    """The bound that it is made from, for every draw above the share that may be missed."""
+    rng = np.random.default_rng(3)
+    added, missing = rng.uniform(0.5, 2.0, 32), share * rng.uniform(0.2, 2.0, (200, 32))
+    taken = allowed_factor(added, missing) * added
+    worse = np.linalg.norm(taken - missing, axis=1) > np.linalg.norm(missing, axis=1)
+    assert worse.mean() <= CONFIG.evidence.share + 1.0 / 200
+    assert likely_gain(taken, missing) >= -1e-9
+
+
+def test_contrast_beyond_print_makes_the_card_doubtful():
+    assert doubt_of(20.0) == doubt_of(CONFIG.evidence.usual_contrast) == CONFIG.evidence.white
+    assert doubt_of(60.0) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("lacking", "expected"),
+    [((1.0, 1.0, 1.0), (1.0, 0.5, 3.0)), ((0.1, 0.1, 1.0), (1.0, 0.5, 20.0)), ((1.0, 0.2, 1.0), (1.0, 0.5, 3.0))],
+)
+def test_no_lamp_is_of_one_colour_unless_one_channel_clips(lacking, expected):
+    problem = types.SimpleNamespace(
+        parts=1, peaks=[], part=np.zeros(1, int), solid_angle=np.ones(1), lacking=np.array([lacking])
+    )
+    assert tie_channels(problem, np.array([[1.0, 0.5, 20.0]]))[0] == pytest.approx(expected)
+
+
+def test_without_a_card_the_light_stays_as_captured(device, scene):
+    """The table alone shows a shadow; its reflectance is a guess, and so would be the lamp."""
+    light = DistantLight(device, scene)
+    light.reflectance = np.full_like(light.reflectance, 0.4)
+    radiance, _, _ = lit_environment(LAMP)
+    estimate, values = light.estimate(radiance)
+    assert (estimate.method, estimate.factor, estimate.lamps) == ("clipped", 0.0, ())
+    assert not estimate.excess.any()
+    assert not estimate.card.holds
+    interval = estimate.irradiance
+    truth = true_irradiance(interval.normals, values, radiance)
+    assert (interval.low <= truth).all()
+    assert (truth <= interval.high).all()
+    assert (interval.high[4] > 5.0 * interval.value[4]).all()
+
+
+def true_irradiance(normals, cells, radiance):
+    d, area = cells["direction"].reshape(-1, 3), cells["solid_angle"].ravel()
+    return (np.maximum(normals @ d.T, 0.0) * area) @ radiance
+
+
+def test_with_a_card_all_is_taken_and_the_interval_holds_the_truth(device, scene):
+    radiance, _, _ = lit_environment(LAMP)
+    estimate, values = DistantLight(device, scene, noise=0.1).estimate(radiance)
+    assert estimate.factor == 1.0
+    assert estimate.method in ("shading", "white_card")
+    assert estimate.card.contrast == pytest.approx(scene.marker.white / 0.04, rel=0.3)
+    interval = estimate.irradiance
+    truth = true_irradiance(interval.normals, values, radiance)
+    assert interval.value == pytest.approx(truth, rel=0.1)
+    assert (interval.low <= truth).all()
+    assert (truth <= interval.high).all()
+    assert (interval.high < 2.0 * interval.value + 1.0).all()
+
+
+def test_light_holds_while_a_hand_hides_the_card(device, scene):
+    """And no longer: what hides it for good may have changed the light."""
+    light = DistantLight(device, scene)
+    radiance, _, _ = lit_environment(LAMP)
+    problem = {}
+    original = Recovery.update
+
+    def kept(self, cells, straight, mirrored, observed, *rest):
+        problem.update(self=self, args=(cells, straight, mirrored), observed=observed, rest=rest)
+        return original(self, cells, straight, mirrored, observed, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recovery, "update", kept)
+        seen, _ = light.estimate(radiance)
+    hidden = problem["observed"].copy()
+    hidden["visible"][light.surfaces.kinds[light.surfaces.surface] <= Kind.INK] = 0.0
+    for _ in range(CONFIG.card.held):
+        assert problem["self"].update(*problem["args"], hidden, *problem["rest"]) is seen
+    assert not problem["self"].update(*problem["args"], hidden, *problem["rest"]).excess.any()

@@ -1,0 +1,116 @@
+"""What a request calls for, and what ``explain`` says of it: reasons are true of the scene at hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from tests.hard_cases.rig import SIZE, make_scene
+from warp_ar import explain
+from warp_ar.engine.graph import Plan, make_plan
+from warp_ar.scene import Exposure, SourceSpec, dumps_scene, load_scene
+from warp_ar.stages.features import Features, find_features
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.relight import Relight
+from warp_ar.stages.request import Request
+from warp_ar.stages.unwrap import Unwrap
+
+
+def features_of(preset: str = "high", exposures: tuple[float, ...] = (), **changes: object) -> Features:
+    return find_features(Request(make_scene(**changes), PRESETS[preset], SIZE, exposures=exposures))
+
+
+def plan_of(preset: str = "medium", **changes: object) -> Plan:
+    return make_plan(Request(make_scene(**changes), PRESETS[preset], SIZE))
+
+
+def test_a_scene_of_everything_calls_for_everything() -> None:
+    found = features_of()
+    assert found.layers == ("virtual", "physical_added", "shadow_ratio", "mirrored")
+    assert found.environment
+    assert found.recovered
+    assert found.emitters
+    assert found.near_field
+    assert found.exposed
+    assert found.declipped
+    assert found.declipped_by_ball
+    assert not found.boxed
+    assert found.relight_method == "bounce"
+    assert found.ambient_visibility
+    assert found.bounced
+
+
+def test_without_a_ball_nothing_is_known_of_the_environment() -> None:
+    found = features_of(probes=())
+    assert not (found.environment)
+    assert not (found.recovered)
+    assert not (found.emitters)
+    assert not (found.merged)
+    assert not (found.near_field)
+    assert not (found.shadowed)
+    assert not (found.ambient_visibility)
+    assert not (found.bounced)
+    assert found.relight_method == "flat"
+    assert (found.distant.diffuse, found.distant.specular) == ("none", False)
+    assert found.layers == ("virtual", "physical_added")
+
+
+EXPOSURES = [
+    (1.0, True, False, False),
+    (0.5, True, True, True),
+    (2.0, True, True, False),
+    ("auto", True, True, True),
+    ("auto", False, False, False),
+]
+
+
+@pytest.mark.parametrize(("scale", "lights", "exposed", "darkened"), EXPOSURES)
+def test_an_exposure_calls_for_what_it_shows(scale: float | str, lights: bool, exposed: bool, darkened: bool) -> None:
+    more = {} if lights else {"lights": ()}
+    high, low = (features_of(preset, exposure=Exposure(scale), **more) for preset in ("high", "low"))
+    assert high.exposed == low.exposed == exposed
+    assert high.declipped == low.boxed == darkened
+
+
+def test_exposures_are_merged_where_light_is_recovered() -> None:
+    assert features_of("medium", (1.0, 0.1)).merged
+    assert not features_of("medium").merged
+    recovers_nothing = PRESETS["medium"].with_methods(recover="clipped")
+    assert not find_features(Request(make_scene(), recovers_nothing, SIZE, exposures=(1.0, 0.1))).merged
+
+
+def test_the_method_is_the_one_that_runs() -> None:
+    """Not the one that the quality names where the scene leaves no choice, nor none where there is a choice."""
+    assert Relight.method_for(features_of("high")) == "bounce"
+    assert Relight.method_for(features_of("high", probes=())) == "flat"
+    assert Unwrap.method_for(features_of("medium")) == "area"
+
+
+def test_the_table_is_left_out_for_a_reason_that_is_true() -> None:
+    """Of an exposure of 0.5 whose method looks above clipping, not that it is not lowered."""
+    reasons = dict(plan_of(exposure=Exposure(0.5), lights=()).left_out)
+    assert reasons["summed_area"] == "neither relighting nor the exposure looks at means of a pixel's surroundings"
+    assert "summed_area" not in dict(plan_of("low", exposure=Exposure(0.5), lights=()).left_out)
+
+
+def explained(scene: object, tmp_path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> str:
+    path = tmp_path / "scene.toml"
+    path.write_text(dumps_scene(scene), encoding="utf-8")  # type: ignore[arg-type]
+    assert explain.main([str(path), *more]) == 0
+    return " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+def test_explain_knows_the_exposures_of_the_source(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(camera=0, exposures=(0.02, 0.002)))
+    assert "bracket default runs" in explained(scene, tmp_path, capsys)
+    bare = dataclasses.replace(scene, source=SourceSpec(camera=0))
+    assert "bracket default runs" not in explained(bare, tmp_path, capsys)
+
+
+def test_explain_shows_the_method_that_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = dataclasses.replace(load_scene("desk"), probes=())
+    said = explained(scene, tmp_path, capsys, "--quality", "high")
+    assert "relight flat runs" in said
+    assert "relight bounce" not in said

@@ -1,0 +1,136 @@
+"""What the camera sees beyond and beside the ball goes into the map where the ball does not tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_ar.kernels import structs
+from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.fill_frame import FRAME_TRUST, fill_frame
+from warp_ar.scene import loads_scene
+from warp_ar.scene.ray_scene import HostScene, trace_config
+
+HEIGHT = 64
+WIDTH = 2 * HEIGHT
+CODES = 0.01
+"""A texel's directions against a ramp over the frame: they lie within a texel of its middle."""
+
+SCENE = """
+schema = 1
+[camera]
+width = 320
+height = 240
+fx = 160.0
+fy = 160.0
+cx = 159.5
+cy = 119.5
+transfer = "linear"
+[marker]
+size = 0.05
+[probe]
+center = [0.0, 0.0, 0.1]
+radius = 0.03
+"""
+PLANE = """
+[[proxy]]
+shape = "plane"
+size = [4.0, 4.0]
+"""
+EYE = np.array([-0.5, 0.0, 0.1])
+"""Looks along +x, level with the ball."""
+CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""``world_from_camera``."""
+
+
+def filled(device, frame, text, seed):
+    """Level 0 of the pyramid, (h, w, 4), after the frame was put into ``seed``."""
+    scene = loads_scene(text)
+    host = HostScene(scene, device)
+    params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+    params["camera_position"], params["world_from_camera"] = EYE, CAMERA
+    params["focal"], params["principal"] = (160.0, 160.0), (159.5, 119.5)
+    probes = np.zeros(1, np.dtype(structs.Probe.numpy_dtype()))
+    probes["center"], probes["radius"], probes["reflectance"] = (0.0, 0.0, 0.1), 0.03, 0.85
+    levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
+    fill_frame(
+        wp.array(frame, dtype=wp.vec3ub, device=device),
+        wp.array(decode_table("linear"), dtype=wp.vec3, device=device),
+        wp.array(params, dtype=structs.FrameParams, device=device),
+        wp.array(probes, dtype=structs.Probe, device=device),
+        host.ray_scene,
+        levels,
+        HEIGHT,
+        WIDTH,
+        proxies=trace_config(scene).proxies,
+    )
+    return levels.numpy().reshape(HEIGHT, WIDTH, 4)
+
+
+def directions():
+    theta = (np.arange(HEIGHT) + 0.5) * np.pi / HEIGHT
+    phi = (2.0 * (np.arange(WIDTH) + 0.5) / WIDTH - 1.0) * np.pi
+    theta, phi = np.meshgrid(theta, phi, indexing="ij")
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def ramp():
+    """Red grows to the right, green downward; blue is even."""
+    y, x = np.mgrid[:240, :320]
+    return np.stack([x * 255 // 320, y, np.full_like(x, 100)], -1).astype(np.uint8)
+
+
+def pixels_of(points):
+    """Pixel of each point relative to the camera, (..., 2)."""
+    p = points @ CAMERA
+    return 160.0 * p[..., :2] / p[..., 2:] + [159.5, 119.5]
+
+
+def inside(pixel, margin):
+    return ((pixel > margin) & (pixel < np.array([319.0, 239.0]) - margin)).all(axis=-1)
+
+
+def test_at_infinity_a_direction_is_where_the_camera_looks_along_it(device):
+    level = filled(device, ramp(), SCENE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    pixel = pixels_of(d)
+    seen = (d[..., 0] > 0.2) & inside(pixel, 6.0)
+    past = seen & (np.arccos(d[..., 0]) > np.arcsin(1.2 * 0.03 / 0.5) + 0.05)
+    assert past.sum() > 300
+    assert level[past][:, 3] == pytest.approx(float(FRAME_TRUST.val if hasattr(FRAME_TRUST, "val") else FRAME_TRUST))
+    assert level[past][:, 0] == pytest.approx(pixel[past][:, 0] / 320, abs=CODES + 1 / 255)
+    assert level[past][:, 1] == pytest.approx(pixel[past][:, 1] / 255, abs=CODES + 1 / 255)
+    # Behind the ball, and behind the camera, it sees nothing.
+    behind = np.arccos(np.clip(d[..., 0], -1.0, 1.0)) < 0.02
+    assert (level[behind | (d[..., 0] < 0.0)][:, 3] == 0.0).all()
+
+
+def test_modelled_surfaces_are_looked_up_where_they_are(device):
+    level = filled(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    down = (d[..., 2] < -0.15) & (d[..., 0] > 0.0)
+    hit = np.array([0.0, 0.0, 0.1]) - 0.1 * d / np.where(down, d[..., 2], -1.0)[..., None]
+    pixel = pixels_of(hit - EYE)
+    away = np.linalg.norm(np.cross(hit - EYE, [1.0, 0.0, 0.0]), axis=-1) / np.linalg.norm(hit - EYE, axis=-1)
+    told = down & inside(pixel, 6.0) & (away > 0.12)
+    assert told.sum() > 100
+    # Texels near the horizon span many pixels of the plane.
+    assert np.median(np.abs(level[told][:, 1] - pixel[told][:, 1] / 255)) < CODES
+    # Parallax: at infinity the same directions are elsewhere.
+    assert np.median(np.abs(pixels_of(d)[told][:, 1] - pixel[told][:, 1])) > 10.0
+
+
+def test_what_the_ball_tells_is_kept(device):
+    seed = np.zeros((HEIGHT, WIDTH, 4), np.float32)
+    seed[..., :3], seed[..., 3] = 0.9, 1.0
+    assert np.array_equal(filled(device, ramp(), SCENE, seed), seed)
+    seed[..., 3] = 0.5
+    level = filled(device, ramp(), SCENE, seed)
+    changed = level[..., 3] > 0.5
+    # Half by the ball, 0.8 of the other half by the frame, whose blue is 100.
+    expected = (0.5 * 0.9 + 0.4 * 100 / 255) / 0.9
+    whole = level[..., 3] > 0.899
+    assert changed.any()
+    assert level[whole][:, 2] == pytest.approx(expected, abs=1e-5)
+    assert np.array_equal(level[~changed], seed[~changed])

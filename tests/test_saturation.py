@@ -1,0 +1,106 @@
+"""At which code channels saturate, told from pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_ar.input.saturation import SaturationLevels, ball_codes, ball_discs
+from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
+from warp_ar.scene import Camera, Probe
+from warp_ar.scene.pose import Pose
+
+DISC = (160.0, 120.0, 90.0)
+
+
+def ball_picture(top, *, surface=60.0, noise=1.5, seed=0):
+    """A ball that mirrors walls of ``surface``, fading to the rim, and two lamps that drive the camera to ``top``."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:240, :320].astype(float)
+    image = np.full((240, 320, 3), 40.0)
+    inside = np.hypot(x - DISC[0], y - DISC[1]) < DISC[2]
+    image[inside] = (surface * (0.6 + 0.4 * x / 320))[inside][:, None] * [1.0, 0.95, 0.9]
+    image += noise * rng.standard_normal(image.shape)
+    for cx, cy, radius in ((120, 90, 24), (200, 110, 12)):
+        image[np.hypot(x - cx, y - cy) < radius] = 400.0
+    image = cv2.GaussianBlur(image, (0, 0), 1.0)  # the lens
+    return np.clip(np.round(np.minimum(image, top)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("top", [238, 235, 247])
+def test_a_plateau_below_full_is_where_channels_saturate(top):
+    levels = SaturationLevels()
+    assert levels.observe(ball_picture(top), [DISC])
+    assert levels.levels.tolist() == [top] * 3
+    assert not levels.observe(ball_picture(top, seed=1), [DISC])
+
+
+def test_compression_hides_no_plateau():
+    picture = cv2.imencode(".jpg", ball_picture(238), [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    levels = SaturationLevels()
+    levels.observe(cv2.imdecode(picture, cv2.IMREAD_COLOR), [DISC])
+    assert np.abs(levels.levels - 238).max() <= 1
+
+
+@pytest.mark.parametrize("surface", [150.0, 215.0, 238.0])
+def test_bright_surfaces_are_no_plateau(surface):
+    """Walls, even as bright as that: noise goes to both sides of them."""
+    picture = ball_picture(255, surface=surface)
+    picture[picture > 250] = 80  # no lamp
+    levels = SaturationLevels()
+    assert not levels.observe(picture, [DISC])
+    assert levels.levels.tolist() == [255] * 3
+
+
+def test_a_bright_frame_takes_a_level_back():
+    levels = SaturationLevels()
+    levels.observe(ball_picture(238), [DISC])
+    assert levels.observe(ball_picture(255), [DISC])
+    assert levels.levels.tolist() == [255] * 3
+    # What was higher once is higher for good.
+    levels.observe(ball_picture(230), [DISC])
+    assert levels.levels.tolist() == [255] * 3
+
+
+def test_pictures_without_a_ball_tell_nothing():
+    levels = SaturationLevels()
+    assert not levels.observe(ball_picture(238), [])
+    assert not levels.observe(ball_picture(238), [(-500.0, 120.0, 90.0)])
+    assert ball_codes(ball_picture(238), [(-500.0, 120.0, 90.0)]).shape == (0, 3)
+
+
+def test_discs_are_where_the_camera_sees_balls():
+    camera = Camera(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 0.5]))
+    balls = (Probe(center=(0.1, -0.05, 0.0), radius=0.03), Probe(center=(0.0, 0.0, -1.0), radius=0.03))
+    ((x, y, radius),) = ball_discs(balls, camera, pose)
+    assert (x, y, radius) == pytest.approx((219.5, 89.5, 18.0))
+
+
+@wp.kernel
+def saturated_kernel(table: wp.array[wp.vec3], codes: wp.array[wp.vec3ub], out: wp.array[wp.vec3]):
+    i = wp.tid()
+    out[i] = is_saturated(codes[i], saturation_codes(table))
+
+
+@pytest.mark.parametrize(
+    ("saturation", "code", "expected"),
+    [
+        (None, (254, 100, 10), (1, 0, 0)),
+        (None, (238, 238, 238), (0, 0, 0)),
+        (None, (255, 248, 247), (1, 1, 0)),
+        ((238, 238, 238), (237, 230, 100), (1, 0, 0)),
+        ((238, 238, 238), (238, 231, 230), (1, 1, 0)),
+        ((238, 255, 255), (240, 240, 253), (1, 0, 1)),
+    ],
+)
+def test_kernels_take_levels_from_the_camera_table(device, saturation, code, expected):
+    """A plain table of 256 entries saturates at 255; beside a saturated channel what is near counts as well."""
+    values = decode_table("srgb") if saturation is None else camera_table("srgb", saturation)
+    out = wp.zeros(1, dtype=wp.vec3, device=device)
+    table = wp.array(values, dtype=wp.vec3, device=device)
+    codes = wp.array(np.array([code], np.uint8), dtype=wp.vec3ub, device=device)
+    wp.launch(saturated_kernel, 1, [table, codes], [out], device=device)
+    assert out.numpy()[0].tolist() == list(expected)

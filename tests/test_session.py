@@ -1,0 +1,65 @@
+"""A session whose scene and quality change while its frames flow."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.test_pipeline import make_scene
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SceneError, UsageError
+from warp_ar.scene import Camera, Light, SourceSpec
+from warp_ar.session import Session
+from warp_ar.stages.quality import PRESETS
+
+SIZE = (320, 240)
+
+
+def scene(**changes: object):
+    return make_scene(source=SourceSpec(synthetic="card"), **changes)
+
+
+def test_frames_after_a_change_are_those_of_the_new_scene_and_quality() -> None:
+    dark = scene(lights=(), objects=())
+    with Session(scene(), device="cpu", quality="low") as session:
+        frames = iter(session)
+        frame, result = next(frames)
+        first = session.pipeline
+        held = result
+        # Numbers alone change in place.
+        session.change(scene=scene(lights=(Light("point", 2.0, at=(0.05, -0.1, 0.2)),)))
+        assert session.pipeline is first
+        session.change(scene=dark, quality="paper")
+        assert isinstance(session.pipeline, Pipeline)
+        assert session.pipeline.quality == PRESETS["paper"]
+        times = [frame.time]
+        for _ in range(3):  # the next one was under way already
+            frame, result = next(frames)
+            times.append(frame.time)
+        assert times == sorted(times)
+        assert "shade" not in result.stages
+        np.testing.assert_array_equal(held.image.shape, result.image.shape)
+
+
+def test_what_cannot_be_shown_changes_nothing() -> None:
+    with Session(scene(), device="cpu", quality="low") as session:
+        frames = iter(session)
+        next(frames)
+        before = session.pipeline
+        with pytest.raises(UsageError, match="no preset"):
+            session.change(quality="best")
+        camera = dataclasses.replace(scene().camera, width=320, height=200)
+        assert isinstance(camera, Camera)
+        with pytest.raises(SceneError):
+            session.change(scene=scene(camera=camera))
+        assert session.pipeline is before
+        next(frames)
+        session.change(quality="paper")
+        assert session.pipeline is not before
+    with (
+        Session(scene(), device="cpu", quality="auto", budget_ms=1e5) as session,
+        pytest.raises(UsageError, match="chooses for itself"),
+    ):
+        session.change(quality="low")

@@ -1,0 +1,339 @@
+"""Native threads that run a frame's passes on CPU; the tables that they read, and Python's part in a frame.
+
+``kernels/bands.py`` has what the threads do. Here launches are packed into its tables, once, and each frame is told
+which rows of which passes are due. What only Python can do is called from there: steps on the host, and the decision
+whether a stage is due where that depends on what a stage before it found.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.kernels import bands
+from warp_ar.kernels.launch import Note, alone_with_tiles
+from warp_ar.stages.base import Pass, Rows, Stage
+
+_Entry = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+_Callback = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
+_SEMAPHORE_BYTES = 64
+_Table = npt.NDArray[np.int64]
+
+
+class _Packed:
+    """A launch as its entry point takes it."""
+
+    def __init__(self, launch: wp.Launch) -> None:
+        names = [argument.label for argument in launch.kernel.adj.args]
+        values = launch.params[1:]
+        fields = [(name, type(value)) for name, value in zip(names, values, strict=True)]
+        self.arguments = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
+        for name, value in zip(names, values, strict=True):
+            setattr(self.arguments, name, value)
+        self.bounds = launch.bounds
+        self.entry = ctypes.cast(launch.hooks.forward, ctypes.c_void_p).value or 0
+        self.launch = launch  # keeps arrays and the loaded module
+
+    def call(self) -> None:
+        """Run it on this thread; others may run Python meanwhile."""
+        _Entry(self.entry)(ctypes.addressof(self.bounds), ctypes.addressof(self.arguments))
+
+
+class _System:
+    """What the operating system gives: a semaphore, a clock, a way to let others run."""
+
+    def __init__(self) -> None:
+        self.clock_id = 1
+        if sys.platform == "win32":
+            kernel = ctypes.WinDLL("kernel32")
+            kernel.CreateSemaphoreW.restype = ctypes.c_void_p
+            self.functions = [
+                kernel.WaitForSingleObject,
+                kernel.ReleaseSemaphore,
+                kernel.SwitchToThread,
+                kernel.QueryPerformanceCounter,
+            ]
+            self.clock_id = -1
+            self.make_semaphore: Callable[[], int] = lambda: int(kernel.CreateSemaphoreW(None, 0, 1 << 20, None))
+            return
+        library = ctypes.CDLL(None)
+        if sys.platform == "darwin":
+            library.dispatch_semaphore_create.restype = ctypes.c_void_p
+            self.functions = [library.dispatch_semaphore_wait, library.dispatch_semaphore_signal]
+            self.clock_id = 6
+            self.make_semaphore = lambda: int(library.dispatch_semaphore_create(ctypes.c_long(0)))
+        else:
+            self.functions = [library.sem_wait, library.sem_post]
+            self.make_semaphore = self._make_posix
+        self.functions += [library.sched_yield, library.clock_gettime]
+        self._library, self._kept = library, list[Any]()
+
+    def _make_posix(self) -> int:
+        memory = (ctypes.c_int64 * (_SEMAPHORE_BYTES // 8))()
+        self._kept.append(memory)
+        self._library.sem_init(memory, 0, 0)
+        return ctypes.addressof(memory)
+
+    def addresses(self) -> list[int]:
+        """Of wait, post, let others run, and the clock."""
+        return [ctypes.cast(function, ctypes.c_void_p).value or 0 for function in self.functions]
+
+
+class Crew:
+    """The threads of one scheduler, and the tables of its passes."""
+
+    def __init__(
+        self,
+        steps: Sequence[tuple[Stage, list[Pass]]],
+        notes: Mapping[int, list[Note]],
+        readers: Mapping[str, list[str]],
+        *,
+        threads: int,
+        bands_per_pass: int | None,
+        decide: Callable[[Stage], object],
+        finish: Callable[[Stage], None],
+    ) -> None:
+        """Pack everything; the threads begin with the first frame.
+
+        Args:
+            steps: Stages and their passes, in order.
+            notes: What each pass launches, by its ``id``; a pass that is not there is Python's.
+            readers: Names of the stages that read what each stage writes.
+            threads: That take rows, the caller's included.
+            bands_per_pass: Equal bands of each pass; None means by need.
+            decide: Called as a stage begins for which ``ask`` was said: is to call ``begin`` or leave it.
+            finish: Called as a stage ends for which ``begin`` was told so.
+        """
+        self._decide, self._finish = decide, finish
+        self._error: BaseException | None = None
+        self._system = _System()
+        self._packed: list[Any] = []
+        self._host_steps: list[Callable[[], None]] = []
+        self._threads: list[threading.Thread] = []
+        self._count = threads
+        self._names = [stage.name for stage, _ in steps]
+        self._places = {name: place for place, name in enumerate(self._names)}
+        self._rows: dict[int, int] = {}  # of the pass table, by the pass's id
+        self._tiles = False
+        self._fill_tables(steps, notes, readers)
+        self._fill_state(bands_per_pass)
+
+    def _fill_tables(
+        self,
+        steps: Sequence[tuple[Stage, list[Pass]]],
+        notes: Mapping[int, list[Note]],
+        readers: Mapping[str, list[str]],
+    ) -> None:
+        passes: list[dict[str, int]] = []
+        calls: list[dict[str, int]] = []
+        stages: list[dict[str, int]] = []
+        reading: list[int] = []
+
+        def add_host(step: Callable[[], None]) -> None:
+            passes.append({"whole": 1, "callback": len(self._host_steps)})
+            self._host_steps.append(step)
+
+        for stage, own in steps:
+            first = len(passes)
+            add_host(lambda stage=stage: self._decide(stage))  # type: ignore[misc,arg-type]
+            for step in own:
+                self._rows[id(step)] = len(passes)
+                packed = self._pack(step, notes[id(step)]) if id(step) in notes else None
+                if packed is None:
+                    add_host(lambda step=step: step.launch(None))  # type: ignore[misc]
+                    continue
+                tiles = any(note.tiles for note in notes[id(step)])
+                self._tiles = self._tiles or tiles
+                span = {"first_call": len(calls), "last_call": len(calls) + len(packed)}
+                passes.append({**span, "whole": int(tiles or step.rows is None), "tiles": int(tiles), "callback": -1})
+                calls += packed
+            add_host(lambda stage=stage: self._finish(stage))  # type: ignore[misc]
+            told = [self._places[name] for name in readers[stage.name]]
+            stages.append(
+                {
+                    "first_pass": first,
+                    "last_pass": len(passes),
+                    "first_reader": len(reading),
+                    "last_reader": len(reading) + len(told),
+                }
+            )
+            reading += told
+        self._passes = _table(bands.PASS, passes)
+        self._calls = _table(bands.CALL, calls)
+        self._stages = _table(bands.STAGE, stages)
+        self._readers = np.array(reading or [0], np.int64)
+        self._waits = np.bincount(reading, minlength=len(stages)).astype(np.int64)
+        self._first = _column(self._stages, bands.STAGE, "first_pass").copy()
+        self._last = _column(self._stages, bands.STAGE, "last_pass").copy()
+        self._start, self._stop, self._time = (
+            _column(self._passes, bands.PASS, name) for name in ("start", "stop", "time")
+        )
+
+    def _pack(self, step: Pass, notes: list[Note]) -> list[dict[str, int]] | None:
+        """Rows of the call table for a pass; None if it must be launched from Python."""
+        rows = []
+        for note in notes:
+            banded = note.rows is not None
+            if step.rows is not None and note.rows != (0, step.rows) and note.arrays is None:
+                return None  # within a pass that is split, a launch over other rows
+            if note.arrays is not None:
+                target, source = note.arrays
+                if not (target.is_contiguous and source.is_contiguous and target.shape == source.shape):
+                    return None
+                height = step.rows or 1
+                if target.capacity % height:
+                    return None
+                row = {"arguments": target.ptr, "row_offset": source.ptr, "argument_bytes": target.capacity // height}
+                self._packed.append(note)
+                rows.append(row)
+                continue
+            assert note.record is not None
+            packed = _Packed(note.record())
+            size = ctypes.sizeof(packed.arguments)
+            if size > bands.ARGUMENT_ROOM:
+                return None
+            self._packed.append(packed)
+            bounds = packed.bounds
+            offset = getattr(type(packed.arguments), packed.launch.kernel.adj.args[0].label).offset if banded else -1
+            rows.append(
+                {
+                    "entry": packed.entry,
+                    "arguments": ctypes.addressof(packed.arguments),
+                    "argument_bytes": size,
+                    "row_offset": offset,
+                    "bounds": ctypes.addressof(bounds),
+                    "bounds_bytes": ctypes.sizeof(bounds),
+                    "size_offset": type(bounds).size.offset,
+                    "row_size": bounds.size // max(bounds.shape[0], 1),
+                }
+            )
+        return rows
+
+    def _fill_state(self, bands_per_pass: int | None) -> None:
+        wait, post, let_others, clock = self._system.addresses()
+        self._called = _Callback(self._call_back)
+        self._state = _table(
+            bands.STATE,
+            [
+                {
+                    "threads": self._count,
+                    "bands": bands_per_pass or 0,
+                    "stages": len(self._names),
+                    "clock_id": self._system.clock_id,
+                    "semaphore": self._system.make_semaphore(),
+                    "caller_semaphore": self._system.make_semaphore(),
+                    "wait": wait,
+                    "post": post,
+                    "let_others": let_others,
+                    "clock": clock,
+                    "callback": ctypes.cast(self._called, ctypes.c_void_p).value or 0,
+                    "stage_table": self._stages.ctypes.data,
+                    "pass_table": self._passes.ctypes.data,
+                    "call_table": self._calls.ctypes.data,
+                    "reader_table": self._readers.ctypes.data,
+                }
+            ],
+        )
+        self._failed = wp.zeros(1, dtype=wp.int32, device="cpu")
+        self._caller = self._serve(1)
+        self._helpers = [self._serve(0) for _ in range(self._count - 1)]
+        self._end = weakref.finalize(self, _stop, self._state, self._system, self._count)
+
+    def _serve(self, caller: int) -> _Packed:
+        inputs = [wp.uint64(self._state.ctypes.data), caller]
+        out = wp.zeros(1, dtype=wp.int32, device="cpu")
+        return _Packed(wp.launch(bands.serve_kernel, 1, inputs, [out], device="cpu", record_cmd=True))
+
+    def _call_back(self, number: int) -> int:
+        """A step of Python's, on whichever thread; 1 if it failed."""
+        try:
+            self._host_steps[number]()
+        except BaseException as error:  # handed to the thread that asked for the frame
+            self._error = error
+            return 1
+        return 0
+
+    # ---- one frame ------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Begin to say what a frame is: nothing is due yet."""
+        self._start[:] = 0
+        self._stop[:] = 0
+        self._time[:] = 0
+
+    def ask(self, stage: Stage) -> None:
+        """Have ``decide`` called for a stage when what it reads is there."""
+        self._stop[self._first[self._places[stage.name]]] = 1
+
+    def begin(self, stage: Stage, due: Sequence[tuple[Pass, Rows]], *, tell: bool) -> None:
+        """Say which rows of which passes of a stage are due.
+
+        Args:
+            stage: That is due.
+            due: Its passes, with their rows; (0, 1) of those that have none.
+            tell: Whether ``finish`` is to be called in the end.
+        """
+        for step, (start, stop) in due:
+            row = self._rows[id(step)]
+            self._start[row], self._stop[row] = start, max(start, stop)
+        self._stop[self._last[self._places[stage.name]] - 1] = int(tell)
+
+    def run(self) -> Mapping[str, float]:
+        """Run the frame; this thread works too. Returns nanoseconds of all threads by stage.
+
+        Raises:
+            BaseException: The first that a step of Python's raised; what was under way is done.
+        """
+        self._stages[:, bands.STAGE.index("waits")] = self._waits
+        self._stages[:, bands.STAGE.index("current")] = self._first
+        self._stages[:, bands.STAGE.index("ready")] = np.where(self._waits == 0, 2, 0)
+        self._state[0, bands.STATE.index("open")] = len(self._names)
+        self._state[0, bands.STATE.index("failed")] = 0
+        if len(self._threads) < len(self._helpers):
+            self._threads = [threading.Thread(target=helper.call, daemon=True) for helper in self._helpers]
+            for thread in self._threads:
+                thread.start()
+        if self._tiles:
+            with alone_with_tiles():
+                self._caller.call()
+        else:
+            self._caller.call()
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        times = np.add.reduceat(self._time, self._first)
+        return dict(zip(self._names, times.tolist(), strict=True))
+
+    def close(self) -> None:
+        """Let the threads end, and go of all that the tables refer to: of the scheduler, and so of this, too."""
+        self._end()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        self._packed.clear()
+        self._host_steps.clear()
+        del self._called, self._decide, self._finish, self._caller, self._helpers
+
+
+def _stop(state: _Table, system: _System, count: int) -> None:
+    state[0, bands.STATE.index("stop")] = 1
+    post, semaphore = system.functions[1], int(state[0, bands.STATE.index("semaphore")])
+    for _ in range(count):
+        post(ctypes.c_void_p(semaphore), *([ctypes.c_long(1), None] if sys.platform == "win32" else []))
+
+
+def _table(names: tuple[str, ...], rows: list[dict[str, int]]) -> _Table:
+    return np.array([[row.get(name, 0) for name in names] for row in rows], np.int64).reshape(len(rows), len(names))
+
+
+def _column(table: _Table, names: tuple[str, ...], name: str) -> _Table:
+    return table[:, names.index(name)]

@@ -1,0 +1,145 @@
+"""Compiling and loading the kernels of a plan: side by side, longest first, with word of how far it is.
+
+Warp translates Python to C++ in one thread at a time and leaves its compilers, which take most of the time, to run
+beside it. Each thread of a process has Clang parse Warp's headers anew, for 1.5 s, before it compiles its first module;
+here they are parsed once and kept beside the compiled kernels.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from warp_ar.device import compiling, exclusive, usable_cores
+
+Progress = Callable[[int, int], None]
+"""Told how many of how many modules are compiled, first with 0; not called where all were compiled before."""
+
+_HEADER_WAIT = 10.0
+"""Seconds that a thread waits for another's headers before it parses them itself."""
+
+
+def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress | None = None) -> None:
+    """Compile the modules of ``kernels`` where they are not in the cache, and load them.
+
+    Args:
+        kernels: Of a plan, in the order of its stages.
+        device: Warp device.
+        progress: Told after each module; on the caller's thread.
+    """
+    found = dict.fromkeys(kernel.module for kernel in kernels)
+    with compiling():
+        missing = [module for module in found if not _is_cached(module, device)]
+        if missing:
+            # The last stages have the longest kernels: begun last they would keep one thread busy alone.
+            _compile(missing[::-1], device, progress)
+        for module in found:
+            with exclusive(device):
+                _load(module, device)
+
+
+def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
+    cores = usable_cores()
+    headers = _Headers() if device.is_cpu else None
+
+    def work(module: Any) -> None:
+        with headers.shared() if headers is not None else contextlib.nullcontext():
+            if device.is_cpu:
+                _load(module, device)
+            else:
+                wp.compile_aot_module(module, device=device)
+
+    if progress is not None:
+        progress(0, len(modules))
+    with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
+        for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
+            job.result()
+            if progress is not None:
+                progress(done, len(modules))
+
+
+def _load(module: Any, device: Any) -> None:
+    wp.load_module(module, device=device, block_dim=1 if device.is_cpu else None)
+
+
+def _is_cached(module: Any, device: Any) -> bool:
+    """Whether a module's binary is there; asking hashes what it is made of, which loading needs anyway."""
+    name = module.get_module_identifier(1 if device.is_cpu else None)
+    return bool(wp.config.cache_kernels) and (Path(wp.config.kernel_cache_dir) / name).is_dir()
+
+
+class _Headers:
+    """Warp's headers, parsed once for all threads and kept for the next process.
+
+    Clang itself sees to it that they fit what it compiles, by the files' times and its own flags, and parses them anew
+    where they do not. Where this Warp keeps them elsewhere, each thread does.
+    """
+
+    def __init__(self) -> None:
+        runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
+        self._folder_of_thread = (
+            getattr(runtime, "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
+        )
+        builtin = Path(wp.__file__).parent / "native" / "builtin.h"
+        self._lock = threading.Lock()
+        self._first: int | None = None
+        self._parsed = threading.Event()
+        if self._folder_of_thread is None or not builtin.is_file():
+            self._folder_of_thread = None
+            return
+        stat = builtin.stat()
+        key = f"{wp.__version__} {builtin} {stat.st_mtime_ns} {stat.st_size} {wp.config.cpu_compiler_flags}"
+        self._store = Path(wp.config.kernel_cache_dir) / f"headers_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+
+    @contextlib.contextmanager
+    def shared(self) -> Any:
+        """Around what a thread compiles: it finds the headers if anyone has parsed them, and leaves its own."""
+        if self._folder_of_thread is None:
+            yield
+            return
+        own = Path(self._folder_of_thread())
+        with self._lock:
+            first = self._first is None and not _headers_in(own) and not _headers_in(self._store)
+            if first:
+                self._first = threading.get_ident()
+                watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
+        if first:
+            watcher.start()
+        elif not _headers_in(own):
+            if self._first is not None:
+                self._parsed.wait(_HEADER_WAIT)
+            _copy_headers(self._store, own)
+        yield
+
+    def _keep(self, own: Path) -> None:
+        """Put what the first thread parses where others find it."""
+        stop = time.monotonic() + _HEADER_WAIT
+        while time.monotonic() < stop and not _headers_in(own):
+            time.sleep(0.02)
+        _copy_headers(own, self._store)
+        self._parsed.set()
+
+
+def _headers_in(folder: Path) -> list[Path]:
+    return list(folder.glob("*.pch"))
+
+
+def _copy_headers(source: Path, target: Path) -> None:
+    """Copy parsed headers; a file appears whole or not at all. A full or foreign disk only costs the time again."""
+    with contextlib.suppress(OSError):
+        target.mkdir(parents=True, exist_ok=True)
+        for path in _headers_in(source):
+            if not (target / path.name).exists():
+                part = target / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+                shutil.copyfile(path, part)
+                part.replace(target / path.name)

@@ -1,0 +1,171 @@
+"""At which code a camera's channels saturate, told from the pictures themselves.
+
+A sensor that saturates need not give 255: limited range, a shoulder or tone mapping may end at 235 or 238. What lies
+above that light is lost all the same, and code 238 taken for a radiance of 0.85 hides that a lamp clips.
+
+Saturation shows as a plateau: of the codes inside the mirror ball, where lamps and windows are seen, many are the same
+and none is higher. Surfaces that are evenly lit crowd too, but around a mean, with noise to both sides. So a level L
+below 254 is believed where, in the ball,
+
+- codes L - 1 to L + 1 are more than ``LEAST_SHARE`` of all, and at least ``LEAST_PIXELS``;
+- they are ``STEEP`` times as frequent as the three codes before them: no bell has such a flank;
+- next to nothing, ``ABOVE`` of them, is higher: rounding of a codec.
+
+Compression throws the channels' codes to both sides of a plateau, up to some ten, but hardly their luma: it keeps that
+in full resolution. So a plateau of luma counts for all channels where its pixels are neutral: lamps drive all channels
+to the end, and few surfaces are so neutral.
+
+A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
+255 anywhere in the picture takes it back for good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.scene import Camera, Probe
+from warp_ar.scene.pose import Pose
+
+FULL = 255
+"""Code at which channels saturate unless pictures say otherwise."""
+LEAST_LEVEL = 200
+"""Code below which no camera is taken to saturate."""
+NEAR_FULL = 253
+"""Level from which on the usual one is meant: codecs lower 255 by one or two."""
+LEAST_PIXELS = 8
+"""Pixels of the ball that a plateau has."""
+LEAST_SHARE = 1e-3
+"""Share of the ball's pixels that it has."""
+STEEP = 4.0
+"""Ratio of a plateau's pixels to those of as many codes before it."""
+ABOVE = 0.05
+"""Share of a plateau's pixels that may be higher: rounding."""
+ABOVE_LUMA = 0.15
+"""The same of a plateau of luma."""
+NEUTRAL = 3.0
+"""Codes by which the median pixel of a plateau of luma may be off it, in each channel."""
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Of JPEG and most video: ITU-R BT.601."""
+RINGING = 17
+"""Codes by which compression exceeds a plateau."""
+LEAST_HEAP = 2e-4
+"""Share of the whole picture that has codes 254 and 255 where a channel saturates at them."""
+INSIDE = 0.95
+"""Share of the ball's radius within which pixels are the ball's for certain."""
+WATCHED = 24
+"""First frames of a camera, each of which is looked at."""
+PERIOD = 12
+"""Of later frames one of so many is."""
+WIDTH = 1
+"""Codes to either side of a plateau's own that belong to it."""
+
+
+class SaturationLevels:
+    """Remembers at which code each channel saturates, frame after frame."""
+
+    def __init__(self) -> None:
+        """Take every channel to saturate at 255."""
+        self.levels: NDArray[np.int64] = np.full(3, FULL)
+        """Code at which each channel saturates, (3,)."""
+        self._is_full = np.zeros(3, bool)
+
+    def observe(self, image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> bool:
+        """Look at one picture; returns whether a level has changed.
+
+        Args:
+            image: uint8 RGB (height, width, 3).
+            balls: Centre x, y and radius of each ball, pixels.
+        """
+        if self._is_full.all():
+            return False
+        before = self.levels.copy()
+        codes = ball_codes(image, balls)
+        found = luma_plateau(codes)
+        for c in range(3):
+            part = np.ascontiguousarray(image[::2, ::2, c])
+            heap = int(np.count_nonzero(part >= 254))
+            before_it = int(np.count_nonzero(part >= 252)) - heap
+            self._is_full[c] |= heap >= max(LEAST_PIXELS, LEAST_HEAP * part.size) and heap > 2 * before_it
+            level = find_plateau(np.bincount(codes[:, c], minlength=256), STEEP, ABOVE)
+            if level is None:
+                level = found
+            if level is not None:
+                self.levels[c] = level
+            if self._is_full[c]:
+                self.levels[c] = FULL
+        return bool((before != self.levels).any())
+
+
+def find_plateau(counts: NDArray[np.int64], steep: float, above: float) -> int | None:
+    """The code at which a channel saturates, or None where its pixels do not tell.
+
+    Args:
+        counts: How often each code is seen, (256,).
+        steep: How many times as frequent as the codes before and behind it a plateau must be.
+        above: Share of its pixels that may be higher.
+    """
+    highest = int(np.flatnonzero(counts).max(initial=0))
+    if highest < LEAST_LEVEL:
+        return None
+    candidates = np.arange(max(highest - RINGING, LEAST_LEVEL), highest + 1)
+    level = int(candidates[np.argmax(counts[candidates])])
+    on = int(counts[level - WIDTH : level + WIDTH + 1].sum())
+    below = int(counts[level - 3 * WIDTH - 1 : level - WIDTH].sum())
+    behind = counts[level + WIDTH + 1 :]
+    if level >= NEAR_FULL or on < max(LEAST_PIXELS, LEAST_SHARE * int(counts.sum())):
+        return None
+    is_steep = on >= steep * max(below, int(behind[: 2 * WIDTH + 1].sum()))
+    return level if is_steep and int(behind.sum()) <= above * on else None
+
+
+def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
+    """The code at which all channels saturate by a plateau of luma, or None.
+
+    Args:
+        codes: Pixels, (n, 3).
+    """
+    luma = np.round(codes @ LUMA).astype(np.int64)
+    level = find_plateau(np.bincount(luma, minlength=256), STEEP, ABOVE_LUMA)
+    if level is None:
+        return None
+    on = codes[np.abs(luma - level) <= WIDTH].astype(np.float64)
+    return level if np.median(np.abs(on - level), axis=0).max() <= NEUTRAL else None
+
+
+def ball_codes(image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> NDArray[np.uint8]:
+    """Codes of the pixels inside balls, (n, 3).
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        balls: Centre x, y and radius of each, pixels.
+    """
+    height, width = image.shape[:2]
+    found = [np.zeros((0, 3), np.uint8)]
+    for x, y, radius in balls:
+        r = INSIDE * radius
+        top, bottom = max(int(np.ceil(y - r)), 0), min(int(np.floor(y + r)) + 1, height)
+        left, right = max(int(np.ceil(x - r)), 0), min(int(np.floor(x + r)) + 1, width)
+        if top >= bottom or left >= right:
+            continue
+        off = np.hypot(np.arange(top, bottom)[:, None] - y, np.arange(left, right)[None] - x)
+        found.append(image[top:bottom, left:right][off <= r])
+    return np.concatenate(found)
+
+
+def ball_discs(probes: Sequence[Probe], camera: Camera, pose: Pose) -> list[tuple[float, float, float]]:
+    """Where balls are in the picture, as circles: centre x, y and radius, pixels; none of those behind the camera.
+
+    Args:
+        probes: The balls.
+        camera: Its distortion is left out: a rough place is enough.
+        pose: ``camera_from_world``.
+    """
+    discs = []
+    for probe in probes:
+        x, y, z = (float(v) for v in pose.rotation @ np.array(probe.center) + pose.translation)
+        if z > probe.radius:
+            discs.append((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, camera.fx * probe.radius / z))
+    return discs

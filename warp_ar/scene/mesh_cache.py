@@ -1,0 +1,49 @@
+"""Meshes as they were read from their files, kept for the next run: reading takes half a second of imports alone.
+
+Only files that hold all of their mesh are kept, under a hash of their bytes and of the code that reads them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from warp_ar.cache_folder import cache_folder
+from warp_ar.scene import geometry, mesh_files
+
+WHOLE = (".ply", ".stl", ".off", ".glb")
+"""Formats without files beside them."""
+MOST_BYTES = 256 << 20
+"""Of a file that is kept."""
+
+
+def load_kept_mesh(path: Path) -> geometry.Mesh:
+    """As ``mesh_files.load_mesh``, from what an earlier run kept if the file is the same.
+
+    Raises:
+        SceneError: As ``mesh_files.load_mesh``.
+    """
+    try:
+        if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
+            return mesh_files.load_mesh(path)
+        code = b"".join(Path(str(module.__file__)).read_bytes() for module in (geometry, mesh_files))
+        key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
+    except OSError:
+        return mesh_files.load_mesh(path)  # which says what is wrong
+    kept = cache_folder() / "meshes" / f"{key}{path.suffix.lower()}.npz"
+    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile), np.load(kept) as values:
+        return geometry.Mesh(**{name: values[name] for name in values.files})
+    mesh = mesh_files.load_mesh(path)
+    values = {field.name: getattr(mesh, field.name) for field in dataclasses.fields(mesh)}
+    part = kept.with_suffix(f".{os.getpid()}.npz")
+    with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(part, **{name: value for name, value in values.items() if value is not None})
+        part.replace(kept)
+    return mesh

@@ -1,0 +1,56 @@
+"""Which variant of a kernel a stage compiles: what its scene calls for, or one that every scene shares.
+
+A kernel that holds nothing but what its scene needs is faster, and is compiled anew for each combination of shapes,
+materials and lights. On CPU the general one costs a frame a few hundredths more, for it asks a shape for its kind where
+it walks memory anyway; there only what a whole stage does without is left out. On CUDA code that is never reached
+still takes registers from what is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from warp_ar.kernels.composite import CompositeConfig
+from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
+from warp_ar.kernels.relight import RelightConfig
+from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.stages.features import Features
+
+
+def shares_kernels(device: Any) -> bool:
+    """Whether kernels on ``device`` are those of any scene."""
+    return bool(device.is_cpu)
+
+
+def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:
+    """Kinds of shape to compile in."""
+    return config.general() if shares_kernels(device) else config
+
+
+def distant_variant(features: Features, device: Any) -> DistantLightConfig:
+    """Shapes, materials and forms of light to compile in."""
+    return features.distant.general(_form(features)) if shares_kernels(device) else features.distant
+
+
+def shade_variant(config: ShadeConfig, features: Features, device: Any) -> ShadeConfig:
+    """As ``distant_variant``, and kinds of virtual light."""
+    return config.general(_form(features), soft=_asks_soft(features)) if shares_kernels(device) else config
+
+
+def relight_variant(config: RelightConfig, features: Features, device: Any) -> RelightConfig:
+    """Shapes and shadows to compile in."""
+    return config.general(soft=_asks_soft(features)) if shares_kernels(device) else config
+
+
+def composite_variant(config: CompositeConfig, device: Any) -> CompositeConfig:
+    """Layers to compile in."""
+    return config.general() if shares_kernels(device) else config
+
+
+def _form(features: Features) -> DiffuseForm:
+    return "sh" if features.irradiance == "irradiance_sh" else "map"
+
+
+def _asks_soft(features: Features) -> bool:
+    return features.request.quality.method("light_shadow") == "soft"

@@ -1,0 +1,45 @@
+"""The mirror ball's part of the frame as a texture with mip levels, as the paper has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels import sphere_map
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, unobserved
+from warp_ar.stages.features import Features
+
+
+class SphereMap(Stage):
+    """Copies the square around the ball, and halves it level by level."""
+
+    name: ClassVar[str] = "sphere_map"
+    summary: ClassVar[str] = "the ball's square of the frame as a texture with mip levels (the paper)"
+    unread: ClassVar[str] = "no stage is on the paper's own way to look the ball up"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; running means, exact for equal texels",
+        bound=1e-4,
+        cause="places of 1e-7 of a frame's width, times the contrast of noise",
+        measured=2e-05,
+        rows=(6, 17),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Needs a mirror ball."""
+        return Wiring(("frame", "pose"), ("sphere_map",)) if features.observed else LeftOut(unobserved(features))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """All levels, one after another."""
+        return {"sphere_map": ArraySpec((sphere_map.map_texels(),), wp.vec3)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """The ball's square, then its levels."""
+        known = arrays["params"], arrays["probes"], arrays["frame"], arrays["decode"]
+        texture = arrays["sphere_map"]
+        return [
+            Pass(lambda rows: sphere_map.copy_ball(*known, texture, rows=rows), rows=sphere_map.SIZE),
+            Pass(lambda rows: sphere_map.halve_levels(texture)),
+        ]
