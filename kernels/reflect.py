@@ -1,6 +1,6 @@
 """What a ray that leaves a surface sees: the receiver in the picture, virtual objects, the environment.
 
-The real desk is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
+The receiver is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.

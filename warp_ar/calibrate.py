@@ -1,6 +1,6 @@
 """``python -m warp_ar.calibrate``: print a marker, and measure the camera, its response, and where the ball stands.
 
-card      writes a marker or board as a PNG that prints at exact size
+card      writes the card, or a marker or board, as a PDF or PNG that prints at true size
 camera    pictures of a ChArUco board to an OpenCV YAML file, which ``--calibration`` and a scene's ``calibration``
 read ball      frames of a scene to its mirror ball's centre, for the scene's ``[probe]``
 response  pictures at several exposures to a response curve, for the scene's ``transfer``
@@ -28,23 +28,23 @@ from warp_ar.input.ball_outline import locate_ball
 from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
 from warp_ar.input.response import measure_response, write_response
+from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import open_source
 from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import Marker, load_scene, loads_scene
 
 Image = NDArray[np.uint8]
 
-PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height of paper in millimetres, upright."""
-
-
-def _marker(options: argparse.Namespace) -> Marker:
-    """The marker that options describe, checked as a scene's is."""
-    lines = [f"dictionary = {json.dumps(options.dictionary)}"]
-    if options.board is not None:
-        lines.append(f"board = {json.dumps(options.board)}")
+def _marker(options: argparse.Namespace) -> Marker | None:
+    """The marker that options describe, checked as a scene's is; None where none of them is given."""
+    given = {key: getattr(options, key, None) for key in ("dictionary", "board", "id", "size")}
+    if all(value is None for value in given.values()):
+        return None
+    lines = [f"dictionary = {json.dumps(given['dictionary'] or Marker.dictionary)}"]
+    if given["board"] is not None:
+        lines.append(f"board = {json.dumps(given['board'])}")
     else:
-        lines += [f"id = {options.id}", f"size = {options.size}"]
+        lines += [f"id = {given['id'] or 0}", f"size = {Marker.size if given['size'] is None else given['size']}"]
     return loads_scene("\n".join(["schema = 1", 'name = "options"', _CAMERA, "[marker]", *lines]), "options").marker
 
 
@@ -80,20 +80,18 @@ def make_parser() -> argparse.ArgumentParser:
             command.add_argument("--overwrite", action="store_true", help=text)
         return command.add_argument
 
-    board = 'a board, as in a scene: "charuco 7x5 0.03 0.022" or "grid 4x3 0.04 0.01", lengths in metres'
-    option = add("card", "write a marker or board as a PNG that prints at exact size", "card.png")
-    option("--dictionary", default="DICT_4X4_50", metavar="NAME", help="OpenCV's dictionary (default: DICT_4X4_50)")
-    option("--id", type=int, default=0, help="which marker (default: 0)")
-    option("--size", type=float, default=0.08, help="side of the black square in metres (default: 0.08)")
+    board = f'a board, as in a scene: "{SHEET.board}" or "grid 4x3 0.04 0.01", lengths in metres'
+    option = add("card", "write the card, or a marker or board of your own, as a page that prints at true size", "card.pdf")
+    option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of a marker of your own ({Marker.dictionary})")
+    option("--id", type=int, metavar="N", help="which marker (0), instead of the card")
+    option("--size", type=float, metavar="X", help="side of its black square in metres (0.08), instead of the card")
     option("--board", metavar="TEXT", help=board)
     option("--paper", default="a4", metavar="|".join(PAPERS), help="default: a4")
     option("--dpi", type=float, default=600.0, help="dots per inch (default: 600)")
     option = add("camera", "calibrate the camera from pictures of a ChArUco board", "camera.yml")
     option("pictures", nargs="+", metavar="PATH|INDEX", help="folders, pictures, videos, or a capture device")
-    option("--dictionary", default="DICT_5X5_100", metavar="NAME", help="OpenCV's dictionary (default: DICT_5X5_100)")
-    option(
-        "--board", default="charuco 7x5 0.03 0.022", metavar="TEXT", help=board + " (default: charuco 7x5 0.03 0.022)"
-    )
+    option("--dictionary", metavar="NAME", help="OpenCV's dictionary (default: that of the board in the pictures)")
+    option("--board", metavar="TEXT", help=board + " (default: the one in the pictures)")
     option("--frames", type=int, metavar="N", help="stop after N frames of each video or device")
     option = add("ball", "measure where a scene's mirror ball stands", None)
     option(
@@ -151,10 +149,9 @@ def _run(options: argparse.Namespace) -> int:
     if options.command != "ball":
         _check_output(options)
     if options.command == "card":
-        write_card(_marker(options), options.output, options.paper, options.dpi)
-        print(f"{options.output}: print at 100 %, without fitting to the page, and check that the bar is 100 mm")
+        write_card(_marker(options) or SHEET, options.output, options.paper, options.dpi)
+        print(f"{options.output}: print at 100 %, without fitting to the page, and check with a ruler that 100 mm are 100 mm")
     elif options.command == "camera":
-        options.id, options.size = 0, 0.08
         report = calibrate_camera(_pictures(options.pictures, options.frames), _marker(options))
         write_camera(report, options.output)
         c = report.camera
@@ -162,6 +159,7 @@ def _run(options: argparse.Namespace) -> int:
             f"{options.output}: fx {c.fx:.2f} fy {c.fy:.2f} (+/- {report.focal_deviation:.2f}) "
             f"cx {c.cx:.2f} cy {c.cy:.2f}"
         )
+        print(f"board: {report.marker.board} ({report.marker.dictionary})")
         print(
             f"reprojection error {report.error:.3f} pixels over {len(report.view_errors)} views "
             f"(worst {max(report.view_errors):.3f}), {report.coverage:.0%} of the picture covered"

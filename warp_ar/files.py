@@ -105,6 +105,14 @@ def is_file(path: str | os.PathLike[str]) -> bool:
         return False
 
 
+def is_folder(path: str | os.PathLike[str]) -> bool:
+    """Whether a path leads to a folder; a path that cannot be one does not."""
+    try:
+        return kind_of(path) == "folder"
+    except OSError:
+        return False
+
+
 def read_bytes(path: str | os.PathLike[str], limit: str, error: type[WarpArError], label: str | None = None) -> bytes:
     """All of a regular file.
 

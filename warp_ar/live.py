@@ -71,7 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="?",
         default="desk",
         metavar="SCENE",
-        help="a scene file or a bundled scene's name (default: desk)",
+        help="a scene file, a folder with one, or a bundled scene's name (default: desk)",
     )
     add("--list", action="store_true", help="list the bundled scenes and stop")
     add(

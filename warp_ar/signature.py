@@ -47,6 +47,8 @@ def is_signed(path: str | os.PathLike[str]) -> bool:
     name = PROGRAM.encode()
     if head.startswith(b"\x89PNG"):
         return b"tEXtSoftware\0" + name in head
+    if head.startswith(b"%PDF-"):
+        return head.split(b"\n", 3)[2:3] == [b"% " + name]
     if head.startswith(b"\x76\x2f\x31\x01"):
         return b"software\0string\0" + struct.pack("<I", len(name)) + name in head
     if head[4:8] == b"ftyp" or head.startswith(b"\x1a\x45\xdf\xa3"):

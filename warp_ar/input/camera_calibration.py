@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
+from warp_ar.input.board_finder import recognise_board
 from warp_ar.input.markers import make_board
+from warp_ar.input.sheet import SHEET
 from warp_ar.scene import Camera, CharucoBoard, Marker
 from warp_ar.signature import PROGRAM
 
@@ -52,29 +54,39 @@ class CameraReport:
     """Share of the picture's cells where the board has been."""
     warnings: tuple[str, ...]
     """What would make it better, one line each."""
+    marker: Marker
+    """The board that was seen."""
 
 
 class BoardViews:
     """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
 
-    def __init__(self, marker: Marker) -> None:
+    def __init__(self, marker: Marker | None = None) -> None:
         """Collect nothing yet.
 
         Args:
-            marker: the board that was printed.
+            marker: the board that was printed; None: whichever ChArUco board the first picture of one shows.
 
         Raises:
             UsageError: if it is no ChArUco board.
         """
-        if not isinstance(marker.board, CharucoBoard):
-            raise UsageError('--board: the camera is calibrated with a ChArUco board, such as "charuco 7x5 0.03 0.022"')
-        self._marker = marker
-        self._board = make_board(marker)
-        self._detector = cv2.aruco.CharucoDetector(self._board)
+        if marker is not None and not isinstance(marker.board, CharucoBoard):
+            raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
+        self.marker: Marker | None = None
+        """The board, as soon as it is known."""
+        self._board: Any = None
+        self._detector: Any = None
+        if marker is not None:
+            self._take(marker)
         self._size: tuple[int, int] | None = None
         self._seen = 0
         self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
         """Corners in pixels, their numbers, and where they are on the board."""
+
+    def _take(self, marker: Marker) -> None:
+        self.marker = marker
+        self._board = make_board(marker)
+        self._detector = cv2.aruco.CharucoDetector(self._board)
 
     def add(self, image: Image) -> bool:
         """Take a picture, RGB or grey uint8; True if it shows the board as none before.
@@ -89,6 +101,10 @@ class BoardViews:
             raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}")
         self._seen += 1
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if self.marker is None:
+            if (seen := recognise_board(gray)) is None:
+                return False
+            self._take(seen)
         corners, ids, _, _ = self._detector.detectBoard(gray)
         # Corners on one line, or fewer than six, leave a view's pose open.
         if ids is None or len(ids) < 6 or self._board.checkCharucoCornersCollinear(ids):
@@ -111,10 +127,11 @@ class BoardViews:
             UsageError: if too few views show the board.
         """
         size = self._size
-        if size is None or len(self.views) < _FEWEST_VIEWS:
+        if size is None or self.marker is None or len(self.views) < _FEWEST_VIEWS:
+            what = "a ChArUco board" if self.marker is None else f"{self.marker.board} ({self.marker.dictionary})"
             raise UsageError(
-                f"{len(self.views)} different views of {self._marker.board} ({self._marker.dictionary}) in "
-                f"{self._seen} pictures; expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
+                f"{len(self.views)} different views of {what} in {self._seen} pictures; "
+                f"expected {_FEWEST_VIEWS} at the least, {GOOD_VIEWS} for a good result"
             )
         result = _calibrate(self.views, size)
         errors = np.ravel(result[-1])
@@ -151,15 +168,16 @@ class BoardViews:
             float(np.ravel(deviations)[:2].max()),
             float(covered.mean()),
             tuple(warnings),
+            self.marker,
         )
 
 
-def calibrate_camera(images: Iterable[Image], marker: Marker) -> CameraReport:
+def calibrate_camera(images: Iterable[Image], marker: Marker | None = None) -> CameraReport:
     """Pinhole and distortion from views of a ChArUco board.
 
     Args:
         images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
-        marker: the board that was printed.
+        marker: the board that was printed; None: whichever the pictures show.
 
     Raises:
         UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.input.markers import find_dictionary, make_board
+from warp_ar.input.sheet import SHEET, draw_sheet
 from warp_ar.scene import CharucoBoard, Marker
-from warp_ar.signature import sign_png
+from warp_ar.signature import PROGRAM, sign_png
 
 Image = NDArray[np.uint8]
 
@@ -71,18 +73,39 @@ def draw_card(marker: Marker, pixels_per_metre: float) -> Image:
 
 
 def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0) -> None:
-    """Write a page with the card, its name and a 100 mm bar to check the printer with.
+    """Write a page that prints at true size: a PDF or a PNG, by the name's ending.
+
+    Args:
+        marker: What to print; ``SHEET`` becomes the whole card, any other one gets its name and a bar of 100 mm.
+        path: The file.
+        paper: A name of ``PAPERS``.
+        dpi: Dots per inch.
 
     Raises:
-        UsageError: if the card does not fit on the paper.
-        SinkError: if the file cannot be written.
+        UsageError: The card does not fit on the paper, or the name ends otherwise.
+        SinkError: The file cannot be written.
     """
     if paper not in PAPERS:
         raise UsageError(f"--paper {paper}: expected {', '.join(PAPERS)}")
     if not 72 <= dpi <= 2400:
         raise UsageError(f"--dpi {dpi:g}: expected 72 to 2400 dots per inch")
+    if path.suffix.lower() not in (".pdf", ".png"):
+        raise UsageError(f"--output {path}: expected a name that ends in .pdf or .png")
     # PNG stores whole pixels per metre: drawn at that resolution, the print is exact.
     per_metre = round(dpi / 0.0254)
+    if marker == SHEET:
+        width, height = PAPERS[paper]
+        page = draw_sheet((width / 1e3, height / 1e3), per_metre, draw_card(marker, per_metre))
+    else:
+        page = _draw_page(marker, paper, per_metre)
+    try:
+        write_whole(path, _pdf(page, per_metre) if path.suffix.lower() == ".pdf" else _png(page, per_metre))
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+
+
+def _draw_page(marker: Marker, paper: str, per_metre: int) -> Image:
+    """A page with a marker or board, its name and a bar of 100 mm to check the printer with."""
     width, height = PAPERS[paper]
     card_mm = [1e3 * length for length in card_size(marker)]
     foot = 15.0
@@ -106,8 +129,38 @@ def write_card(marker: Marker, path: Path, paper: str = "a4", dpi: float = 600.0
     text = f"{marker.dictionary}, {name}; print at 100 %: this bar is 100 mm"
     place = (round(_MARGIN * mm), bottom - round(3 * mm))
     cv2.putText(page, text, place, cv2.FONT_HERSHEY_SIMPLEX, mm / 9, 0, max(1, round(mm / 5)), cv2.LINE_AA)
-    try:
-        density = (per_metre * 0.0254, per_metre * 0.0254)
-        write_whole(path, sign_png(imageio.v3.imwrite("<bytes>", page, extension=".png", dpi=density)))
-    except OSError as error:
-        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
+    return page
+
+
+def _png(page: Image, per_metre: int) -> bytes:
+    density = (per_metre * 0.0254, per_metre * 0.0254)
+    return sign_png(imageio.v3.imwrite("<bytes>", page, extension=".png", dpi=density))
+
+
+def _pdf(page: Image, per_metre: int) -> bytes:
+    """A page of one bit per pixel as PDF 1.4, whose size on paper is exactly that of its pixels."""
+    rows, columns = page.shape
+    width, height = (length / per_metre / 0.0254 * 72 for length in (columns, rows))
+    bits = zlib.compress(np.packbits(page > 127, axis=1).tobytes(), 9)
+    contents = f"{width:.5f} 0 0 {height:.5f} 0 0 cm /Card Do".encode()
+    image = f"/Type /XObject /Subtype /Image /Width {columns} /Height {rows} /ColorSpace /DeviceGray"
+    objects = [
+        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
+        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.5f} {height:.5f}] /Contents 4 0 R "
+        "/Resources << /XObject << /Card 5 0 R >> >> >>".encode(),
+        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(contents), contents),
+        f"<< {image} /BitsPerComponent 1 /Filter /FlateDecode /Length {len(bits)} >>\nstream\n".encode()
+        + bits
+        + b"\nendstream",
+    ]
+    # The second line tells programs that the file is binary; the third is this program's signature.
+    out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n% " + PROGRAM.encode() + b"\n")
+    offsets = []
+    for number, body in enumerate(objects, 1):
+        offsets.append(len(out))
+        out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
+    table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
+    start, count = len(out), len(objects) + 1
+    trailer = f"trailer\n<< /Size {count} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n"
+    return bytes(out) + f"xref\n0 {count}\n0000000000 65535 f \n{table}{trailer}".encode()

@@ -48,6 +48,23 @@ class Camera:
     """OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]: 4, 5 or 8 values."""
     transfer: str | Path = "srgb"
     """How values were encoded: "srgb", "linear", "gamma:G" (linear = value ** G), or a measured response's file."""
+    field_of_view: float | None = None
+    """Horizontal field of view in degrees of a camera that was never calibrated, instead of its numbers: a guess, with
+    square pixels, a central principal point and no distortion, for whatever size the frames have."""
+
+    @classmethod
+    def guessed(cls, width: int, height: int, field_of_view: float, transfer: str | Path = "srgb") -> Camera:
+        """A camera of which only the field of view is guessed.
+
+        Args:
+            width: Width of the picture in pixels.
+            height: Height of the picture in pixels.
+            field_of_view: Horizontal, degrees.
+            transfer: How its values were encoded.
+        """
+        focal = 0.5 * width / math.tan(math.radians(0.5 * field_of_view))
+        center = (0.5 * (width - 1), 0.5 * (height - 1))
+        return cls(width, height, focal, focal, *center, transfer=transfer, field_of_view=field_of_view)
 
     def matrix(self) -> FloatMatrix:
         """Camera matrix K, (3, 3), in pixels."""
@@ -67,6 +84,8 @@ class Camera:
         """
         if (width, height) == (self.width, self.height):
             return self
+        if self.field_of_view is not None and min(width, height) >= 1:
+            return Camera.guessed(width, height, self.field_of_view, self.transfer)
         if width < 1 or height < 1 or width * self.height != height * self.width:
             raise SceneError(
                 f"camera: calibrated for {self.width}x{self.height}, frames are {width}x{height}: another aspect "

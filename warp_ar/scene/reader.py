@@ -20,8 +20,8 @@ from typing import Any, Final, NoReturn, TypeVar, cast
 
 import cv2
 
-from warp_ar.errors import SceneError
-from warp_ar.files import bracket_depth, check_depth, is_file, read_text
+from warp_ar.errors import SceneError, reason
+from warp_ar.files import bracket_depth, check_depth, is_file, is_folder, read_text
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
     RGB,
@@ -64,6 +64,8 @@ _BOARDS: Final = (
     '"charuco 5x7 0.04 0.03"'
 )
 
+_NOMINAL_SIZE: Final = (640, 480)
+"""Pixels of a guessed camera until its frames' size is known."""
 _DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
 _MOST_DOTS: Final = 16
@@ -224,9 +226,16 @@ def _read_camera(table: _Table, source: object = None) -> Camera:
         for key in INTRINSICS:
             if key in table:
                 table.fail(key, "not used beside calibration; give either the file or the numbers")
+        if "field_of_view" in table:
+            table.fail("field_of_view", "not used beside calibration; give either the file or the guess")
         return load_calibration(table.file("calibration", "a calibration file"), transfer)
+    if "field_of_view" in table:
+        for key in INTRINSICS:
+            if key in table:
+                table.fail(key, "not used beside field_of_view; give either the numbers or the guess")
+        return Camera.guessed(*_NOMINAL_SIZE, table.number("field_of_view", low=5.0, high=150.0, unit="degrees"), transfer)
     if not any(key in table for key in INTRINSICS):
-        table.fail("width", f"give {', '.join(INTRINSICS[:6])}, or calibration with the path of OpenCV's YAML or JSON")
+        table.fail("width", f"give {', '.join(INTRINSICS[:6])}, or field_of_view, or calibration with the path of OpenCV's YAML or JSON")
     return Camera(
         width=table.integer("width", low=1, high=MOST_PIXELS),
         height=table.integer("height", low=1, high=MOST_PIXELS),
@@ -500,16 +509,34 @@ def bundled_scenes() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
+def _scene_in(folder: Path) -> Path:
+    """The one scene file of a folder.
+
+    Raises:
+        SceneError: It holds none, or several.
+    """
+    try:
+        found = sorted(path for path in folder.glob("*.toml") if is_file(path))
+    except OSError as error:
+        raise SceneError(f"{folder}: cannot be read: {reason(error)}") from error
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:4]) or "none"
+        raise SceneError(f"{folder}: expected a folder with one scene file, NAME.toml; it has {names}")
+    return found[0]
+
+
 def load_scene(path_or_name: str | Path) -> Scene:
     """Read a scene file.
 
     Args:
-        path_or_name: A file, or the name of a bundled scene.
+        path_or_name: A file, a folder that holds one, or the name of a bundled scene.
 
     Raises:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
     """
     path = Path(path_or_name)
+    if is_folder(path):
+        path = _scene_in(path)
     if not is_file(path):
         bundled = bundled_scenes()
         if str(path_or_name) not in bundled:
@@ -554,7 +581,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     if top.data["schema"] is True or top.data["schema"] != SCHEMA:
         top.fail("schema", f"this program reads schema {SCHEMA}")
     if "camera" not in data:
-        raise SceneError(f"{label}: [camera] is missing: give {', '.join(INTRINSICS[:6])}, or calibration")
+        raise SceneError(f"{label}: [camera] is missing: give {', '.join(INTRINSICS[:6])}, calibration or field_of_view")
 
     def one(section: str, keys: Sequence[str], read: Any) -> Any:
         return read(_Table(label, folder, section, data[section], keys)) if section in data else None
@@ -584,7 +611,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
         name=top.text("name", "scene" if path is None else path.stem),
         camera=one(
             "camera",
-            (*INTRINSICS, "transfer", "calibration"),
+            (*INTRINSICS, "transfer", "calibration", "field_of_view"),
             lambda table: _read_camera(table, data.get("source")),
         ),
         source=one("source", keys_of(SourceSpec), _read_source),

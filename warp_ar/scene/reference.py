@@ -97,6 +97,7 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("camera", "distortion"): ("-", "[-0.12, 0.05, 0.0, 0.0, 0.0]", _INTRINSICS),
     ("camera", "transfer"): ("-", '"gamma:2.2"', _INTRINSICS),
     ("camera", "calibration"): ("-", '"camera.yml"', ""),
+    ("camera", "field_of_view"): ("degrees", "60.0", ""),
     ("source", "path"): ("-", '"frames"', ""),
     ("source", "camera"): ("-", "0", ""),
     ("source", "synthetic"): ("-", '"moving_card"', ""),

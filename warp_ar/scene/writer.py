@@ -49,7 +49,8 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         return [f"animate = {value({key: entry for key, entry in fields.items() if entry is not None})}"]
 
     lines = [f"schema = {scene.schema}", f"name = {value(scene.name)}"]
-    lines += ["", "[camera]", *table(scene.camera, (*INTRINSICS, "transfer"))]
+    guessed = scene.camera.field_of_view is not None
+    lines += ["", "[camera]", *table(scene.camera, (*(("field_of_view",) if guessed else INTRINSICS), "transfer"))]
     if scene.source is not None:
         lines += ["", "[source]", *table(scene.source, keys_of(SourceSpec))]
     keys = ("dictionary", "id", "size", "white") if scene.marker.board is None else ("dictionary", "board", "white")

@@ -16,11 +16,10 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 from warp_ar.input.camera_calibration import GOOD_VIEWS, BoardViews, CameraReport, write_camera
 from warp_ar.input.card import write_card
-from warp_ar.scene import Camera, CharucoBoard, Marker
+from warp_ar.input.sheet import SHEET
+from warp_ar.scene import Camera
 from warp_ar.viewer.controls import Notify
 
-BOARD: Final = Marker(dictionary="DICT_5X5_100", board=CharucoBoard(7, 5, 0.03, 0.022))
-"""What a camera is calibrated with: a sheet of A4."""
 _LOOK_SECONDS: Final = 0.4
 """How often the board is looked for."""
 
@@ -53,7 +52,7 @@ class CalibrationSession:
                 raise UsageError("nothing was looked at yet: start the calibration first")
             self._report = self._views.solve()
             self._use(self._report.camera)
-        self._views = BoardViews(BOARD) if name == "start" else None
+        self._views = BoardViews() if name == "start" else None
         self._notify(self.message())
 
     def look(self, image: npt.NDArray[np.uint8]) -> None:
@@ -109,8 +108,8 @@ class CalibrationSession:
 
 
 def board_picture() -> bytes:
-    """The board to print, a PNG of a sheet of A4."""
-    return written("board.png", lambda path: write_card(BOARD, path, dpi=300.0))
+    """The card to print, a PNG of a sheet of A4."""
+    return written("board.png", lambda path: write_card(SHEET, path, dpi=300.0))
 
 
 def written(name: str, write: Callable[[Path], object]) -> bytes:

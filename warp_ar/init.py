@@ -1,0 +1,100 @@
+"""``python -m warp_ar.init my_desk``: a folder to start one's own desk from, with a scene, a teapot and the card to print.
+
+The folder runs at once with a guessed camera; what is guessed is said whenever it is run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.errors import SinkError, UsageError, printable, reason
+from warp_ar.input.card import write_card
+from warp_ar.input.sheet import RINGS, SHEET, ball_center
+from warp_ar.scene import bundled_scenes, load_scene
+from warp_ar.scene.starter import starter_scene
+
+SCENE, MESH = "scene.toml", "teapot.ply"
+CARDS = tuple(
+    (f"card-{paper}.{kind}", paper, dpi) for paper in ("a4", "letter") for kind, dpi in (("pdf", 600), ("png", 300))
+)
+"""Files of the card: name, paper, dots per inch."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.init",
+        description="Make a folder to start your own desk from: a scene file, a teapot, and the card to print.",
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="the folder to make; it must not be there yet")
+    text = "frames: a capture device's index, a video, a folder (default: 0)"
+    parser.add_argument("--source", default="0", metavar="PATH|INDEX", help=text)
+    parser.add_argument(
+        "--radius", type=float, default=0.035, metavar="X", help="the mirror ball's radius in metres (default: 0.035)"
+    )
+    return parser
+
+
+def make_desk(folder: Path, source: str | int, radius: float) -> None:
+    """Make the folder with all that is in it, or nothing.
+
+    Args:
+        folder: It must not be there yet.
+        source: A capture device's index, or a path.
+        radius: The ball's radius in metres.
+
+    Raises:
+        UsageError: The folder is there, or the radius fits no ball that stands on the card.
+        SinkError: It cannot be written.
+    """
+    if folder.exists() or folder.is_symlink():
+        raise UsageError(f"{folder}: is there already; expected the name of a new folder")
+    if not folder.absolute().parent.is_dir():
+        raise UsageError(f"{folder}: no folder {folder.absolute().parent} to make it in")
+    largest = 1.25 * max(RINGS)
+    if not (math.isfinite(radius) and 0.005 <= radius <= largest):
+        hint = f"; {radius:g} mm are {1e-3 * radius:g}" if 5 <= radius <= 1e3 * largest else ""
+        right = f"expected metres from 0.005 to {largest:g}, which stands on the card"
+        raise UsageError(f"--radius {radius:g}: {right}{hint}")
+    text = starter_scene(folder.absolute().name, source, SHEET, ball_center(radius), radius, MESH)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".warp_ar_init_", dir=folder.absolute().parent) as aside:
+            made = Path(aside) / "desk"
+            made.mkdir()
+            (made / SCENE).write_text(text, encoding="utf-8")
+            shutil.copyfile(bundled_scenes()["desk"].parent / "meshes" / MESH, made / MESH)
+            for name, paper, dpi in CARDS:
+                write_card(SHEET, made / name, paper, dpi)
+            load_scene(made)
+            made.rename(folder)
+    except OSError as error:
+        raise SinkError(f"{folder}: cannot be made: {reason(error)}") from error
+
+
+def _run(options: argparse.Namespace) -> int:
+    folder, given = options.folder, options.source
+    source = int(given) if given.isdecimal() else str(Path(given).absolute())
+    make_desk(folder, source, options.radius)
+    shown = printable(folder)
+    print(f"{shown}: {SCENE}, {MESH}, {', '.join(name for name, _, _ in CARDS)}")
+    print(f"1. Print {shown}/card-a4.pdf (or card-letter.pdf) at 100 %; both rulers on it must be 100 mm.")
+    print("2. Lay it flat, stand the mirror ball on its cross, and have all of it in the camera's picture.")
+    print(f"3. Write the ball's radius into {shown}/{SCENE}, [probe]; it says {options.radius:g} m.")
+    print(f"next: python -m warp_ar.live {shown}")
+    return EXIT_DONE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: _run(make_parser().parse_args(arguments)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
