@@ -1,4 +1,4 @@
-"""Whole frames: frames per second, every stage beside its floor, scenes of one effect, and the first frame of a run.
+"""Whole frames: frames per second, every stage beside its floor, and scenes of one effect.
 
 On CPU stages are timed by the processor time of one core, which other programs hardly disturb; frames per second by the
 clock. On CUDA stages are timed by events on the device; the whole frame is one captured graph.
@@ -13,8 +13,6 @@ import functools
 import itertools
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -324,18 +322,6 @@ def bench_effects(device: str, count: int) -> None:
         report(f"effect {name}", whole[WARM_UP:], device, beyond_stages=beyond_share, stages=stages)
 
 
-def bench_start(device: str) -> None:
-    """Seconds from the command to the first frame written: nothing cached, then everything."""
-    with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "warp_ar.live", "desk", "--headless", "--frames", "1", "--device", device]
-        environment = {**os.environ, "WARP_CACHE_PATH": str(Path(folder) / "cache")}
-        for run in ("first", "second", "third"):
-            start = time.perf_counter()
-            subprocess.run([*command, "--output", str(Path(folder) / run)], env=environment, check=True)
-            load = round(os.getloadavg()[0], 1)
-            report(f"start, {run} run", [(time.perf_counter() - start) * 1e3], device, load=load)
-
-
 def with_triangles(frames: Clip, count: int, folder: Path) -> Clip:
     """The clip with a torus of about ``count`` triangles in place of its first object."""
     tolerance = 1.0
@@ -381,5 +367,3 @@ def main(device: str) -> None:
                     many = with_triangles(clip("desk", SIZES["1080p"]), count, Path(folder))
                     bench_graph(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 200)
                     bench_stages(f"1080p {count} triangles", many, device, QUALITIES["medium, light as clipped"], 60)
-    if wanted("start"):
-        bench_start(device)

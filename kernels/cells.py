@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
+
+STRIDE_ROWS = 480
+"""Rows of a frame for which strides are given."""
 
 
 @wp.func
@@ -88,3 +93,22 @@ def any_cell_above_zero(
             if surface[i, j] >= 0 and wp.max(values[i, j]) > 0.0:
                 return True
     return False
+
+
+def cell_stride(stride: int, rows: int, *, slowly: bool = False) -> int:
+    """Pixels along a cell of a frame of so many rows; a stride of 1 is every pixel of any frame.
+
+    Args:
+        stride: The same for a frame of ``STRIDE_ROWS`` rows.
+        rows: Of the frame.
+        slowly: Whether cells grow as the root of the rows, so that larger pictures still have finer cells; else as the
+            rows, and their number stays.
+    """
+    grown = stride * math.sqrt(rows / STRIDE_ROWS) if slowly else stride * rows / STRIDE_ROWS
+    return 1 if stride == 1 else max(1, round(grown))
+
+
+def cell_shape(size: tuple[int, int], stride: int) -> tuple[int, int]:
+    """Rows and columns of the cells of a frame of (width, height)."""
+    width, height = size
+    return -(-height // stride), -(-width // stride)

@@ -1,4 +1,4 @@
-"""Shadows that virtual objects cast on the real desk under the environment, and the light that they bounce onto it.
+"""Shadows that virtual objects cast on the receiver under the environment, and the light that they bounce onto it.
 
 What a proxy's pixel becomes is a factor on what the camera sees there [Deb98]: reflectance cancels,
 

@@ -5,7 +5,7 @@ Per pixel of an object, two objects replace what the distant environment alone w
 *Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
 picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
 way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
-empty desk.
+empty receiver.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they

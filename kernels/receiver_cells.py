@@ -67,7 +67,7 @@ MIN_FACING = wp.constant(wp.float32(0.02))
 MAX_PARTIALS = 16
 """Threads of a CUDA device that share the samples of a cell at most: few cells are asked, each of many samples."""
 KINDS = wp.constant(2)
-"""Sums per part of a cell: the environment, and what is lost of it."""
+"""Values of a partial sum: the environment, and what is lost of it."""
 PENDING = wp.constant(-2)
 """What ``surface_out`` holds less the cell's surface while partials of its share are not yet added."""
 
@@ -178,7 +178,7 @@ def make_ambient_visibility_kernel(config: CellConfig) -> wp.Kernel:
         surface_out = cells_out.ambient_surface
         partial = ci / share_out.shape[0]
         ci = ci % share_out.shape[0]
-        # One part of a cell writes its surface, and no surface that another partial may still read as found before.
+        # One thread of a cell writes its surface, and no surface that another may still read as found before.
         if not bounced:
             if partial == 0:
                 surface_out[ci, cj] = -1

@@ -1,6 +1,6 @@
 """What a ray that leaves a surface sees: the receiver in the picture, virtual objects, the environment.
 
-The real desk is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
+The receiver is known twice: as part of the environment, seen from the mirror ball, and as the camera's picture, which
 the proxies place in space. Near an object the two differ by parallax, so a ray that meets a proxy looks the point up in
 the picture. A point outside the picture, on a face turned away, or hidden from the camera by a proxy or a ball, is
 looked up in the environment instead. Proxies are taken as matt: they look the same from the camera and from the point.
@@ -61,6 +61,8 @@ class DistantLightConfig:
     """Whether there are mirror balls, which hide the receiver."""
     emitters: bool = False
     """Whether emitters of the environment are known by their places."""
+    captured: bool = False
+    """Whether the environment is known without mirror balls, from a file."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
         """For any scene with as many mirror balls: forms that it does not call for may then be empty.
@@ -69,8 +71,11 @@ class DistantLightConfig:
             form: Where irradiance comes from in scenes that call for it.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
-        diffuse: DiffuseForm = form if self.probes else "none"
-        return DistantLightConfig(self.trace.general(), models, True, diffuse, self.probes, self.probes, self.emitters)
+        known = self.probes or self.captured
+        diffuse: DiffuseForm = form if known else "none"
+        return DistantLightConfig(
+            self.trace.general(), models, True, diffuse, known, self.probes, self.emitters, self.captured
+        )
 
 
 @wp.struct

@@ -1,4 +1,4 @@
-"""Virtual light on the physical desk: linear radiance that a virtual light adds to each pixel of the camera's frame.
+"""Virtual light on the receiver: linear radiance that a virtual light adds to each pixel of the camera's frame.
 
 Every pixel's ray meets the nearest proxy; the mirror ball, if it is in front, shows no light of its own. A light of
 irradiance E_v (facing it) arrives there along wi, unless a virtual object or a proxy stands between, and adds

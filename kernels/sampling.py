@@ -6,7 +6,7 @@ and point away from the surface. A pdf is per steradian, of what its sampler ret
 stays finite.
 
 References:
-    [JO20] Jarzynski, Olano 2020, Hash Functions for GPU Rendering: the PCG hashes.
+    [JO20] Jarzynski, Olano 2020, Hash Functions for GPU Rendering: the PCG hash.
     [SC97] Shirley, Chiu 1997, A Low Distortion Map Between Disk and Square.
     [Duff17] Duff et al. 2017, Building an Orthonormal Basis, Revisited.
     [Walter07] Walter et al. 2007, Microfacet Models for Refraction through Rough Surfaces: GGX.
@@ -35,15 +35,6 @@ ODD_NIBBLES = wp.constant(wp.uint32(0x0F0F0F0F))
 EVEN_NIBBLES = wp.constant(wp.uint32(0xF0F0F0F0))
 ODD_BYTES = wp.constant(wp.uint32(0x00FF00FF))
 EVEN_BYTES = wp.constant(wp.uint32(0xFF00FF00))
-PCG_SHIFT = wp.constant(wp.uint32(2891336453))
-
-
-@wp.func
-def pcg_hash(value: wp.uint32) -> wp.uint32:
-    """Hash of one integer ([JO20] pcg): the same bits on every device."""
-    state = value * wp.uint32(747796405) + PCG_SHIFT
-    word = ((state >> ((state >> wp.uint32(28)) + wp.uint32(4))) ^ state) * wp.uint32(277803737)
-    return (word >> wp.uint32(22)) ^ word
 
 
 @wp.func

@@ -14,7 +14,6 @@ PLANE = 0
 BOX = 1
 MESH = 2
 SPHERE = 3
-TORUS = 4
 
 # Kinds of light.
 POINT = 0
@@ -76,7 +75,7 @@ class Light:
 class Shape:
     """A proxy or a virtual object: point_world = rotation (scale point_local) + position."""
 
-    kind: wp.int32  # PLANE, BOX, MESH, SPHERE or TORUS
+    kind: wp.int32  # PLANE, BOX, MESH or SPHERE
     rotation: wp.mat33
     position: wp.vec3
     scale: wp.float32

@@ -16,9 +16,8 @@ ROUNDING = 1e-5
 
 
 @wp.kernel(enable_backward=False)
-def hash_kernel(values: wp.array[wp.vec3ui], single_out: wp.array[wp.uint32], triple_out: wp.array[wp.vec3ui]):
+def hash_kernel(values: wp.array[wp.vec3ui], triple_out: wp.array[wp.vec3ui]):
     i = wp.tid()
-    single_out[i] = sampling.pcg_hash(values[i][0])
     triple_out[i] = sampling.pcg3d_hash(values[i][0], values[i][1], values[i][2])
 
 
@@ -120,16 +119,15 @@ def view(cosine):
 def test_hashes_are_the_twins_bits(device):
     values = np.random.default_rng(2).integers(0, 2**32, (1000, 3), dtype=np.uint32)
     values[:2] = [[0, 0, 0], [2**32 - 1] * 3]
-    single, triple = wp.zeros(1000, dtype=wp.uint32), wp.zeros(1000, dtype=wp.vec3ui)
-    wp.launch(hash_kernel, 1000, [wp.array(values, dtype=wp.vec3ui)], [single, triple])
-    assert single.numpy().tolist() == [reference.pcg_hash(int(v[0])) for v in values]
+    triple = wp.zeros(1000, dtype=wp.vec3ui)
+    wp.launch(hash_kernel, 1000, [wp.array(values, dtype=wp.vec3ui)], [triple])
     assert triple.numpy().tolist() == [list(reference.pcg3d_hash(*map(int, v))) for v in values]
 
 
 def test_hashed_numbers_are_uniform(device):
     grid = np.stack(np.meshgrid(np.arange(64), np.arange(64), np.arange(16), indexing="ij"), -1).reshape(-1, 3)
-    single, triple = wp.zeros(len(grid), dtype=wp.uint32), wp.zeros(len(grid), dtype=wp.vec3ui)
-    wp.launch(hash_kernel, len(grid), [wp.array(grid.astype(np.uint32), dtype=wp.vec3ui)], [single, triple])
+    triple = wp.zeros(len(grid), dtype=wp.vec3ui)
+    wp.launch(hash_kernel, len(grid), [wp.array(grid.astype(np.uint32), dtype=wp.vec3ui)], [triple])
     for bits in triple.numpy().T:
         assert stats.chisquare(np.bincount(bits >> 24, minlength=256)).pvalue > SIGNIFICANCE
     joint = np.bincount((triple.numpy()[:, 0] >> 28) * 16 + (triple.numpy()[:, 1] >> 28), minlength=256)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import dataclasses
 import faulthandler
 import gc
 import itertools
@@ -40,7 +39,7 @@ from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
-from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
+from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 
@@ -81,7 +80,12 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="PATH|INDEX",
         help="frames from this folder, video file or capture device, not the scene's own",
     )
-    add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
+    add(
+        "--calibration",
+        metavar="FILE|exif",
+        help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers; exif: the first picture's",
+    )
+    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball in the frames shows")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add(
         "--quality",
@@ -173,6 +177,8 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
     reads["what the scene names,"] = [path for path in files_of(scene) if path != scene.path]
     if options.calibration is not None:
         reads["--calibration"] = [Path(options.calibration)]
+    if options.light is not None:
+        reads["--light"] = [Path(options.light)]
     if source is not None:
         reads["the source"] = [Path(source)]
     names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
@@ -259,6 +265,7 @@ def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.session import calibrated, with_light
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -271,7 +278,9 @@ def serve_page(options: argparse.Namespace) -> int:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     scene = load_scene(options.scene)
     if options.calibration is not None:
-        scene = dataclasses.replace(scene, camera=load_calibration(options.calibration, scene.camera.transfer))
+        scene = calibrated(scene, options.calibration, options.source)
+    if options.light is not None:
+        scene = with_light(scene, options.light)
     local = options.host in LOOPBACK
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
@@ -471,6 +480,7 @@ def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str,
         scene,
         source=options.source,
         calibration=options.calibration,
+        light=options.light,
         device=options.device,
         quality=options.quality,
         budget_ms=options.budget_ms,

@@ -386,10 +386,10 @@ MUTATIONS = (
     ),
     Mutation(
         17,
-        "the last band ends a row early",
-        "warp_ar/engine/scheduler.py",
-        "start + (stop - start) * band // bands for band",
-        "start + (stop - start - (bands > 1)) * band // bands for band",
+        "bands leave out a row between them",
+        "kernels/bands.py",
+        "p.taken = stop;",
+        "p.taken = stop + (stop < p.stop);",
         f"{HARD}test_row17_same_answer.py::test_bands_of_threads",
     ),
     Mutation(

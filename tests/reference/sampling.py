@@ -7,12 +7,6 @@ import numpy as np
 MASK = 0xFFFFFFFF
 
 
-def pcg_hash(value):
-    state = (value * 747796405 + 2891336453) & MASK
-    word = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & MASK
-    return (word >> 22) ^ word
-
-
 def pcg3d_hash(x, y, z):
     x, y, z = ((v * 1664525 + 1013904223) & MASK for v in (x, y, z))
     x = (x + y * z) & MASK

@@ -16,7 +16,7 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
-from warp_ar.input.saturation import SaturationLevels, ball_discs
+from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
 from warp_ar.scene import Camera, Pose, Scene
@@ -152,6 +152,8 @@ class FrameInputs:
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
         if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
+            return
+        if frame.index >= WATCHED and frame.index % PERIOD:
             return
         if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
             table = camera_table(self._camera.transfer, self.saturation.levels)

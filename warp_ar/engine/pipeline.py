@@ -125,7 +125,9 @@ class Pipeline:
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
-        self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
+        tracked = self.plan.needs("pose") and self.scene.pose is None
+        self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
         self._lit_time = 0.0
@@ -289,6 +291,9 @@ class Pipeline:
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         host_image = self._accept(image)
+        if pose is None and self.scene.pose is not None:
+            pose = Pose(*self.scene.pose.at(self._begun))
+        self._begun += 1
         handed_over = ahead and host_image is not None
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:

@@ -56,7 +56,7 @@ def read_photograph(path: str | Path) -> Photograph:
 
 
 def exposures_by_exif(photographs: Sequence[Photograph]) -> tuple[float, ...] | None:
-    """t ISO / (100 N^2) of every photograph; None where one of them does not tell.
+    """T ISO / (100 N^2) of every photograph; None where one of them does not tell.
 
     Raises:
         SourceError: Some tell of sensitivity or aperture, and some do not.

@@ -55,6 +55,10 @@ LEAST_HEAP = 2e-4
 """Share of the whole picture that has codes 254 and 255 where a channel saturates at them."""
 INSIDE = 0.95
 """Share of the ball's radius within which pixels are the ball's for certain."""
+WATCHED = 24
+"""First frames of a camera, each of which is looked at."""
+PERIOD = 12
+"""Of later frames one of so many is."""
 WIDTH = 1
 """Codes to either side of a plateau's own that belong to it."""
 
@@ -75,13 +79,16 @@ class SaturationLevels:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
         """
+        if self._is_full.all():
+            return False
         before = self.levels.copy()
         codes = ball_codes(image, balls)
         found = luma_plateau(codes)
         for c in range(3):
-            counts = np.bincount(image[::2, ::2, c].ravel(), minlength=256)
-            heap, before_it = int(counts[254:].sum()), int(counts[252:254].sum())
-            self._is_full[c] |= heap >= max(LEAST_PIXELS, LEAST_HEAP * counts.sum()) and heap > 2 * before_it
+            part = np.ascontiguousarray(image[::2, ::2, c])
+            heap = int(np.count_nonzero(part >= 254))
+            before_it = int(np.count_nonzero(part >= 252)) - heap
+            self._is_full[c] |= heap >= max(LEAST_PIXELS, LEAST_HEAP * part.size) and heap > 2 * before_it
             level = find_plateau(np.bincount(codes[:, c], minlength=256), STEEP, ABOVE)
             if level is None:
                 level = found

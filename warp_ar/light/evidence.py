@@ -122,6 +122,24 @@ def allowed_factor(added: Array, missing: Array) -> float:
     return float(np.clip(config.safety * np.quantile(2.0 * (missing @ added) / squared, config.share), 0.0, 1.0))
 
 
+def most_by_card(captured: Array, added: Array, share: float) -> float:
+    """What an estimate may be multiplied by, 0 to 1, for its share of all light to be in keeping with the card's.
+
+    Light from the side, or from below, hardly lights the card; surfaces that say it is there are textured and of
+    unknown reflectance. Where the card shows little missing, it is little elsewhere, within ``lever``.
+
+    Args:
+        captured: Irradiance as captured, (directions,).
+        added: Irradiance that the estimate adds, (directions,).
+        share: Of the card's irradiance that is missing.
+    """
+    most = CONFIG.evidence.lever * share
+    size = float(np.linalg.norm(added))
+    if most >= 1.0 or size <= 0.0:
+        return 1.0
+    return min(most / (1.0 - most) * float(np.linalg.norm(captured)) / size, 1.0)
+
+
 def likely_gain(added: Array, missing: Array) -> float:
     """By how much an estimate lowers the squared error of irradiance in nearly all draws."""
     gain = (missing**2).sum(axis=1) - ((missing - added) ** 2).sum(axis=1)
@@ -133,9 +151,9 @@ def irradiance_interval(
 ) -> Interval:
     """Between which bounds the irradiance at the ball's place lies.
 
-    What the ball shows errs by ``capture``. What an estimate found scatters as its draws do, and where part of it was
-    held back the whole of it, and as much again, may be there. Where no draws were made, or the card only bounds what
-    is missing, all that clips may be as bright as ``clipped``.
+    What the ball shows errs by ``capture`` to one side and ``overlooked`` to the other. What an estimate found scatters
+    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Where no draws
+    were made, or the card only bounds what is missing, all that clips may be as bright as ``clipped``.
 
     Args:
         problem: The equations.
@@ -149,9 +167,9 @@ def irradiance_interval(
     form = irradiance_form(problem, normals)
     captured, found = form @ problem.radiance, form @ (excess * problem.lacking)
     most = form @ (config.clipped * problem.lacking)
-    reach = config.interval * np.hypot(0.0 if spread is None else spread, config.capture)
+    reach = config.interval * np.hypot(0.0 if spread is None else spread, config.found)
     low = (1.0 - config.capture) * captured + factor * np.maximum(1.0 - reach, 0.0) * found
-    high = (1.0 + config.capture) * captured + (2.0 - factor) * (1.0 + reach) * found
+    high = (1.0 + config.overlooked) * captured + (2.0 - factor) * (1.0 + reach) * found
     is_open = np.array(bounds) | (spread is None)
-    high = np.where(is_open, np.maximum(high, (1.0 + config.capture) * captured + most), high)
+    high = np.where(is_open, np.maximum(high, (1.0 + config.overlooked) * captured + most), high)
     return Interval(normals, low, captured + factor * found, high)

@@ -212,14 +212,22 @@ class Problem:
             doubt: Standard deviation of the card's logarithm.
         """
         config = CONFIG.evidence
-        shares = []
-        for c in range(3):
-            use = (self.kind == Kind.CARD) & (self.exact[:, c] | (self.bound[:, c] & bounds[c]))
-            if use.any():
-                shares.append(1.0 - float(np.median(self.captured[use, c] * self.white / self.light[use, c])))
-        missing = float(np.mean(shares)) if shares else 0.0
+        shares = [self.card_share(c, bounds[c]) for c in range(3)]
+        missing = float(np.mean(shares))
         error = 1.28 * float(np.linalg.norm([doubt, config.response, config.ball]))
         return float(np.clip(2.0 * config.safety * (missing - error) / max(missing, 1e-9), 0.0, 1.0))
+
+    def card_share(self, c: int, is_bound: bool) -> float:
+        """Share of the card's irradiance that the light as captured leaves open in a channel; 0 where it is not seen.
+
+        Args:
+            c: Channel.
+            is_bound: Whether the card clips: then it is more.
+        """
+        use = (self.kind == Kind.CARD) & (self.exact[:, c] | (self.bound[:, c] & is_bound))
+        if not use.any():
+            return 0.0
+        return max(1.0 - float(np.median(self.captured[use, c] * self.white / self.light[use, c])), 0.0)
 
     # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of each surface.
 

@@ -60,6 +60,7 @@ from warp_ar.light.evidence import (
     irradiance_form,
     irradiance_interval,
     likely_gain,
+    most_by_card,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -137,6 +138,7 @@ class Recovery:
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[Peak] = []
         self._frames = 0
+        self._solved = 0
         self._stillness = Stillness()
         self._blocks = blocks_of(surfaces)
         self._evidence: _Evidence | None = None
@@ -182,10 +184,11 @@ class Recovery:
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
+        self._frames += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
             return self._without_card(problem, card)
-        self._frames += 1
+        self._solved += 1
         self._unseen = 0
         means, bounds = problem.card_means()
         by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
@@ -208,8 +211,9 @@ class Recovery:
             lamps.append(Lamp(problem.origin[peak.cell], problem.direction[peak.cell], peak.distance, power))
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
         if is_turn or self._evidence is None:
-            start = fit_channel(problem, best, problem.start(means[best]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(problem, best, start, (excess, by_card), self._blocks, doubt_of(card.contrast))
+            c = _told_channel(problem)
+            start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
+            self._evidence = _weigh(problem, c, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast))
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
@@ -241,7 +245,7 @@ class Recovery:
             if problem.may_hold_peak[peak.cell]:
                 problem.push(peak)
         search = EmitterSearch(problem, best)
-        before = self._frames - 1
+        before = self._solved - 1
         settled = before >= CONFIG.solver.settled
         if before and problem.peaks and (not settled or before % 2 == 0):
             search.move_peak(mean)
@@ -289,18 +293,32 @@ class _Evidence:
         return self.method, self.factor
 
 
+def _told_channel(problem: Problem) -> int:
+    """Of the channels in which something is missing the one that surfaces show best; green of equals."""
+    missing = problem.solid_angle @ problem.lacking
+    shown = problem.exact.sum(axis=0)
+    return max(range(3), key=lambda c: (missing[c] > 0.3 * missing.max(), shown[c], c == 1))
+
+
 def _weigh(
-    problem: Problem, c: int, z: Array, solutions: tuple[Array, Array], blocks: NDArray[np.int64], doubt: float
+    problem: Problem,
+    c: int,
+    z: Array,
+    bounds: tuple[bool, bool, bool],
+    solutions: tuple[Array, Array],
+    blocks: NDArray[np.int64],
+    doubt: float,
 ) -> _Evidence:
     """Which of two solutions, by shading and by the card alone, to take, and how much of it."""
     form = irradiance_form(problem, spread_directions(CONFIG.evidence.directions))
+    share = 1.0 if bounds[c] else problem.card_share(c, is_bound=False) + doubt
     missing = draw_missing(problem, c, z, blocks, doubt) @ form.T
     total = missing.sum(axis=1)
     spread = float(total.std() / max(total.mean(), 1e-9))
     found = []
     for method, excess in zip(("shading", "white_card"), solutions, strict=True):
         added = form @ (excess[:, c] * problem.lacking[:, c])
-        factor = allowed_factor(added, missing)
+        factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
     return max(found, key=lambda one: one[0])[1]
 

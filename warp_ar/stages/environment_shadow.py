@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -12,6 +11,7 @@ import warp as wp
 from warp_ar.kernels import environment_shadow
 from warp_ar.kernels import environment_shadow_filter as filters
 from warp_ar.kernels import environment_shadow_wavefront as wavefront
+from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.environment_samples import SampleSets
 from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig, ShadowCells, shaded_shape
 from warp_ar.kernels.launch import count_partials
@@ -60,16 +60,9 @@ METHODS: Mapping[str, Method] = {
 """Cheapest first, after ``none``."""
 
 
-STRIDE_ROWS = 480
-"""Rows of a frame for which the strides of ``METHODS`` are."""
-
-
-def cell_size(method: Method, rows: int) -> int:
-    """Pixels from one estimate to the next, growing as the root of the frame's rows.
-
-    So estimates grow in number as the rows, not as the pixels, and larger pictures still have finer shadows.
-    """
-    return method.stride if method.stride == 1 else max(1, round(method.stride * math.sqrt(rows / STRIDE_ROWS)))
+def find_stride(method: Method, rows: int) -> int:
+    """Pixels from one estimate to the next, growing as the root of the frame's rows."""
+    return int(cell_stride(method.stride, rows, slowly=True))
 
 
 class EnvironmentShadow(Stage):
@@ -124,8 +117,7 @@ class EnvironmentShadow(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The ratio, and the estimates that it is averaged from."""
         width, height = self.request.size
-        stride = cell_size(METHODS[self.method], height)
-        cells = -(-height // stride), -(-width // stride)
+        cells = cell_shape(self.request.size, find_stride(METHODS[self.method], height))
         specs = {
             "shadow_ratio": ArraySpec((height, width), wp.vec3, wp.vec3(1.0, 1.0, 1.0)),
             "environment_shadow_ratio": ArraySpec(cells, wp.vec4),
@@ -195,7 +187,7 @@ class EnvironmentShadow(Stage):
     def _cells(self, arrays: Arrays) -> ShadowCells:
         """The stage's own arrays as its kernels read and write them."""
         cells = ShadowCells()
-        cells.stride = cell_size(METHODS[self.method], self.request.size[1])
+        cells.stride = find_stride(METHODS[self.method], self.request.size[1])
         for name in ("ratio", "bounced", "surface", "shaded", "filtered", "changed"):
             setattr(cells, name, arrays[f"{self.name}_{name}"])
         return cells

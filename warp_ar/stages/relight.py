@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import receiver_cells, relight
+from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.ray_scene import trace_config
@@ -41,7 +42,6 @@ class Grain:
 
 GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), "brute_force": Grain(SAMPLES, 1, 1, 4)})
 """By method of ``features.LOCAL``: else these are ``reflectance``."""
-STRIDE_ROWS = 480
 
 
 class Relight(Stage):
@@ -230,14 +230,12 @@ def _grain(features: Features) -> Grain:
 
 
 def _stride(request: Request, pixels: int) -> int:
-    """Pixels per cell, growing with the frame."""
-    return 1 if pixels == 1 else max(1, round(pixels * request.size[1] / STRIDE_ROWS))
+    return int(cell_stride(pixels, request.size[1]))
 
 
 def _cells(request: Request, pixels: int) -> tuple[int, int]:
-    width, height = request.size
-    stride = _stride(request, pixels)
-    return -(-height // stride), -(-width // stride)
+    rows, columns = cell_shape(request.size, _stride(request, pixels))
+    return rows, columns
 
 
 def make_cells(features: Features, arrays: Arrays) -> relight.ReceiverCells:

@@ -1,0 +1,113 @@
+"""Recovered light against light as captured, over random tables: no card, grey cards, wrong responses, clutter.
+
+    WARP_AR_SHARED=../shared python -m bench.bench_never_worse --count 300    # ten minutes on two cores
+    python -m bench never_worse                                               # 20 of them
+
+Prints the relative error of irradiance over all directions with recovery and without, their ratio, and how often the
+interval of irradiance holds the truth; one JSON line in all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.random_tables import Setup, make_setup
+from bench.table_world import latlong_directions
+from warp_ar import PRESETS, Pipeline, Pose
+from warp_ar.scene import loads_scene
+
+NO_WORSE = 1.02
+"""Ratio of errors up to which recovered light counts as no worse."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one set-up became."""
+
+    clipped: float
+    """Relative error of irradiance over all directions, of the light as captured."""
+    recovered: float
+    """The same of what the program makes of it."""
+    held: float
+    """Share of the interval's 18 numbers that hold the truth."""
+    method: str
+    """What the estimate rests on."""
+
+    @property
+    def ratio(self) -> float:
+        """Of the errors."""
+        return self.recovered / max(self.clipped, 1e-9)
+
+
+def irradiance(environment: NDArray[Any], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Irradiance by normal, (k, 3)."""
+    small = cv2.resize(np.asarray(environment, np.float32), (128, 64), interpolation=cv2.INTER_AREA)
+    d, area = latlong_directions(64, 128)
+    return np.asarray(np.maximum(normals @ d.reshape(-1, 3).T, 0.0) @ (small.reshape(-1, 3) * area.reshape(-1, 1)))
+
+
+def evaluate(setup: Setup, *, device: str = "cpu") -> Outcome:
+    """Run the program's default on one picture."""
+    pipeline = Pipeline(loads_scene(setup.scene), device=device, quality=PRESETS["medium"], outputs=("environment",))
+    try:
+        result = pipeline(setup.image, time_seconds=0.0, pose=Pose(setup.rotation, setup.translation))
+        recovered = result.environment
+        assert recovered is not None
+        captured = pipeline.arrays["filled_radiance"].numpy().reshape(recovered.shape)
+        status = pipeline.arrays["recover_status"]()
+    finally:
+        pipeline.close()
+    normals = latlong_directions(24, 48)[0].reshape(-1, 3)
+    truth = irradiance(setup.truth, normals)
+    errors = [
+        float(np.linalg.norm(irradiance(one, normals) - truth) / np.linalg.norm(truth)) for one in (captured, recovered)
+    ]
+    axes = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
+    true_axes = irradiance(setup.truth, axes)
+    low, high = (np.array(status[f"irradiance_{name}"]) for name in ("low", "high"))
+    held = float(((low <= true_axes) & (true_axes <= high)).mean())
+    return Outcome(errors[0], errors[1], held, str(status["method"]))
+
+
+def summarise(outcomes: list[Outcome]) -> dict[str, float]:
+    """Figures over all set-ups."""
+    ratios = np.array([outcome.ratio for outcome in outcomes])
+    return {
+        "count": len(outcomes),
+        "no_worse": float((ratios <= NO_WORSE).mean()),
+        "ratio_median": float(np.median(ratios)),
+        "ratio_99": float(np.quantile(ratios, 0.99)),
+        "error_clipped": float(np.mean([outcome.clipped for outcome in outcomes])),
+        "error_recovered": float(np.mean([outcome.recovered for outcome in outcomes])),
+        "interval_holds": float(np.mean([outcome.held for outcome in outcomes])),
+    }
+
+
+def main(device: str, first: int = 0, count: int = 20) -> None:
+    """Evaluate set-ups and print figures, by kind of card and in all."""
+    outcomes: dict[str, list[Outcome]] = {}
+    for seed in range(first, first + count):
+        setup = make_setup(seed)
+        outcome = evaluate(setup, device=device)
+        outcomes.setdefault(setup.about["card"], []).append(outcome)
+        if outcome.ratio > NO_WORSE:
+            print(f"worse: {outcome.clipped:.3f} -> {outcome.recovered:.3f} {outcome.method} {setup.about}", flush=True)
+    for card, own in outcomes.items():
+        print(card, {key: round(value, 3) for key, value in summarise(own).items()})
+    print(json.dumps({"bench": "never_worse", **summarise([one for own in outcomes.values() for one in own])}))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Recovered light against light as captured, over random tables.")
+    parser.add_argument("--count", type=int, default=300, help="set-ups")
+    parser.add_argument("--first", type=int, default=0, help="number of the first")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    main(arguments.device, arguments.first, arguments.count)
