@@ -167,4 +167,4 @@ def _minimise(residuals: object, start: Array, free: NDArray[np.int_], frames: i
             break
     e = residuals(x)
     spread = max(1.0, float(np.median(np.abs(e))) / 0.6745) ** 2
-    return x, np.linalg.pinv(normal) * spread * frames
+    return x, np.asarray(np.linalg.pinv(normal) * spread * frames, float)

@@ -274,7 +274,9 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))
-    if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and width[k] < abs(shift[k]):
+    # A lamp that goes changes level and colour together; a camera's balance hardly changes the level.
+    alike = width[k] < 0.75 * abs(shift[k]) and abs(change) < 0.4
+    if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and alike:
         text = f"the white balance drifts: {'red' if k == 0 else 'blue'} by a factor of {math.exp(shift[k]):.2f}"
         found.append(Finding("camera.balance", text, "lock the camera's white balance"))
     return found

@@ -10,7 +10,7 @@ import numpy as np
 from warp_ar.input.ball_solve import ground_below
 from warp_ar.input.card import card_size
 from warp_ar.input.finding import Finding
-from warp_ar.scene import CharucoBoard, Probe, Scene
+from warp_ar.scene import CharucoBoard, Light, Object, Probe, Proxy, Scene
 
 LARGEST_BALL: Final = 0.3
 """Metres: no mirror ball on a desk has a larger radius, gazing globes included."""
@@ -46,7 +46,9 @@ def check_scene(scene: Scene) -> list[Finding]:
                 "add [probe] with center and radius",
             )
         )
-    for kind, items in (("object", scene.objects), ("light", scene.lights), ("proxy", scene.proxies)):
+    placed: dict[str, tuple[Object | Light | Proxy, ...]]
+    placed = {"object": scene.objects, "light": scene.lights, "proxy": scene.proxies}
+    for kind, items in placed.items():
         for index, item in enumerate(items):
             far = float(np.linalg.norm(item.at))
             if far > FARTHEST:
