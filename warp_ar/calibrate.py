@@ -32,7 +32,7 @@ from warp_ar.input.response import measure_response, write_response
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import open_source
 from warp_ar.output.places import check_places, check_replaceable
-from warp_ar.scene import Marker, bundled_scenes, load_scene, loads_scene
+from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 from warp_ar.scene.keys import INTRINSICS
 
@@ -185,7 +185,11 @@ def _run(options: argparse.Namespace) -> int:
             f"{options.output}: print at 100 %, not fitted to the page, and check with a ruler that 100 mm are 100 mm"
         )
     elif options.command == "camera":
-        report = calibrate_camera(_pictures(options.pictures, options.frames), _marker(options))
+        marker, pictures = _marker(options), _pictures(options.pictures, options.frames)
+        if marker is not None and options.dictionary is None and isinstance(marker.board, CharucoBoard):
+            report = calibrate_camera(pictures, board=marker.board)
+        else:
+            report = calibrate_camera(pictures, marker)
         write_camera(report, options.output)
         c = report.camera
         print(

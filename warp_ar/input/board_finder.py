@@ -53,12 +53,12 @@ def find_markers(image: Image) -> tuple[str, list[Detection]]:
         if len(found) > len(best[1]):
             best = (name, found)
     name, found = best
-    return (_smallest(name, max(d.id for d in found)) if found else "", found)
+    return (smallest_dictionary(name, max(d.id for d in found)) if found else "", found)
 
 
-def _smallest(name: str, number: int) -> str:
-    """The smallest dictionary of a family that has a number."""
-    if (family := re.fullmatch(r"(DICT_\dX\d)_1000", name)) is None:
+def smallest_dictionary(name: str, number: int) -> str:
+    """The smallest dictionary of the family of one that has a number."""
+    if (family := re.fullmatch(r"(DICT_\dX\d)_\d+", name)) is None:
         return name
     return f"{family[1]}_{next(size for size in (50, 100, 250, 1000) if number < size)}"
 
@@ -89,14 +89,10 @@ def recognise_board(image: Image) -> Marker | None:
         return None
     rows = max(3, math.ceil(2 * (max(d.id for d in found) + 1) / columns))
     rows += columns * rows // 2 <= max(d.id for d in found)
-    name = _smallest(_family(name), columns * rows // 2 - 1)
+    name = smallest_dictionary(name, columns * rows // 2 - 1)
     if columns * rows // 2 > len(find_dictionary(name).bytesList):
         return None
     return Marker(dictionary=name, board=CharucoBoard(columns, rows, 1.0, round(ratio, 3)))
-
-
-def _family(name: str) -> str:
-    return re.sub(r"^(DICT_\dX\d)_\d+$", r"\1_1000", name)
 
 
 def _explain(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
-from warp_ar.input.board_finder import recognise_board
+from warp_ar.input.board_finder import find_markers, recognise_board, smallest_dictionary
 from warp_ar.input.markers import make_board
 from warp_ar.input.sheet import SHEET
 from warp_ar.scene import Camera, CharucoBoard, Marker
@@ -61,11 +61,12 @@ class CameraReport:
 class BoardViews:
     """Different views of a ChArUco board, collected until they calibrate a camera [Z00]."""
 
-    def __init__(self, marker: Marker | None = None) -> None:
+    def __init__(self, marker: Marker | None = None, board: CharucoBoard | None = None) -> None:
         """Collect nothing yet.
 
         Args:
             marker: the board that was printed; None: whichever ChArUco board the first picture of one shows.
+            board: its layout, where only the dictionary is to be told from the pictures.
 
         Raises:
             UsageError: if it is no ChArUco board.
@@ -74,6 +75,7 @@ class BoardViews:
             raise UsageError(f'--board: the camera is calibrated with a ChArUco board, such as "{SHEET.board}"')
         self.marker: Marker | None = None
         """The board, as soon as it is known."""
+        self._layout = board
         self._board: Any = None
         self._detector: Any = None
         if marker is not None:
@@ -82,6 +84,15 @@ class BoardViews:
         self._seen = 0
         self.views: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
         """Corners in pixels, their numbers, and where they are on the board."""
+
+    def _recognised(self, gray: Image) -> Marker | None:
+        if self._layout is None:
+            return recognise_board(gray)
+        name, found = find_markers(gray)
+        count = self._layout.marker_count
+        if not found or max(d.id for d in found) >= count:
+            return None
+        return Marker(dictionary=smallest_dictionary(name, count - 1), board=self._layout)
 
     def _take(self, marker: Marker) -> None:
         self.marker = marker
@@ -102,7 +113,7 @@ class BoardViews:
         self._seen += 1
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.marker is None:
-            if (seen := recognise_board(gray)) is None:
+            if (seen := self._recognised(gray)) is None:
                 return False
             self._take(seen)
         corners, ids, _, _ = self._detector.detectBoard(gray)
@@ -172,17 +183,20 @@ class BoardViews:
         )
 
 
-def calibrate_camera(images: Iterable[Image], marker: Marker | None = None) -> CameraReport:
+def calibrate_camera(
+    images: Iterable[Image], marker: Marker | None = None, board: CharucoBoard | None = None
+) -> CameraReport:
     """Pinhole and distortion from views of a ChArUco board.
 
     Args:
         images: RGB or grey uint8 pictures, all of one size; views that hardly differ from earlier ones are skipped.
         marker: the board that was printed; None: whichever the pictures show.
+        board: its layout, where only the dictionary is to be told from the pictures.
 
     Raises:
         UsageError: if the board is no ChArUco board, sizes differ, or too few views show it.
     """
-    views = BoardViews(marker)
+    views = BoardViews(marker, board)
     for image in images:
         views.add(image)
     return views.solve()
