@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -379,3 +380,38 @@ def test_explain_runs_no_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str
     scene = write_scene(tmp_path, source='path = "scene.toml"')  # no picture: opening it as a source would fail
     assert explain.main([str(scene)]) == 0
     assert "unwrap" in capsys.readouterr().out
+
+
+def card_frames(folder: Path, count: int = 2) -> None:
+    """Frames of the generated card, which show no mirror ball."""
+    folder.mkdir()
+    with Synthetic("card", length=count) as card:
+        for frame in card:
+            cv2.imwrite(str(folder / f"{frame.index:04d}.png"), frame.image[..., ::-1])
+
+
+def test_a_ball_that_is_never_seen_ends_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    card_frames(tmp_path / "frames")
+    scene = write_scene(tmp_path, source='path = "frames"')
+    assert run(scene, "--headless", "--output", tmp_path / "out") == 1
+    said = capsys.readouterr().err.splitlines()
+    assert "python -m warp_ar.doctor" in said[0]  # the quick check, before any frame
+    assert "[probe]" in said[0]
+    assert "no mirror ball was found" in said[-1]
+    assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+def test_a_picture_that_never_changes_ends_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    far = OBJECT.replace("at = [0.1, 0.0, 0.03]", "at = [100.0, 0.0, 0.03]")
+    assert run(write_scene(tmp_path, body=far), "--headless", "--frames", 2) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert "100 millimetres are 0.1 m" in said[0] or "100 centimetres are 1 m" in said[0]
+    assert "no frame was changed" in said[-1]
+
+
+def test_a_guessed_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = write_scene(tmp_path, body=OBJECT)
+    text = re.sub(r"(?m)^(width|height|fx|fy|cx|cy) = .*\n", "", scene.read_text())
+    scene.write_text(text.replace("[camera]", "[camera]\nfield_of_view = 50.0"))
+    assert run(tmp_path, "--headless", "--frames", 2) == 0  # the folder, which holds one scene
+    assert "the camera is guessed, with a field of view of 50 degrees" in message(capsys)

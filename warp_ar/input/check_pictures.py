@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from warp_ar.input.board_finder import find_markers
 from warp_ar.input.finding import Finding
 from warp_ar.input.marker_pattern import Pattern, make_pattern, printed_cells
-from warp_ar.input.markers import MarkerDetector
+from warp_ar.input.markers import MarkerDetector, find_dictionary
 from warp_ar.input.source import Source
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.kernels.color import decode_table
@@ -26,8 +26,8 @@ Image = NDArray[np.uint8]
 
 RARE: Final = 0.6
 """Share of the frames below which a marker is seen too seldom."""
-FEWEST_PIXELS: Final = 20.0
-"""Side in pixels of the smallest marker whose cells are read with certainty."""
+CELL_PIXELS: Final = 3.0
+"""Side in pixels of the smallest cells that are read with certainty."""
 WORST_EDGES: Final = 1.0
 """Pixels that a print's edges may be off where the pose has them: lens and board as the scene says give 0.1 to 0.4."""
 CLIPPED: Final = 250
@@ -95,9 +95,10 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
     if share < RARE:
         text = f"the marker is seen in {share:.0%} of {len(look.images)} frames"
         found.append(Finding("marker.rare", text, "keep the whole card in the picture, flat, lit and unhidden"))
-    side = float(np.median([_smallest_side(scene.marker, look.camera, pose) for _, pose in look.views]))
-    if side < FEWEST_PIXELS:
-        text = f"a marker is {side:.0f} pixels wide; expected {FEWEST_PIXELS:.0f} or more"
+    side = float(np.median([_marker_side(scene.marker, look.camera, pose) for _, pose in look.views]))
+    least = CELL_PIXELS * (int(find_dictionary(scene.marker.dictionary).markerSize) + 2)
+    if side < least:
+        text = f"a marker is {side:.0f} pixels wide; expected {least:.0f} or more"
         found.append(Finding("marker.small", text, "move the camera nearer, or print a larger card"))
     worst = float(np.median(look.errors))
     if worst > WORST_EDGES:
@@ -120,9 +121,10 @@ def _project(camera: Camera, pose: Pose, points: Array) -> Array:
     return np.asarray(pixels.reshape(-1, 2), float)
 
 
-def _smallest_side(marker: Marker, camera: Camera, pose: Pose) -> float:
+def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
+    """Mean side in pixels of a marker, the median of a board's."""
     quads = [_project(camera, pose, corners) for corners in _pattern(marker).markers.values()]
-    return min(float(np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean()) for quad in quads)
+    return float(np.median([np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in quads]))
 
 
 def _why_unseen(marker: Marker, look: Look) -> Finding:

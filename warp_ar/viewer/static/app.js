@@ -97,9 +97,9 @@ connection.addEventListener("calibration", ({ detail }) => {
   $("coverage").style.gridTemplate = `repeat(${covered.length}, 1fr) / repeat(${covered[0]?.length ?? 1}, 1fr)`;
   $("coverage").replaceChildren(...covered.flat().map((seen) => Object.assign(document.createElement("i"), { className: seen ? "on" : "" })));
   const lines = [];
-  if (on) lines.push(`${views} of ${wanted} views. Hold the printed board before the camera, tilted another way each time, until every field of the picture is green.`);
+  if (on) lines.push(`${views} of ${wanted} views. Hold the printed card before the camera, tilted another way each time, until every field of the picture is green.`);
   else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${report.deviation.toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
-  else lines.push("Print the board, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
+  else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
   $("calibration-note").textContent = lines.join(" ");
 });
 
