@@ -115,7 +115,7 @@ def _quarter(radiance: Radiance, axes: str) -> int:
     """
     if axes == "blender":
         return 0
-    width = radiance.shape[1]
+    width = int(radiance.shape[1])
     if width % 4:
         raise UsageError(f"a latlong of {width} columns has no whole quarter; axes {axes} need a width divisible by 4")
     return -width // 4 if axes == "y-up" else width // 4

@@ -38,4 +38,4 @@ def encode_hdr(radiance: npt.NDArray[np.float32], axes: str) -> bytes:
         *("#?RADIANCE", f"SOFTWARE={PROGRAM}", f"VIEW_AXES={axes}", f"PRIMARIES={REC_709}"),
         *("FORMAT=32-bit_rle_rgbe", "", f"-Y {height} +X {width}", ""),
     ]
-    return "\n".join(header).encode() + pixels.astype(np.uint8).tobytes()
+    return b"".join(["\n".join(header).encode(), pixels.astype(np.uint8).tobytes()])
