@@ -534,11 +534,11 @@ def load_scene(path_or_name: str | Path) -> Scene:
     Raises:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
     """
-    path = Path(path_or_name)
-    if is_folder(path):
+    path, bundled = Path(path_or_name), bundled_scenes()
+    # A folder of frames may have a bundled scene's name.
+    if str(path_or_name) and str(path_or_name) not in bundled and is_folder(path):
         path = _scene_in(path)
     if not is_file(path):
-        bundled = bundled_scenes()
         if str(path_or_name) not in bundled:
             hint = f"a file, or a bundled scene ({nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
