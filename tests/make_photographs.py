@@ -1,7 +1,7 @@
-"""Write the bracket of photographs that the documentation captures light from: ``python -m tests.make_photographs DIR``.
+"""Write the bracket of photographs that the documentation uses: ``python -m tests.make_photographs DIR``.
 
-A rendered room, five exposures of two stops with a sensor's noise, EXIF as a camera writes it. Prints the pixel at which
-the ball touches the table.
+A rendered room, five exposures of two stops with a sensor's noise, EXIF as a camera writes it. Prints the pixel at
+which the ball touches the table.
 """
 
 from __future__ import annotations
