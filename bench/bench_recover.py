@@ -14,6 +14,7 @@ from bench.common import measure, report
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.light import recovery
+from warp_ar.light.config import Kind
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene import load_scene
 from warp_ar.scene.ray_scene import HostScene, trace_config
@@ -53,7 +54,8 @@ class Setup:
             self.cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell)
             self.excess = wp.zeros(self.cells.shape, dtype=wp.vec3)
             seen = np.zeros(count, np.dtype(kernels.Observation.numpy_dtype()))
-            seen["visible"], seen["radiance"] = 1.0, 0.25
+            ink = surfaces.kinds[surfaces.surface] == Kind.INK
+            seen["visible"], seen["radiance"] = 1.0, np.where(ink, 0.02, 0.25)[:, None]
             self.seen = wp.array(seen, dtype=kernels.Observation)
             self.transfer = wp.zeros((count, self.cells.size), dtype=wp.float32)
             self.mirrored = wp.zeros_like(self.transfer)

@@ -61,6 +61,8 @@ class DistantLightConfig:
     """Whether there are mirror balls, which hide the receiver."""
     emitters: bool = False
     """Whether emitters of the environment are known by their places."""
+    captured: bool = False
+    """Whether the environment is known without mirror balls, from a file."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
         """For any scene with as many mirror balls: forms that it does not call for may then be empty.
@@ -69,8 +71,11 @@ class DistantLightConfig:
             form: Where irradiance comes from in scenes that call for it.
         """
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
-        diffuse: DiffuseForm = form if self.probes else "none"
-        return DistantLightConfig(self.trace.general(), models, True, diffuse, self.probes, self.probes, self.emitters)
+        known = self.probes or self.captured
+        diffuse: DiffuseForm = form if known else "none"
+        return DistantLightConfig(
+            self.trace.general(), models, True, diffuse, known, self.probes, self.emitters, self.captured
+        )
 
 
 @wp.struct

@@ -107,7 +107,7 @@ def table_irradiance(room: Room, count: int = 4096) -> Array:
     rng = np.random.default_rng(9)
     u, v = rng.random(count), 2 * np.pi * rng.random(count)
     d = np.column_stack([np.sqrt(u) * np.cos(v), np.sqrt(u) * np.sin(v), np.sqrt(1 - u)])
-    return math.pi * room_radiance(room, np.zeros((count, 3)) + [0, 0, 1e-3], d).mean(0)
+    return math.pi * room_radiance(room, np.tile([0.0, 0.0, 1e-3], (count, 1)), d).mean(0)
 
 
 def radiance_along(room: Room, origin: Array, direction: Array, irradiance: Array) -> Array:

@@ -398,14 +398,8 @@ def test_any_exposure_can_be_the_shown_one(clip, device, shown):
     times = tuple(0.02 * ratio for ratio in RATIOS)
     found = []
     for choice in (0, shown):
-        with Pipeline(
-            make_scene(),
-            device=device,
-            quality="low",
-            outputs=("environment", "image"),
-            exposures=times,
-            shown=times[choice],
-        ) as pipe:
+        outputs, show = ("environment", "image"), times[choice]
+        with Pipeline(make_scene(), device=device, quality="low", outputs=outputs, exposures=times, shown=show) as pipe:
             for index, (image, pose, seconds) in enumerate(clip * 2):
                 result = pipe(image, time_seconds=index / 30, pose=pose, exposure_time=seconds)
                 assert result.shown == (index % len(RATIOS) == choice)

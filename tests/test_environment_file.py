@@ -12,9 +12,9 @@ import OpenEXR
 import pytest
 
 from warp_ar.errors import SinkError, UsageError
+from warp_ar.light.captured import REC_709, Light
 from warp_ar.output.environment_axes import AXES, CUBES, DESCRIPTIONS, to_axes, to_cube
 from warp_ar.output.environment_file import (
-    REC_709,
     EnvironmentInfo,
     read_environment,
     read_environment_info,
@@ -100,6 +100,21 @@ def test_an_environment_of_somebody_elses_says_nothing(tmp_path: pathlib.Path) -
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": radiance()}).write(str(tmp_path / "e.exr"))
     assert read_environment_info(tmp_path / "e.exr") == EnvironmentInfo()
     np.testing.assert_array_equal(read_environment(tmp_path / "e.exr"), radiance())
+
+
+def test_captured_light_is_read_with_what_it_says(tmp_path: pathlib.Path) -> None:
+    light = Light(radiance(), np.ones((8, 16), np.float32), white_level=0.9, exposure=0.5)
+    light.save(tmp_path / "light.exr")
+    info = read_environment_info(tmp_path / "light.exr")
+    assert (info.white_level, info.exposure) == (pytest.approx(0.9, rel=FLOAT32), 0.5)
+    np.testing.assert_array_equal(read_environment(tmp_path / "light.exr"), radiance())
+
+
+def test_what_is_written_is_a_captured_light(tmp_path: pathlib.Path) -> None:
+    write_environment(tmp_path / "e.exr", radiance(), info=EnvironmentInfo(white_level=0.9, exposure=0.5))
+    light = Light.load(tmp_path / "e.exr")
+    np.testing.assert_array_equal(light.radiance, radiance())
+    assert (light.white_level, light.exposure) == (pytest.approx(0.9, rel=FLOAT32), 0.5)
 
 
 def test_hdr_holds_the_turned_picture(tmp_path: pathlib.Path) -> None:

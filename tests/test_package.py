@@ -10,6 +10,9 @@ import warp_ar
 PUBLIC = {
     *(
         "PRESETS",
+        "Capture",
+        "Light",
+        "capture_light",
         "Frame",
         "Pipeline",
         "Plan",

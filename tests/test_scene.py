@@ -534,7 +534,7 @@ def test_errors_name_file_key_and_value(folder: pathlib.Path, text: str, message
 
 def test_scenes_that_are_no_files(folder: pathlib.Path) -> None:
     for name in (folder, folder / "none.toml", "x" * 5000, "a\0b", ""):
-        with pytest.raises(SceneError, match="no such scene; expected a"):
+        with pytest.raises(SceneError, match=r"no such scene; expected a|expected a folder with one scene file"):
             load_scene(name)
     latin = folder / "latin.toml"
     latin.write_bytes(b'schema = 1\nname = "\xe9"')

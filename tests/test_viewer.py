@@ -36,6 +36,7 @@ from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.input.card import card_size, draw_card
+from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import Synthetic, open_source
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import (
@@ -59,7 +60,6 @@ from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.budget import BudgetSetting
-from warp_ar.viewer.calibration import BOARD
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
@@ -390,7 +390,8 @@ def test_the_budget_changes_the_picture(known_errors: None, monkeypatch: pytest.
         assert running.host.wanted().quality.name == "auto"
         running.edit(type="budget", ms=1.0)
         running.until(lambda: running.host.state_message()["auto"]["expected_error"] > best["expected_error"])
-        running.until(lambda: dict(running.host.wanted().quality.methods)["irradiance"] == "top_mip")
+        cheapest = next(setting.methods[0] for setting in SETTINGS if setting.name == "irradiance")
+        running.until(lambda: dict(running.host.wanted().quality.methods)["irradiance"] == cheapest)
         # Undoing edits leaves the budget; choosing a preset ends it.
         running.edit(type="reset")
         assert running.host.wanted().quality.name == "auto"
@@ -810,7 +811,7 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
     """The board is shown from a dozen sides; what comes out is the camera that took the pictures."""
     size = (480, 360)
     truth = Camera(*size, 430.0, 430.0, 243.0, 176.0, (-0.12, 0.03, 0.0, 0.0))
-    views = list(rendered(truth, 14, seed=5, marker=BOARD))
+    views = list(rendered(truth, 14, seed=5, marker=SHEET))
     with Running(page_scene()) as running:
         with pytest.raises(UsageError, match="start the calibration"):
             running.edit(type="calibrate", step="finish")

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from warp_ar.errors import SceneError, SinkError, SourceError, UsageError, WarpArError
     from warp_ar.input.sources import Frame, open_source
     from warp_ar.input.tracking import Tracker, TrackState
+    from warp_ar.light.captured import Light
     from warp_ar.output.sinks import open_sink, read_environment, write_environment
+    from warp_ar.photo_capture import Capture, capture_light
     from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
     from warp_ar.session import Session
     from warp_ar.stages.quality import PRESETS, Quality
@@ -27,6 +29,8 @@ _HOMES = {
     "engine.pipeline": ("Pipeline", "Result"),
     "stages.quality": ("PRESETS", "Quality"),
     "scene": ("Pose", "Scene", "bundled_scenes", "dumps_scene", "load_scene"),
+    "light.captured": ("Light",),
+    "photo_capture": ("Capture", "capture_light"),
     "session": ("Session",),
     "output.sinks": ("open_sink", "read_environment", "write_environment"),
     "input.sources": ("Frame", "open_source"),
@@ -36,7 +40,9 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "PRESETS",
+    "Capture",
     "Frame",
+    "Light",
     "Pipeline",
     "Plan",
     "Pose",
@@ -52,6 +58,7 @@ __all__ = [
     "UsageError",
     "WarpArError",
     "bundled_scenes",
+    "capture_light",
     "dumps_scene",
     "load_scene",
     "make_plan",

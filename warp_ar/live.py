@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import dataclasses
 import faulthandler
 import gc
 import itertools
@@ -14,6 +13,7 @@ import os
 import secrets
 import signal
 import sys
+import threading
 import time
 import webbrowser
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
-from warp_ar.scene import Scene, bundled_scenes, load_calibration, load_scene
+from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
 
@@ -80,7 +80,12 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="PATH|INDEX",
         help="frames from this folder, video file or capture device, not the scene's own",
     )
-    add("--calibration", metavar="FILE", help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers")
+    add(
+        "--calibration",
+        metavar="FILE|exif",
+        help="OpenCV camera calibration, YAML or JSON, instead of the scene's numbers; exif: the first picture's",
+    )
+    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball in the frames shows")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add(
         "--quality",
@@ -172,6 +177,8 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
     reads["what the scene names,"] = [path for path in files_of(scene) if path != scene.path]
     if options.calibration is not None:
         reads["--calibration"] = [Path(options.calibration)]
+    if options.light is not None:
+        reads["--light"] = [Path(options.light)]
     if source is not None:
         reads["the source"] = [Path(source)]
     names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
@@ -195,9 +202,70 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     say(message)
 
 
+def _quick_check(options: argparse.Namespace, scene: Scene) -> None:
+    """Say in one line each what is guessed, and the worst of what is wrong with the set-up.
+
+    Frames of a capture device are left to the run itself: a device is not opened twice.
+    """
+    from warp_ar.input.checkup import check_up, source_of
+
+    source = source_of(scene, options.source)
+    recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
+    found = check_up(scene, source if recorded else None, quick=True)
+    # What the run itself cannot start with, it says itself.
+    found = [finding for finding in found if not finding.name.startswith(("source.", "marker.", "camera.aspect"))]
+    worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
+    for finding in [*worst, *(finding for finding in found if finding.name == "camera.guessed")]:
+        more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
+        say(f"{finding.text}; to do: {finding.remedy}{more}")
+
+
+class _Evidence:
+    """What frames show of a run: whether any was changed, and some by which to look for the ball."""
+
+    def __init__(self) -> None:
+        self.changed = False
+        self.views: list[tuple[Any, Any]] = []
+        self._count = 0
+
+    def add(self, image: Any, result: Any) -> None:
+        """Note a frame and what it became."""
+        self._count += 1
+        self.changed = self.changed or bool((result.image != image).any())
+        # The first, second, fourth, eighth, ...: all parts of a run, in few frames.
+        if result.pose is not None and self._count & (self._count - 1) == 0:
+            self.views = [*self.views, (image.copy(), result.pose)][-4:]
+
+
+def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
+    """Complain about a run that showed no marker, no ball, or changed nothing, though its scene calls for it.
+
+    Raises:
+        RunError: It did.
+    """
+    from warp_ar.input.checkup import ball_is_seen
+
+    _check_marker(log, session.scene, live=False)
+    scene, source = session.scene, session.scene.source
+    generated = source is not None and source.synthetic is not None
+    reads_ball = any(stage.name == "unwrap" for stage, _ in session.pipeline.plan.stages)
+    if reads_ball and evidence.views and not generated:
+        camera = scene.camera.scaled_to(*session.source.size)
+        if not ball_is_seen(scene, camera, evidence.views):
+            raise RunError(
+                "no mirror ball was found where [probe] has it, so its light is not that of the desk; "
+                "check center and radius, and see python -m warp_ar.doctor"
+            )
+    if log.count > 0 and not evidence.changed and (scene.objects or scene.lights):
+        raise RunError(
+            "no frame was changed: no [[object]] and no [[light]] reaches the picture; check their at, in metres"
+        )
+
+
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.session import calibrated, with_light
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -210,7 +278,9 @@ def serve_page(options: argparse.Namespace) -> int:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
     scene = load_scene(options.scene)
     if options.calibration is not None:
-        scene = dataclasses.replace(scene, camera=load_calibration(options.calibration, scene.camera.transfer))
+        scene = calibrated(scene, options.calibration, options.source)
+    if options.light is not None:
+        scene = with_light(scene, options.light)
     local = options.host in LOOPBACK
     if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
         raise UsageError("--token: expected letters and digits, for it stands in an address")
@@ -223,6 +293,8 @@ def serve_page(options: argparse.Namespace) -> int:
         else load_context(Path(options.tls))
     )
     port = DEFAULT_PORT if options.port is None else options.port
+    # Beside the page, which does not wait for it.
+    threading.Thread(target=_quick_check, args=(options, scene), daemon=True).start()
 
     def make_host(**callbacks: Any) -> Any:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
@@ -365,6 +437,7 @@ def light_clip(options: argparse.Namespace) -> int:
             stack.enter_context(lights)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
+        _quick_check(options, session.scene)
         _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()
@@ -374,12 +447,12 @@ def light_clip(options: argparse.Namespace) -> int:
         for words in (*replaced, sink.replaced, "" if lights is None else lights.replaced):
             if words:
                 say(words)
-        log = RunLog(session.pipeline)
+        log, evidence = RunLog(session.pipeline), _Evidence()
         try:
             with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
-                _light_frames(options, session, log, sink, lights, stop)
-            if log.count < MARKER_PATIENCE and stop.code is None:
-                _check_marker(log, session.scene, live=source.live)
+                _light_frames(options, session, log, sink, lights, stop, evidence)
+            if stop.code is None:
+                _check_run(log, session, evidence)
         except WarpArError as error:
             problem = _write_report(options.report, log, balls)
             also = f"; and {problem}" if problem else ""
@@ -407,6 +480,7 @@ def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str,
         scene,
         source=options.source,
         calibration=options.calibration,
+        light=options.light,
         device=options.device,
         quality=options.quality,
         budget_ms=options.budget_ms,
@@ -417,7 +491,13 @@ def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str,
 
 
 def _light_frames(
-    options: argparse.Namespace, session: Session, log: RunLog, sink: Sink, lights: EnvironmentSink | None, stop: _Stop
+    options: argparse.Namespace,
+    session: Session,
+    log: RunLog,
+    sink: Sink,
+    lights: EnvironmentSink | None,
+    stop: _Stop,
+    evidence: _Evidence,
 ) -> None:
     """Let frames flow until they end, or until a signal asks to stop."""
     source = session.source
@@ -434,8 +514,9 @@ def _light_frames(
     )
     bar = progress.add_task("frames", total=total, fps=0.0)
     with progress:
-        for _, result in itertools.islice(session, options.frames):
+        for frame, result in itertools.islice(session, options.frames):
             image, decode_ms = result.image, session.decode_ms
+            evidence.add(frame.image, result)
             start = time.perf_counter()
             sink.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3

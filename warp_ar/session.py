@@ -15,7 +15,9 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
 from warp_ar.input.sources import Frame, Source, open_source
-from warp_ar.scene import Scene, SourceSpec, load_calibration, load_scene
+from warp_ar.light.captured import Light
+from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
+from warp_ar.scene.exif import camera_by_exif
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, Quality
 
 
@@ -24,6 +26,34 @@ def _where(spec: SourceSpec) -> str | int | Path:
     if spec.path is not None:
         return spec.path
     return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
+
+
+def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path | None = None) -> Scene:
+    """The scene with its camera by a calibration file or, for ``exif``, by the EXIF of the source's first picture.
+
+    Raises:
+        SceneError: The calibration or the EXIF cannot be used.
+        UsageError: The source has no EXIF.
+    """
+    transfer = scene.camera.transfer
+    if str(calibration) != "exif":
+        return dataclasses.replace(scene, camera=load_calibration(calibration, transfer))
+    own = scene.source.path if scene.source is not None else None
+    path = own if source is None else Path(str(source))
+    if path is None or not path.exists():
+        raise UsageError("calibration exif: the source is no picture or folder of pictures; give a calibration file")
+    return dataclasses.replace(scene, camera=camera_by_exif(path, transfer))
+
+
+def with_light(scene: Scene, light: str | Path) -> Scene:
+    """The scene lit by a captured light instead of what a mirror ball in its frames shows.
+
+    Raises:
+        SceneError: The file cannot be used.
+    """
+    Light.load(light)
+    spec = scene.captured or CapturedLight(Path(light))
+    return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve()))
 
 
 class Session:
@@ -38,6 +68,7 @@ class Session:
         *,
         source: str | int | Path | None = None,
         calibration: str | Path | None = None,
+        light: str | Path | None = None,
         device: str = "auto",
         quality: str | Quality = DEFAULT_PRESET,
         budget_ms: float | None = None,
@@ -50,7 +81,9 @@ class Session:
         Args:
             scene: A scene, a scene file or a bundled scene's name.
             source: Frames instead of the scene's own: a folder, a video file, or a capture device's index.
-            calibration: OpenCV calibration file instead of the scene's camera numbers.
+            calibration: OpenCV calibration file instead of the scene's camera numbers, or ``exif``: by the EXIF of the
+                first picture.
+            light: Captured light instead of what a mirror ball shows: an OpenEXR.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
@@ -66,8 +99,9 @@ class Session:
         """
         self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
         if calibration is not None:
-            camera = load_calibration(calibration, self.scene.camera.transfer)
-            self.scene = dataclasses.replace(self.scene, camera=camera)
+            self.scene = calibrated(self.scene, calibration, source)
+        if light is not None:
+            self.scene = with_light(self.scene, light)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
         chosen = source

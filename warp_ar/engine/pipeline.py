@@ -131,7 +131,9 @@ class Pipeline:
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
-        self._tracker = Tracker(self.scene.marker, self.camera) if self.plan.needs("pose") else None
+        tracked = self.plan.needs("pose") and self.scene.pose is None
+        self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
         self._lit_time = 0.0
@@ -308,6 +310,9 @@ class Pipeline:
     ) -> Result:
         """Have a frame rendered whose arguments are in order."""
         host_image = image if isinstance(image, np.ndarray) else None
+        if pose is None and self.scene.pose is not None:
+            pose = Pose(*self.scene.pose.at(self._begun))
+        self._begun += 1
         handed_over = ahead and host_image is not None
         now = self._last_time + DEFAULT_FRAME_INTERVAL if time_seconds is None else time_seconds
         if self._start_time is None:

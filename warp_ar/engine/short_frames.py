@@ -88,9 +88,8 @@ class ShortFrames:
             Whether one has come in that was not there before: what was accumulated until then had clipped without it,
             and is no mean to start from.
         """
-        told = tuple(
-            index == self._reference or abs(now - taken) < KEPT_SECONDS for index, taken in enumerate(self._taken)
-        )
+        recent = [abs(now - taken) < KEPT_SECONDS for taken in self._taken]
+        told = tuple(index == self._reference or new for index, new in enumerate(recent))
         if told == self._told:
             return False
         self._told = told

@@ -259,8 +259,8 @@ def let_go(pipeline: Pipeline) -> None:
     objects: a pipeline is few objects and many megabytes. Results that refer to arrays keep those.
     """
     device, scheduler = pipeline.device, pipeline.scheduler
-    pipeline.close()
     crew = scheduler.crew
+    pipeline.close()
     with exclusive(device):
         for owner in (pipeline.arrays, scheduler, pipeline, *([] if crew is None else [crew])):
             vars(owner).clear()

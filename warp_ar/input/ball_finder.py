@@ -1,8 +1,8 @@
 """The outline of a mirror ball in a photograph, to a fraction of a pixel, with its uncertainty.
 
 From coarse to fine: a rough circle, given or looked for, is corrected in a reduced picture whose ball is
-``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of a
-sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
+``COARSE_RADIUS`` pixels, then in ever larger ones, each time by the evidence of ``ball_rim``. The unknowns are those of
+a sphere before the camera, three in all, so that the ellipse that a wide lens makes of a ball costs no further ones.
 
 How far it may be off is told by leaving out one sector of the rim after the other (a delete-a-group jackknife): what
 spoils a rim, a stand, a band of light, a shadow, spoils neighbouring pieces alike, so single pieces must not count as
@@ -228,6 +228,7 @@ def _coarse(image: Image, camera: Camera, sphere: Array, rough_error: float) -> 
 
 def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
     """The outline near a sphere that is within some percent of right, with its uncertainty."""
+    image, camera, corner = _window(image, camera, sphere)
     radius = _radius(camera, sphere)
     share, finest = min(1.0, COARSE_RADIUS / radius), min(1.0, LARGEST_RADIUS / radius)
     while share < finest:
@@ -260,7 +261,20 @@ def refine_outline(image: Image, camera: Camera, sphere: Array) -> BallOutline:
     spread = np.sqrt((SECTORS - 1) / SECTORS * ((left - left.mean(0)) ** 2).sum(0)) + LEAST_DEVIATION
     spread = np.hypot(spread, [0.0, 0.0, unsure]) / finest
     steps = _Fit(picture, view, fit.sphere(move), 1.0).evidence
-    return _describe(camera, fit.sphere(move), spread, steps.support(np.zeros(PIECES)))
+    found = _describe(camera, fit.sphere(move), spread, steps.support(np.zeros(PIECES)))
+    return dataclasses.replace(found, center=(found.center[0] + corner[0], found.center[1] + corner[1]))
+
+
+def _window(image: Image, camera: Camera, sphere: Array) -> tuple[Image, Camera, tuple[int, int]]:
+    """The part of a picture that a ball's outline may lie in, its camera, and its corner's column and row."""
+    points, _ = silhouette(camera, sphere, 32)
+    low, high = points.min(0), points.max(0)
+    margin = 0.35 * (high - low).max() + 24.0
+    x0, y0 = (int(v) for v in np.maximum(np.floor(low - margin), 0))
+    x1, y1 = (int(v) for v in np.minimum(np.ceil(high + margin) + 1, image.shape[1::-1]))
+    part = np.ascontiguousarray(image[y0:y1, x0:x1])
+    inside = dataclasses.replace(camera, width=x1 - x0, height=y1 - y0, cx=camera.cx - x0, cy=camera.cy - y0)
+    return part, inside, (x0, y0)
 
 
 def _describe(camera: Camera, sphere: Array, spread: Array, support: float) -> BallOutline:
@@ -344,8 +358,8 @@ def find_ball(
     if outline.support < LEAST_SUPPORT:
         raise UsageError(
             f"no ball was found in the picture: only {outline.support:.0%} of the best outline, about "
-            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is seen; "
-            "give a rough circle: column, row, radius in pixels"
+            f"({outline.center[0]:.0f}, {outline.center[1]:.0f}) with a radius of {outline.radius:.0f} pixels, is "
+            "seen; give a rough circle: column, row, radius in pixels"
         )
     return outline
 

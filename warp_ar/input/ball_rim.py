@@ -11,9 +11,9 @@ on changes slowly in q. So a profile across the rim is modelled, before the pict
 
     I(t) = a0 + a1 t  outside,    b0 + b1 q(t) + b2 q(t)^2  inside,
 
-linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains, C(s),
-makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen it is
-flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
+linear in its five coefficients. For each shift s of the rim along the normal they are solved for, and what remains,
+C(s), makes the profile's cost (n / 2) log(C(s) + floor): a likelihood whose noise is not known. Where nothing is seen
+it is flat; where a stand or a reflection makes a stronger step it is bounded by ``MOST_COST``, so that it is outvoted.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class RimEvidence:
 
     def total(self, shift: Array) -> float:
         """Mean cost of the pieces shifted by ``shift`` (n,) pixels; outside the window a piece costs the most."""
-        return float(self._each(shift).mean())
+        return float(self._each(shift).mean()) if self.known.any() else MOST_COST
 
     def _each(self, shift: Array) -> Array:
         step = self.shifts[1] - self.shifts[0]
@@ -121,20 +121,29 @@ class RimEvidence:
 
 
 def _profiles(
-    image: Image, table: NDArray[np.float32], points: Array, normals: Array, inward: float, outward: float
+    image: Image,
+    table: NDArray[np.float32],
+    points: Array,
+    normals: Array,
+    inward: float,
+    outward: float,
+    *,
+    whole: bool = True,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Profiles across an outline, (m, channels, samples), of the pieces that the picture shows whole, and which (n,).
+    """Profiles across an outline, (m, channels, samples), of the pieces that the picture shows, and which (n,).
 
-    ``table`` (256,) gives the value of each code.
+    ``table`` (256,) gives the value of each code. ``whole``: pieces whose profile leaves the picture are not shown;
+    else it goes on as at the picture's edge, and only the piece itself must be inside.
     """
     height, width = image.shape[:2]
     t = np.arange(-inward, outward + 0.5 * STEP, STEP)
     at = points[:, None] + t[None, :, None] * normals[:, None]
-    known = ((at >= 0) & (at <= (width - 1, height - 1))).all((1, 2))
+    asked = at if whole else points[:, None]
+    known = np.asarray(((asked >= 0) & (asked <= (width - 1, height - 1))).all((1, 2)))
     if not known.any():
         return np.zeros((0, image.shape[2], len(t))), known
-    low = np.maximum(np.floor(at[known].min((0, 1))).astype(int) - 2, 0)
-    high = np.ceil(at[known].max((0, 1))).astype(int) + 3
+    low = np.clip(np.floor(at[known].min((0, 1))).astype(int) - 2, 0, (width - 1, height - 1))
+    high = np.maximum(np.ceil(at[known].max((0, 1))).astype(int) + 3, low + 1)
     part = table[image[low[1] : high[1], low[0] : high[0]]]
     x, y = np.moveaxis((at[known] - low).astype(np.float32), 2, 0)
     found = cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -146,11 +155,11 @@ def gather_steps(
 ) -> RimEvidence:
     """Where there are steps: how much better than a smooth curve the model explains a window about each shift.
 
-    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain, however
-    strong it is: a circle is where most pieces have one.
+    A piece of the outline costs ``MOST_COST`` where nothing speaks for a step, and nothing where one is certain,
+    however strong it is: a circle is where most pieces have one.
     """
     inward, outward = STEP_WINDOW
-    profiles, known = _profiles(image, _CODES, points, normals, inward + shift, outward + shift)
+    profiles, known = _profiles(image, _CODES, points, normals, inward + shift, outward + shift, whole=False)
     shifts = np.arange(-shift, shift + 0.5 * STEP, STEP)
     costs = np.zeros((len(points), len(shifts)))
     if not known.any():

@@ -40,17 +40,21 @@ Circle = tuple[float, float, float]
 
 PATCH = 384
 """Most pixels across the ball's picture in which exposures are compared."""
-DARKEST, DIM, BRIGHTEST = 8, 40, 245
+DARKEST, DIM, BRIGHTEST = 16, 40, 245
 """Codes between which a pixel tells of light; those below ``DIM`` only where there are no others.
 
 Flare and processing lift the darks of single pictures, and of short exposures nothing takes its darks.
 """
+FLAT = 30
+"""Range of codes around a pixel from which on it is beside an edge: there blur mixes what clips with what does not."""
 LEAST_PIXELS = 400
 """Pixels well exposed in two pictures without which nothing is said of their ratio."""
 HOLDS = 0.12
 """Logarithm of the factor by which a step may be off what the pixels say."""
 CONTRADICTS = 0.3
 """The same where a response is estimated with it: beyond, no response explains the exposures."""
+FEATURELESS = 6.0
+"""Standard deviation of codes below which a picture shows nothing."""
 MOVED = 0.75
 """Correlation over well exposed pixels below which a picture shows something else."""
 HATS = 8
@@ -74,23 +78,37 @@ def cut_ball(image: Image, circle: Circle, size: int) -> Image:
     x, y, radius = circle
     scale = 2.1 * radius / size
     corner = (x - 1.05 * radius + 0.5 * scale - 0.5, y - 1.05 * radius + 0.5 * scale - 0.5)
-    if scale > 1.5:
-        # Averaged first: a sample stands for all the pixels that it covers.
-        blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale)
-    else:
-        blurred = image
+    # Averaged first where it is reduced: a sample stands for all the pixels that it covers.
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.35 * scale) if scale > 1.5 else image
     matrix = np.array([[scale, 0.0, corner[0]], [0.0, scale, corner[1]]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(blurred, matrix, (size, size), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _tone_curve(u: Array, v: Array) -> Array:
+def _tone_curve(u: NDArray[np.float32], v: NDArray[np.float32]) -> Array:
     """Median code of the second picture for each code of the first, (256,), rising."""
     bins = np.clip((u / 8).astype(int), 0, 31)
     middle = np.array([np.median(v[bins == k]) if (bins == k).sum() > 20 else np.nan for k in range(32)])
     known = np.isfinite(middle)
     curve = np.interp(np.arange(256), 8 * np.flatnonzero(known) + 3.5, np.maximum.accumulate(middle[known]))
     return np.asarray(curve)
+
+
+def _gauss_newton(
+    seen: NDArray[np.float32],
+    wanted: NDArray[np.float32],
+    ok: NDArray[np.bool_],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+) -> Array:
+    """Step of (columns, rows, log scale) that makes ``seen`` more like ``wanted``, robustly."""
+    slope_x, slope_y = (cv2.Sobel(seen, cv2.CV_32F, *way, scale=1 / 8)[ok] for way in ((1, 0), (0, 1)))
+    error = (seen - wanted)[ok].astype(float)
+    scale = 2.0 + 1.5 * float(np.median(np.abs(error)))
+    weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
+    jacobian = np.column_stack([slope_x, slope_y, slope_x * x[ok] + slope_y * y[ok]]).astype(float)
+    normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(3)
+    return np.asarray(-np.linalg.solve(normal, jacobian.T @ (weight * error)))
 
 
 def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[Array, float]:
@@ -103,43 +121,48 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
 
     Returns:
         (columns, rows, log of the scale about the middle) by which ``other`` must be looked up, and the correlation
-        afterwards, NaN where fewer than ``LEAST_PIXELS`` are well exposed in both.
+        afterwards, NaN where fewer than ``LEAST_PIXELS`` tell.
     """
     n = len(reference)
-    first, second = (cv2.GaussianBlur(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
-                     for p in (reference, other))  # fmt: skip
-    rows, columns = np.mgrid[:n, :n].astype(np.float32)
-    x, y = columns - (n - 1) / 2, rows - (n - 1) / 2
-    move, correlation = np.zeros(3), math.nan
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (reference, other)]
+    first, second = (cv2.GaussianBlur(picture, (0, 0), 1.0) for picture in gray)
+    y, x = np.asarray(np.mgrid[:n, :n] - (n - 1) / 2, np.float32)
     well = disc & (reference.max(2) < BRIGHTEST) & (first > DARKEST)
+
+    def look(blurred: NDArray[np.float32], move: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """The other picture where ``move`` lays it over the first, and which pixels are well exposed in both."""
+        grow, middle = math.exp(move[2]), (n - 1) / 2
+        at_x = (grow * x + middle + move[0]).astype(np.float32)
+        at_y = (grow * y + middle + move[1]).astype(np.float32)
+        seen = np.asarray(cv2.remap(blurred, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return seen, well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
+
+    def alike(move: Array) -> float:
+        """Correlation; what is dark or clips in one of the two counts as well."""
+        seen, _ = look(second, move)
+        told = disc & ~((first <= DARKEST) & (seen <= DARKEST)) & ~((first >= BRIGHTEST) & (seen >= BRIGHTEST))
+        if told.sum() < LEAST_PIXELS:
+            return math.nan
+        wanted = np.interp(first[told], np.arange(256), _tone_curve(first[told], seen[told]))
+        if np.ptp(wanted) == 0.0:
+            # Nothing to see in either, or much that the first does not have.
+            return math.nan if np.std(seen[told]) < FEATURELESS else 0.0
+        return float(np.corrcoef(wanted, seen[told])[0, 1])
+
+    move = np.zeros(3)
     for coarse in (4.0, 2.0, 0.0, 0.0):
         a, b = (cv2.GaussianBlur(p, (0, 0), coarse) if coarse else p for p in (first, second))
         for _ in range(8):
-            grow = math.exp(move[2])
-            at = (
-                (grow * x + (n - 1) / 2 + move[0]).astype(np.float32),
-                (grow * y + (n - 1) / 2 + move[1]).astype(np.float32),
-            )
-            seen = cv2.remap(b, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            ok = well & (seen > DARKEST) & (seen < BRIGHTEST - 5)
+            seen, ok = look(b, move)
             if ok.sum() < LEAST_PIXELS:
-                return np.zeros(3), math.nan
-            curve = _tone_curve(a[ok], seen[ok])
-            wanted = np.interp(a, np.arange(256), curve).astype(np.float32)
-            slope_x, slope_y = (cv2.Sobel(seen, cv2.CV_32F, *way, scale=1 / 8)[ok] for way in ((1, 0), (0, 1)))
-            error = (seen - wanted)[ok].astype(float)
-            scale = 2.0 + 1.5 * float(np.median(np.abs(error)))
-            weight = 1.0 / (1.0 + (error / scale) ** 2) ** 2
-            jacobian = np.column_stack([slope_x, slope_y, slope_x * x[ok] + slope_y * y[ok]]).astype(float)
-            normal = jacobian.T @ (weight[:, None] * jacobian) + 1e-6 * np.eye(3)
-            step = -np.linalg.solve(normal, jacobian.T @ (weight * error))
-            move += np.clip(step, -0.02 * n, 0.02 * n) * np.array([1.0, 1.0, 1.0 if n else 0.0])
+                return np.zeros(3), alike(np.zeros(3))
+            wanted = np.asarray(np.interp(a, np.arange(256), _tone_curve(a[ok], seen[ok])), np.float32)
+            step = _gauss_newton(seen, wanted, ok, x, y)
+            move += np.clip(step, -0.02 * n, 0.02 * n)
             move[2] = float(np.clip(move[2], -0.1, 0.1))
             if np.abs(step[:2]).max() < 0.01:
                 break
-        told = np.corrcoef(wanted[ok], seen[ok])[0, 1] if np.ptp(wanted[ok]) > 0 else math.nan
-        correlation = float(told)
-    return move, correlation
+    return move, alike(move)
 
 
 def align(images: Sequence[Image], circles: Sequence[Circle]) -> Aligned:
@@ -190,9 +213,10 @@ def _collect(patches: Sequence[Image]) -> tuple[tuple[Array, Array], ...]:
         u, v = smooth[k], smooth[k + 1]
         ok = disc & (u.max(2) <= BRIGHTEST) & (v.max(2) <= BRIGHTEST)
         bright = ok & (u.min(2) >= DIM) & (v.min(2) >= DIM)
-        ok = bright if bright.sum() >= LEAST_PIXELS else ok & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
-        flat = ok & (plain[k] < 24) & (plain[k + 1] < 24)
-        ok = flat if flat.sum() >= LEAST_PIXELS else ok
+        flat = (plain[k] < FLAT) & (plain[k + 1] < FLAT)
+        dim = ok & flat & (u.min(2) >= DARKEST) & (v.min(2) >= DARKEST)
+        ways = ((bright & flat, LEAST_PIXELS), (bright, 5 * LEAST_PIXELS), (dim, 0))
+        ok = next(chosen for chosen, least in ways if chosen.sum() >= least)
         pairs.append((u[ok].astype(float), v[ok].astype(float)))
     return tuple(pairs)
 
@@ -341,26 +365,28 @@ def agree_exposures(
         )
     dark = decode_table(transfer)[:, 1][40] / max(bent.curve[40, 1], 1e-9)
     notes.append(
-        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code 40): "
-        "it was estimated from the bracket"
+        f"the response is not {transfer} (off by {math.exp(off):.2f} in one step, {_number(float(dark))} times at code "
+        "40): it was estimated from the bracket"
     )
     return Exposures(ratios, bent.curve, tuple(notes))
 
 
-def thin_exposures(exposures: Sequence[float]) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def thin_exposures(ratios: Sequence[float], shown: int) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Which pictures of a bracket to use: of those that are within ``WAVERING`` of each other, one.
+
+    Args:
+        ratios: Exposures.
+        shown: Index of the one that stays in any case.
 
     Returns:
         Indices, longest exposure first, and a note for each that is left out.
     """
-    order = sorted(range(len(exposures)), key=lambda k: -exposures[k])
-    kept, notes = [order[0]], []
-    for k in order[1:]:
-        ratio = exposures[kept[-1]] / exposures[k]
-        if ratio < WAVERING:
-            notes.append(
-                f"exposure {_number(exposures[k])} is left out: {ratio:.2f} times from {_number(exposures[kept[-1]])}"
-            )
-        else:
+    kept, notes = [shown], []
+    for k in sorted(range(len(ratios)), key=lambda k: -ratios[k]):
+        near = [other for other in kept if abs(math.log(ratios[k] / ratios[other])) < math.log(WAVERING)]
+        if k != shown and near:
+            ratio = max(ratios[k] / ratios[near[0]], ratios[near[0]] / ratios[k])
+            notes.append(f"picture {k + 1} by brightness is left out: its exposure is {ratio:.2f} times another's")
+        elif k != shown:
             kept.append(k)
-    return tuple(kept), tuple(notes)
+    return tuple(sorted(kept, key=lambda k: -ratios[k])), tuple(notes)

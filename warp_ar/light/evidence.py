@@ -151,9 +151,9 @@ def irradiance_interval(
 ) -> Interval:
     """Between which bounds the irradiance at the ball's place lies.
 
-    What the ball shows errs by ``capture``. What an estimate found scatters as its draws do, and where part of it was
-    held back the whole of it, and as much again, may be there. Where no draws were made, or the card only bounds what
-    is missing, all that clips may be as bright as ``clipped``.
+    What the ball shows errs by ``capture`` to one side and ``overlooked`` to the other. What an estimate found scatters
+    as its draws do, and where part of it was held back the whole of it, and as much again, may be there. Where no draws
+    were made, or the card only bounds what is missing, all that clips may be as bright as ``clipped``.
 
     Args:
         problem: The equations.
@@ -167,9 +167,9 @@ def irradiance_interval(
     form = irradiance_form(problem, normals)
     captured, found = form @ problem.radiance, form @ (excess * problem.lacking)
     most = form @ (config.clipped * problem.lacking)
-    reach = config.interval * np.hypot(0.0 if spread is None else spread, config.capture)
+    reach = config.interval * np.hypot(0.0 if spread is None else spread, config.found)
     low = (1.0 - config.capture) * captured + factor * np.maximum(1.0 - reach, 0.0) * found
-    high = (1.0 + config.capture) * captured + (2.0 - factor) * (1.0 + reach) * found
+    high = (1.0 + config.overlooked) * captured + (2.0 - factor) * (1.0 + reach) * found
     is_open = np.array(bounds) | (spread is None)
-    high = np.where(is_open, np.maximum(high, (1.0 + config.capture) * captured + most), high)
+    high = np.where(is_open, np.maximum(high, (1.0 + config.overlooked) * captured + most), high)
     return Interval(normals, low, captured + factor * found, high)

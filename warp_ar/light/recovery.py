@@ -137,8 +137,8 @@ class Recovery:
         self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
         self._peaks: list[Peak] = []
-        self._estimates = 0
         self._frames = 0
+        self._solved = 0
         self._stillness = Stillness()
         self._blocks = blocks_of(surfaces)
         self._evidence: _Evidence | None = None
@@ -154,7 +154,7 @@ class Recovery:
             cells: As for ``update``.
             observations: As for ``update``.
         """
-        return self._stillness.holds(cells, observations, settled=self._estimates >= CONFIG.solver.settled)
+        return self._stillness.holds(cells, observations, settled=self._frames >= CONFIG.solver.settled)
 
     def update(
         self,
@@ -184,11 +184,11 @@ class Recovery:
 
     def _solve(self, problem: Problem) -> Estimate:
         """``update``, by the thread that asks for it alone."""
-        self._estimates += 1
+        self._frames += 1
         card = check_card(problem.points, problem.kind, problem.light)
         if not card.holds:
             return self._without_card(problem, card)
-        self._frames += 1
+        self._solved += 1
         self._unseen = 0
         means, bounds = problem.card_means()
         by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
@@ -211,10 +211,9 @@ class Recovery:
             lamps.append(Lamp(problem.origin[peak.cell], problem.direction[peak.cell], peak.distance, power))
         lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
         if is_turn or self._evidence is None:
-            start = fit_channel(problem, best, problem.start(means[best]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(
-                problem, best, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast)
-            )
+            c = _told_channel(problem)
+            start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
+            self._evidence = _weigh(problem, c, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast))
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
@@ -246,7 +245,7 @@ class Recovery:
             if problem.may_hold_peak[peak.cell]:
                 problem.push(peak)
         search = EmitterSearch(problem, best)
-        before = self._frames - 1
+        before = self._solved - 1
         settled = before >= CONFIG.solver.settled
         if before and problem.peaks and (not settled or before % 2 == 0):
             search.move_peak(mean)
@@ -294,6 +293,13 @@ class _Evidence:
         return self.method, self.factor
 
 
+def _told_channel(problem: Problem) -> int:
+    """Of the channels in which something is missing the one that surfaces show best; green of equals."""
+    missing = problem.solid_angle @ problem.lacking
+    shown = problem.exact.sum(axis=0)
+    return max(range(3), key=lambda c: (missing[c] > 0.3 * missing.max(), shown[c], c == 1))
+
+
 def _weigh(
     problem: Problem,
     c: int,
@@ -314,6 +320,8 @@ def _weigh(
         added = form @ (excess[:, c] * problem.lacking[:, c])
         factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
+    if found[0][1].factor >= CONFIG.evidence.enough:
+        return found[0][1]
     return max(found, key=lambda one: one[0])[1]
 
 

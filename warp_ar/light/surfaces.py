@@ -79,8 +79,9 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     )
     ring = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     paper = [*cells[white], *np.column_stack([ring, np.zeros(len(ring))])]
-    found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
-    found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
+    if scene.has_marker:
+        found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
+        found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
     if card_only:
         return found.result()
     margin = 0.3 * float((high - low).max())
@@ -100,6 +101,7 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
             points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
             flat = np.abs(points[:, 2]) < 0.02
             card = flat & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
+            card &= scene.has_marker
             points = points[~card & ~_in_boxes(scene, points)]
             found.add(list(points), rotation[:, 2], rotation[:, 0], 0.004, Kind.PLANE, 2 + number)
         elif proxy.shape == "box":

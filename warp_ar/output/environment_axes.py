@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
+from warp_ar.light import captured
 
 Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
@@ -37,7 +38,7 @@ AXES = ("z-up", "blender", "y-up", "opengl")
 LAYOUTS = ("latlong", "cube")
 
 DESCRIPTIONS = {
-    "z-up": "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y",
+    "z-up": captured.AXES,
     "blender": "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward -y",
     "y-up": "latlong, row 0 toward +y (up), centre column toward +z, columns grow toward -x",
     "opengl": "latlong, row 0 toward +y (up), centre column toward -z, columns grow toward +x",

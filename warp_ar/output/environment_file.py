@@ -24,14 +24,12 @@ import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import is_file, limits, too_much, write_whole
+from warp_ar.light.captured import REC_709
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.places import check_replaceable
 from warp_ar.output.radiance_hdr import encode_hdr
 from warp_ar.signature import PROGRAM
-
-REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""x, y of sRGB's red, green, blue and white."""
 
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr", ".json")
 

@@ -377,6 +377,36 @@ class Light:
 
 
 @dataclasses.dataclass(frozen=True)
+class CapturedLight:
+    """Light of the environment from a file instead of from a mirror ball in the frames."""
+
+    file: Path
+    """OpenEXR latlong, as ``warp_ar.capture`` writes it; any other is taken to have the same axes."""
+    scale: float = 1.0
+    """Factor from the file's values to those of the frames' camera."""
+    rotate: Vec3 = (0.0, 0.0, 0.0)
+    """Degrees about the fixed x, then y, then z axis, from the file's axes to the scene's."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseSpec:
+    """Where the camera stands, instead of what a marker says; ``camera_from_world``: x_camera = R x_world + t.
+
+    Axes of the camera are those of OpenCV and COLMAP: x right, y down, z forward.
+    """
+
+    poses: tuple[tuple[tuple[float, ...], Vec3], ...]
+    """(R as 9 numbers row by row, t in metres) of every frame, or one for all."""
+    file: Path | None = None
+    """Where they were read from."""
+
+    def at(self, index: int) -> tuple[FloatMatrix, FloatMatrix]:
+        """R (3, 3) and t (3,) of a frame; after the last, poses start again, as a looped clip does."""
+        rotation, translation = self.poses[index % len(self.poses)]
+        return np.array(rotation).reshape(3, 3), np.array(translation)
+
+
+@dataclasses.dataclass(frozen=True)
 class Exposure:
     """A simulated shorter exposure."""
 
@@ -406,6 +436,12 @@ class Scene:
     """Virtual objects."""
     lights: tuple[Light, ...] = ()
     """Virtual lights."""
+    captured: CapturedLight | None = None
+    """Light of the environment from a file; mirror balls are then objects like others."""
+    pose: PoseSpec | None = None
+    """Where the camera stands, where no marker tells."""
+    has_marker: bool = True
+    """Whether a printed card lies at the origin; not where the file gives a pose and no marker."""
     exposure: Exposure = Exposure()
     """Simulated exposure."""
     path: Path | None = dataclasses.field(default=None, compare=False)

@@ -141,6 +141,25 @@ def read_exif(path: str | Path) -> PhotoInfo:
     )
 
 
+def camera_by_exif(path: Path, transfer: str | Path = "srgb") -> Camera:
+    """Camera of a photograph, or of the first one in a folder.
+
+    Raises:
+        SceneError: It has no focal length, or was cut.
+    """
+    if path.is_dir():
+        pictures = sorted(p for p in path.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif", ".tiff", ".png"))
+        if not pictures:
+            raise SceneError(f"{path}: holds no photograph to read EXIF from")
+        path = pictures[0]
+    info = read_exif(path)
+    camera = info.camera(transfer)
+    if camera is None:
+        why = "tells no focal length" if info.is_whole else f"is of {info.width}x{info.height}, a part of a photograph"
+        raise SceneError(f"{path}: its EXIF {why}; calibrate the camera or give its numbers")
+    return camera
+
+
 def _number(tags: dict[str, Any], name: str) -> float | None:
     """First value of a tag as a number above 0."""
     values = getattr(tags.get(name), "values", None)

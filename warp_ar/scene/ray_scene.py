@@ -129,7 +129,8 @@ def skeleton(scene: scenes.Scene) -> Any:
         for item in scene.objects
     )
     lights = tuple(light.kind for light in scene.lights)
-    return scene.camera, scene.marker, scene.probes, scene.proxies, objects, lights
+    place = scene.camera, scene.marker, scene.has_marker, scene.pose, scene.captured
+    return *place, scene.probes, scene.proxies, objects, lights
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

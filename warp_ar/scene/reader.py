@@ -29,6 +29,7 @@ from warp_ar.scene.description import (
     Animation,
     Board,
     Camera,
+    CapturedLight,
     CharucoBoard,
     Color,
     Exposure,
@@ -41,18 +42,21 @@ from warp_ar.scene.description import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    PoseSpec,
     Probe,
     Proxy,
     Scene,
     SourceSpec,
     Vec3,
 )
+from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
+from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
 
 _TOP_KEYS: Final = ("schema", "name")
-_SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "exposure")
+_SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
 _SOURCES: Final = ("path", "camera", "synthetic")
 _TRANSFERS: Final = '"srgb", "linear", "gamma:2.2" or the path of a measured response'
 _BOARDS: Final = (
@@ -203,8 +207,21 @@ def _range(what: str, low: float, high: float, unit: str) -> str:
     return f"{what}, finite{unit}" if what == "a number" else f"{what}, each finite{unit}"
 
 
-def _read_camera(table: _Table) -> Camera:
+def _exif_camera(table: _Table, source: object, transfer: str | Path) -> Camera:
+    """The camera by the EXIF of the scene's own first picture."""
+    path = source.get("path") if isinstance(source, dict) else None
+    if not isinstance(path, str):
+        table.fail("calibration", '"exif" reads the pictures of the scene: give [source] path; else a file or numbers')
+    return camera_by_exif(table.folder / path, transfer)
+
+
+def _read_camera(table: _Table, source: object = None) -> Camera:
     transfer = _read_transfer(table)
+    if table.data.get("calibration") == "exif":
+        for key in INTRINSICS:
+            if key in table:
+                table.fail(key, "not used beside calibration; give either EXIF or the numbers")
+        return _exif_camera(table, source, transfer)
     if "calibration" in table:
         for key in INTRINSICS:
             if key in table:
@@ -438,6 +455,46 @@ def _read_light(table: _Table) -> Light:
     )
 
 
+def _read_captured(table: _Table) -> CapturedLight:
+    return CapturedLight(
+        table.file("file", "a captured light (OpenEXR)"),
+        table.number("scale", CapturedLight.scale, low=SMALLEST),
+        table.vec3("rotate", CapturedLight.rotate, unit="degrees"),
+    )
+
+
+_POSE_KEYS: Final = ("R", "t", "quaternion", "position", "rotate", "file")
+_POSES: Final = "expected R and t, quaternion and t (both camera_from_world), position and rotate, or file"
+
+
+def _read_pose(table: _Table) -> PoseSpec:
+    given = [key for key in ("R", "quaternion", "position", "file") if key in table]
+    if len(given) != 1:
+        key = given[1] if given else "R"
+        table.fail(key, f"{given[0]} is given too; {_POSES}" if given else _POSES)
+    way = given[0]
+    others = {"R": ("t",), "quaternion": ("t",), "position": ("rotate",), "file": ()}[way]
+    for key in table.data:
+        if key != way and key not in others:
+            table.fail(key, f"not used with {way}; {_POSES}")
+    if way == "file":
+        path = table.file("file", "poses: COLMAP's images.txt, or JSON")
+        return PoseSpec(load_poses(path), path)
+    if way == "position":
+        rotate = table.vec3("rotate", (0.0, 0.0, 0.0), unit="degrees")
+        return PoseSpec((pose_of_position(table.vec3("position", unit="metres"), rotate),))
+    translation = table.vec3("t", unit="metres")
+    if way == "R":
+        rotation = table.vector("R", sizes=(9,))
+        if not check_rotation(rotation):
+            table.fail("R", "expected a rotation matrix, 9 numbers row by row: camera_from_world, as OpenCV has it")
+        return PoseSpec(((rotation, translation),))
+    w, x, y, z = table.vector("quaternion", sizes=(4,), low=-1e6, high=1e6)
+    if w == x == y == z == 0.0:
+        table.fail("quaternion", "has no length; expected w, x, y, z as COLMAP has them")
+    return PoseSpec(((rotation_of_quaternion(w, x, y, z), translation),))
+
+
 def _read_exposure(table: _Table) -> Exposure:
     if table.data.get("scale") == "auto":
         return Exposure("auto")
@@ -477,11 +534,11 @@ def load_scene(path_or_name: str | Path) -> Scene:
     Raises:
         SceneError: No such scene, or something in it is wrong; one line names file, key, value and what would be right.
     """
-    path = Path(path_or_name)
-    if is_folder(path):
+    path, bundled = Path(path_or_name), bundled_scenes()
+    # A folder of frames may have a bundled scene's name.
+    if str(path_or_name) and str(path_or_name) not in bundled and is_folder(path):
         path = _scene_in(path)
     if not is_file(path):
-        bundled = bundled_scenes()
         if str(path_or_name) not in bundled:
             hint = f"a file, or a bundled scene ({nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
@@ -537,22 +594,42 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
             raise SceneError(f"{label}: {section}: there may be several: write [[{section}]] instead of [{section}]")
         return tuple(read(_Table(label, folder, f"{section}[{i}]", item, keys)) for i, item in enumerate(value))
 
+    lights = data.get("light", [])
+    captured: list[tuple[str, Any]] = []
+    if isinstance(lights, dict) and "file" in lights:
+        lights, captured = [], [("light", lights)]
+    elif isinstance(lights, list):
+        named = [(f"light[{i}]", item) for i, item in enumerate(lights) if isinstance(item, dict) and "file" in item]
+        captured = [(name, item) for name, item in named if "kind" not in item]
+        lights = [item for item in lights if all(item is not other for _, other in captured)]
+    if len(captured) > 1:
+        raise SceneError(f"{label}: {captured[1][0]}.file: a scene has one captured light; {captured[0][0]} is one too")
+    data = {**data, "light": lights}
+
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
-        camera=one("camera", (*INTRINSICS, "transfer", "calibration", "field_of_view"), _read_camera),
+        camera=one(
+            "camera",
+            (*INTRINSICS, "transfer", "calibration", "field_of_view"),
+            lambda table: _read_camera(table, data.get("source")),
+        ),
         source=one("source", keys_of(SourceSpec), _read_source),
         marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
         objects=many("object", keys_of(Object), _read_object),
         lights=many("light", keys_of(Light), _read_light),
+        captured=_read_captured(_Table(label, folder, *captured[0], keys_of(CapturedLight))) if captured else None,
+        pose=one("pose", _POSE_KEYS, _read_pose),
+        has_marker="marker" in data or "pose" not in data,
         exposure=one("exposure", keys_of(Exposure), _read_exposure) or Exposure(),
         path=path,
     )
     placed = [section for section in ("probe", "proxy", "object", "light") if data.get(section)]
-    if placed and "marker" not in data:
+    if placed and "marker" not in data and "pose" not in data:
         raise SceneError(
-            f"{label}: [marker] is missing: [{placed[0]}] has its place in the marker's frame; give its size"
+            f"{label}: [marker] is missing: [{placed[0]}] has its place in the marker's frame; give its size, "
+            "or the camera's [pose]"
         )
     return scene

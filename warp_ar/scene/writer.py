@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from warp_ar.scene.description import Animation, Board, Light, Object, Probe, Scene, SourceSpec
+from warp_ar.scene.description import Animation, Board, CapturedLight, Light, Object, PoseSpec, Probe, Scene, SourceSpec
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 
 
@@ -54,7 +54,10 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     if scene.source is not None:
         lines += ["", "[source]", *table(scene.source, keys_of(SourceSpec))]
     keys = ("dictionary", "id", "size", "white") if scene.marker.board is None else ("dictionary", "board", "white")
-    lines += ["", "[marker]", *table(scene.marker, keys)]
+    if scene.has_marker:
+        lines += ["", "[marker]", *table(scene.marker, keys)]
+    if scene.pose is not None:
+        lines += ["", "[pose]", *_pose_lines(scene.pose, value)]
     for probe in scene.probes:
         lines += ["", "[[probe]]", *table(probe, keys_of(Probe))]
     for proxy in scene.proxies:
@@ -72,5 +75,15 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     for light in scene.lights:
         lines += ["", "[[light]]", *table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
         lines += animation(light)
+    if scene.captured is not None:
+        lines += ["", "[[light]]", *table(scene.captured, keys_of(CapturedLight))]
     lines += ["", "[exposure]", *table(scene.exposure, ("scale",))]
     return "\n".join(lines) + "\n"
+
+
+def _pose_lines(spec: PoseSpec, value: Callable[[Any], str]) -> list[str]:
+    """Keys of ``[pose]``: the file that poses are from, or the only one."""
+    if spec.file is not None:
+        return [f"file = {value(spec.file)}"]
+    rotation, translation = spec.poses[0]
+    return [f"R = {value(rotation)}", f"t = {value(translation)}"]

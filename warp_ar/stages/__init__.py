@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from warp_ar.stages.base import Stage
 
 _ORDER = (
+    "captured.Captured",
     "sphere_map.SphereMap",
     "unwrap.Unwrap",
     "bracket.Bracket",

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import accumulate
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
 
@@ -33,8 +33,8 @@ class Accumulate(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(unobserved(features))
         seen = "merged" if features.merged else "probe"
         return Wiring(
             (*(f"{seen}_{part}" for part in UNWRAPPED), "clock"),

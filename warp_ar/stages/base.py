@@ -155,6 +155,11 @@ NO_OBJECT = "the scene has no virtual object"
 """Reasons that several stages give."""
 
 
+def unobserved(features: Features) -> str:
+    """Why nothing is read off a mirror ball, where no ball shows the environment."""
+    return NO_BALL if features.request.scene.captured is None else "the environment comes from a file"
+
+
 class Stage(abc.ABC):
     """One step on the way of a frame."""
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import bracket as kernels
 from warp_ar.kernels.launch import copy
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import UNWRAPPED
 
@@ -33,11 +33,11 @@ class Bracket(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball, and a source whose frames alternate between exposures."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(unobserved(features))
         if len(features.request.exposures) < 2:
             return LeftOut("the source tells of no alternating exposures")
-        if not features.recovered:
+        if not features.merged:
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             (*(f"probe_{part}" for part in UNWRAPPED), "short_frames"), tuple(f"merged_{part}" for part in UNWRAPPED)

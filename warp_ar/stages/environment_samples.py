@@ -66,7 +66,8 @@ class EnvironmentSamples(Stage):
         environment, samples = settled_environment(arrays, device), arrays["environment_samples"]
         cumulative, sums = arrays["environment_samples_cumulative"], arrays["environment_samples_rows"]
         out = arrays["environment_samples_directions"], arrays["environment_samples_flux"], samples
-        origin = wp.vec3(*self.request.scene.probes[0].center)
+        probes = self.request.scene.probes
+        origin = wp.vec3(*probes[0].center) if probes else wp.vec3()
         passes = [
             Pass(lambda rows: environment_samples.sum_environment(environment, cumulative, sums)),
             Pass(lambda rows: environment_samples.draw_samples(environment, cumulative, sums, origin, *out)),

@@ -37,7 +37,9 @@ class Features:
     request: Request
     """What they were found for."""
     environment: bool
-    """A mirror ball shows the environment."""
+    """The environment is known."""
+    observed: bool
+    """A mirror ball in the frames shows it; else it comes from a file."""
     recovered: bool
     """Light that clips in the ball is put back."""
     emitters: bool
@@ -89,8 +91,11 @@ class Features:
 def find_features(request: Request) -> Features:
     """Answer for ``request``; pure Python, nothing of Warp is touched."""
     scene, quality = request.scene, request.quality
-    environment = bool(scene.probes)
-    recovered = environment and quality.method("recover") not in ("default", "clipped")
+    environment = has_environment(scene)
+    observed = environment and scene.captured is None
+    bracketed = observed and quality.method("recover") not in ("default", "clipped")
+    # Without a card or anything else that is modelled, nothing tells what clipped light does.
+    recovered = bracketed and (scene.has_marker or bool(scene.proxies))
     layers = _find_layers(scene, quality)
     scale = scene.exposure.scale
     exposed = "physical_added" in layers if isinstance(scale, str) else scale != 1.0
@@ -102,9 +107,10 @@ def find_features(request: Request) -> Features:
     return Features(
         request=request,
         environment=environment,
+        observed=observed,
         recovered=recovered,
         emitters=emitters,
-        merged=recovered and len(request.exposures) > 1,
+        merged=bracketed and len(request.exposures) > 1,
         layers=layers,
         exposed=exposed,
         boxed=darkened and quality.method("expose") in BOXES,
@@ -120,6 +126,11 @@ def find_features(request: Request) -> Features:
     )
 
 
+def has_environment(scene: Scene) -> bool:
+    """Whether a mirror ball or a file tells of the environment."""
+    return bool(scene.probes) or scene.captured is not None
+
+
 def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     layers = []
     if scene.objects:
@@ -127,7 +138,7 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     if scene.lights and scene.proxies:
         layers.append("physical_added")
     shadows = quality.method("environment_shadow") not in ("default", "none")
-    if shadows and scene.objects and scene.proxies and scene.probes:
+    if shadows and scene.objects and scene.proxies and has_environment(scene):
         layers.append("shadow_ratio")
     if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
         layers.append("mirrored")
@@ -136,13 +147,14 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
 
 def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLightConfig:
     materials = [item.material for item in scene.objects]
-    environment = bool(scene.probes)
+    environment = has_environment(scene)
     return DistantLightConfig(
         trace=trace_config(scene),
         models=tuple(sorted(set(map(material_model, materials)))),
         textures=has_textures(scene),
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
         specular=environment and any(map(reflects_glossily, materials)),
-        probes=environment,
+        probes=bool(scene.probes),
         emitters=emitters,
+        captured=scene.captured is not None,
     )

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_ar.kernels import change, fill, fill_frame
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 
 
@@ -34,8 +34,8 @@ class Fill(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
         return Wiring(("environment_radiance", "environment_confidence", "frame", "pose"), (written,))
 

@@ -45,6 +45,12 @@ class Irradiance(Stage):
     )
 
     @classmethod
+    def method_for(cls, features: Features) -> str:
+        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        method = super().method_for(features)
+        return "top_mip" if method == "sphere_mip" and not features.observed else method
+
+    @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Read the environment, write irradiance in the form of the method."""
         if not features.environment:

@@ -103,7 +103,7 @@ class MirrorBall(Stage):
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Reads what the objects and the desk are lit by."""
         quality = features.request.quality
-        if not features.environment:
+        if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")
         if quality.method(cls.name) not in SAMPLES:
             return LeftOut(f"the quality {quality.name!r} leaves the ball as the camera saw it")

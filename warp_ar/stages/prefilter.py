@@ -55,6 +55,12 @@ class Prefilter(Stage):
     )
 
     @classmethod
+    def method_for(cls, features: Features) -> str:
+        """The nearest to the paper's where light from a file leaves no ball to look up."""
+        method = super().method_for(features)
+        return "box_mip" if method == "sphere_mip" and not features.observed else method
+
+    @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Read the environment, write the levels."""
         if not features.environment:

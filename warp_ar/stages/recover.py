@@ -18,7 +18,7 @@ from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.ray_scene import trace_config
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
 from warp_ar.stages.shared.variants import trace_variant
@@ -88,8 +88,8 @@ class Recover(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball and a method that does something."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(unobserved(features))
         if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(

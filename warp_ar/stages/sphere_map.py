@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import sphere_map
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 
 
@@ -29,7 +29,7 @@ class SphereMap(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        return Wiring(("frame", "pose"), ("sphere_map",)) if features.environment else LeftOut(NO_BALL)
+        return Wiring(("frame", "pose"), ("sphere_map",)) if features.observed else LeftOut(unobserved(features))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """All levels, one after another."""

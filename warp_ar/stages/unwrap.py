@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import sphere_map, unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
-from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.variants import shares_kernels
 
@@ -53,8 +53,8 @@ class Unwrap(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        if not features.environment:
-            return LeftOut(NO_BALL)
+        if not features.observed:
+            return LeftOut(unobserved(features))
         texture = ("sphere_map",) if cls.method_for(features) == "sphere_map" else ()
         return Wiring(("frame", "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
 

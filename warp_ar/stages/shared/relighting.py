@@ -30,7 +30,7 @@ def relight_config(features: Features) -> relight.RelightConfig:
         "reflectance" if method in LOCAL else method,
         trace_config(features.request.scene),
         "sh" if features.irradiance == "irradiance_sh" else "map",
-        features.environment,
+        bool(features.request.scene.probes),
         features.soft_lights,
         method in ("reflectance", *LOCAL) and features.emitters,
         features.ambient_visibility,

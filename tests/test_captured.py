@@ -1,0 +1,200 @@
+"""Captured light: its file, how it is turned, and scenes that are lit by it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SceneError
+from warp_ar.light.captured import (
+    REC_709,
+    CapturedEmitter,
+    Light,
+    find_emitters,
+    latlong_directions,
+    texel_solid_angles,
+)
+from warp_ar.scene import dumps_scene, loads_scene
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.session import with_light
+from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Request
+
+SCENE = """schema = 1
+[camera]
+width = 96
+height = 72
+fx = 90.0
+fy = 90.0
+cx = 47.5
+cy = 35.5
+transfer = "linear"
+[pose]
+position = [0.0, -0.5, 0.2]
+rotate = [-20.0, 0.0, 0.0]
+[[proxy]]
+shape = "plane"
+size = [2.0, 2.0]
+[[object]]
+shape = "sphere"
+radius = 0.08
+at = [0.0, 0.0, 0.08]
+[object.material]
+model = "lambert"
+base_color = [0.5, 0.5, 0.5]
+[light]
+file = "light.exr"
+"""
+
+
+PLACED = "position = [0.0, -0.5, 0.2]\nrotate = [-20.0, 0.0, 0.0]"
+
+
+def constant(value, height=16):
+    return Light(np.full((height, 2 * height, 3), value, np.float32), np.ones((height, 2 * height), np.float32))
+
+
+def smooth(height):
+    """A map that changes slowly in every direction."""
+    d = latlong_directions(height)
+    return (1.5 + d @ np.array([[0.5, 0.1, 0.0], [0.2, 0.6, 0.1], [0.3, 0.0, 0.7]])).astype(np.float32)
+
+
+def test_a_light_survives_its_file(tmp_path):
+    emitter = CapturedEmitter((0.0, 0.6, 0.8), 0.01, (1.0, 2.0, 3.0), (0.9, 1.9, 2.9), None, 1.5, (0.0, 0.0, 0.1))
+    light = dataclasses.replace(constant(0.5), emitters=(emitter,), exposure=0.02, lower_bound=0.125, white_level=1.0)
+    light.save(tmp_path / "deep" / "light.exr")
+    again = Light.load(tmp_path / "deep" / "light.exr")
+    assert (again.radiance == light.radiance).all()
+    assert (again.confidence == light.confidence).all()
+    assert again.emitters == light.emitters
+    assert again.exposure == pytest.approx(0.02)
+    assert (again.lower_bound, again.white_level) == (0.125, 1.0)
+    with OpenEXR.File(str(tmp_path / "deep" / "light.exr")) as file:
+        header = dict(file.header())
+    assert header["chromaticities"] == pytest.approx(REC_709)
+    assert "row 0 toward +z" in header["axes"]
+    assert json.loads(header["emitters"])[0]["power"] == [1.0, 2.0, 3.0]
+
+
+def test_somebody_elses_map_is_cleaned(tmp_path):
+    radiance = np.ones((4, 8, 3), np.float32)
+    radiance[0, 0], radiance[1, 1], radiance[2, 2] = np.nan, -5.0, np.inf
+    OpenEXR.File({}, {"RGB": radiance}).write(str(tmp_path / "a.exr"))
+    light = Light.load(tmp_path / "a.exr")
+    assert np.isfinite(light.radiance).all()
+    assert light.radiance.min() == 0.0
+    assert light.exposure is None
+
+
+@pytest.mark.parametrize(
+    ("channels", "attributes", "message"),
+    [
+        ({"Y": np.ones((4, 8), np.float32)}, {}, "R, G and B"),
+        ({"RGB": np.ones((4, 9, 3), np.float32)}, {}, "twice as wide"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": "[{}]"}, "emitters is damaged"),
+    ],
+)
+def test_files_that_are_no_light(tmp_path, channels, attributes, message):
+    OpenEXR.File(attributes, channels).write(str(tmp_path / "a.exr"))
+    with pytest.raises(SceneError, match=message):
+        Light.load(tmp_path / "a.exr")
+
+
+def test_turning_moves_what_is_seen_where_it_belongs():
+    light = Light(smooth(64), np.ones((64, 128), np.float32))
+    turn = rotation_matrix([20.0, -35.0, 110.0])
+    d = latlong_directions(32)
+    # What arrives from R d in the new axes arrived from d in the old ones.
+    wanted = 1.5 + (d @ turn) @ np.array([[0.5, 0.1, 0.0], [0.2, 0.6, 0.1], [0.3, 0.0, 0.7]])
+    # Bilinear in a map of 64 rows, and a mean of four places a texel: second order in 2.8 degrees.
+    assert np.abs(light.resampled(32, turn) - wanted).max() < 4e-3
+    assert (light.resampled(64) == light.radiance).all()
+
+
+def test_emitters_are_found_with_their_power_and_across_the_seam():
+    radiance = np.full((32, 64, 3), 0.1, np.float32)
+    radiance[10:12, [0, 1, 62, 63]] = 30.0
+    clipped = np.zeros_like(radiance)
+    area = texel_solid_angles(32)[10:12].sum() * 4
+    (found,) = find_emitters(radiance, clipped, 0.05)
+    assert found.power == pytest.approx((30 * area,) * 3, rel=1e-4)
+    assert found.solid_angle == pytest.approx(area, rel=1e-4)
+    assert found.direction[0] < -0.8
+    assert abs(found.direction[1]) < 1e-5
+    assert found.high == pytest.approx(tuple(1.05 * p for p in found.power), rel=1e-3)
+    clipped[10, 0] = 1.0
+    assert find_emitters(radiance, clipped, 0.05)[0].high is None
+
+
+def test_a_scene_of_captured_light_needs_neither_ball_nor_marker(tmp_path, device):
+    constant(0.4).save(tmp_path / "light.exr")
+    scene = loads_scene(SCENE, tmp_path / "scene.toml")
+    assert scene.captured.file == tmp_path / "light.exr"
+    assert not scene.has_marker
+    assert loads_scene(dumps_scene(scene), tmp_path / "scene.toml") == scene
+    plan = make_plan(Request(scene, PRESETS["medium"], (96, 72)))
+    names = [stage.name for stage, _ in plan.stages]
+    assert "captured" in names
+    assert {"unwrap", "accumulate", "fill", "recover"}.isdisjoint(names)
+    frame = np.full((72, 96, 3), 100, np.uint8)
+    with Pipeline(scene, device=device, quality="medium", outputs=("image", "environment")) as pipeline:
+        result = pipeline(frame)
+        image, environment = result.image, result.environment
+    assert np.allclose(environment, 0.4, atol=1e-6)
+    # A furnace: a Lambertian sphere in constant light shows that light times its reflectance.
+    top = image[25:30, 46:50].reshape(-1, 3) / 255
+    assert np.abs(top - 0.2).max() < 0.01
+    assert (image[2, 2] == 100).all()
+
+
+def test_scale_and_turn_are_the_scenes(tmp_path, device):
+    Light(smooth(64), np.ones((64, 128), np.float32)).save(tmp_path / "light.exr")
+    text = SCENE + "scale = 2.0\nrotate = [0.0, 0.0, 90.0]\n"
+    scene = loads_scene(text, tmp_path / "scene.toml")
+    with Pipeline(scene, device=device, quality="low", outputs=("environment",)) as pipeline:
+        environment = pipeline(np.zeros((72, 96, 3), np.uint8)).environment
+    wanted = 2.0 * Light.load(tmp_path / "light.exr").resampled(64, rotation_matrix([0.0, 0.0, 90.0]))
+    assert np.allclose(environment, wanted, rtol=1e-5)
+
+
+def test_a_light_replaces_what_a_ball_shows(tmp_path, device):
+    constant(0.25).save(tmp_path / "light.exr")
+    text = SCENE.split("[light]")[0] + "[probe]\ncenter = [0.1, 0.0, 0.04]\nradius = 0.04\n"
+    scene = with_light(loads_scene(text, tmp_path / "scene.toml"), tmp_path / "light.exr")
+    with Pipeline(scene, device=device, quality="medium", outputs=("image", "environment")) as pipeline:
+        result = pipeline(np.full((72, 96, 3), 30, np.uint8))
+        assert np.allclose(result.environment, 0.25, atol=1e-6)
+        assert result.image.shape == (72, 96, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('file = "light.exr"', 'file = "other.exr"'), r"light.file.*no such file"),
+        (('file = "light.exr"', 'file = "light.exr"\nscal = 1'), r"light.scal: unknown key"),
+        (("position", "R = [1,0,0,0,1,0,0,0,1]\nposition"), r"pose.position.*R is given too"),
+        (
+            ("position = [0.0, -0.5, 0.2]\nrotate = [-20.0, 0.0, 0.0]", "R = [1,0,0,0,2,0,0,0,1]\nt = [0,0,1]"),
+            "rotation matrix",
+        ),
+    ],
+)
+def test_errors_name_the_key(tmp_path, change, message):
+    constant(0.4).save(tmp_path / "light.exr")
+    with pytest.raises(SceneError, match=message):
+        loads_scene(SCENE.replace(*change), tmp_path / "scene.toml")
+
+
+def test_virtual_lights_stand_beside_a_captured_one(tmp_path):
+    constant(0.4).save(tmp_path / "light.exr")
+    text = SCENE.replace("[light]", "[[light]]") + '[[light]]\nkind = "point"\nat = [0, 0, 1]\nintensity = 1.0\n'
+    scene = loads_scene(text, tmp_path / "scene.toml")
+    assert scene.captured is not None
+    assert len(scene.lights) == 1
+    with pytest.raises(SceneError, match="one captured light"):
+        loads_scene(text + '[[light]]\nfile = "light.exr"\n', tmp_path / "scene.toml")

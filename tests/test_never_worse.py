@@ -1,0 +1,55 @@
+"""Recovered light is no worse than light as captured: a few of the random tables of ``bench.bench_never_worse``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bench.bench_never_worse import NO_WORSE, evaluate, summarise
+from bench.random_tables import make_setup
+from bench.table_world import FINE, Block, Bulb, World, latlong_directions
+
+SEEDS = (3, 4, 5, 8, 9, 10)
+"""Cards that are true, grey and absent, wrong responses, clutter and lamps."""
+FURNACE = 0.03
+"""2,048 directions for a cosine, a coarse bounce."""
+
+
+def test_the_renderer_lights_as_closed_forms_have_it():
+    """A uniform sky gives pi times the radiance; a lamp its intensity over the squared distance, or its shadow."""
+    sky = np.ones((*FINE, 3), np.float32)
+    table = np.full((64, 64, 3), 0.5, np.float32)
+    ball = (np.array([0.0, 0.0, 0.5]), 0.001, 0.9)
+    lamp = Bulb(np.array([0.3, 0.0, 1.0]), 0.01, np.full(3, 4e4))
+    up = np.array([0.0, 0.0, 1.0])
+    point = np.array([[0.3, 0.0, 1e-4], [0.3, 0.3, 1e-4]])
+    world = World(sky, ball, [], [], (table, np.ones(2)), None)
+    assert world.irradiance(point, up) == pytest.approx(np.pi, rel=FURNACE)
+    lit = World(sky, ball, [], [lamp], (table, np.ones(2)), None).irradiance(point, up) - world.irradiance(point, up)
+    intensity = np.pi * 0.01**2 * 4e4
+    assert lit[0] == pytest.approx(intensity, rel=1e-3)
+    assert lit[1] == pytest.approx(intensity / 1.09**1.5, rel=1e-3)
+    roof = Block(np.array([0.3, 0.0, 0.5]), np.array([0.1, 0.1, 0.1]), 0.0, np.zeros(3), modelled=False)
+    dark = World(sky, ball, [roof], [lamp], (table, np.ones(2)), None).irradiance(point[:1], up)
+    assert (dark < np.pi).all()
+    # The table as the camera sees it.
+    seen = world.trace(np.array([0.3, 0.0, 1.0]), -up[None])
+    assert seen == pytest.approx(0.5, rel=FURNACE)
+    d, area = latlong_directions(*FINE)
+    assert area.sum() == pytest.approx(4.0 * np.pi, rel=1e-4)
+    assert np.linalg.norm(d, axis=-1) == pytest.approx(1.0)
+
+
+def test_set_ups_are_the_same_every_time():
+    first, again = make_setup(5), make_setup(5)
+    assert np.array_equal(first.image, again.image)
+    assert first.scene == again.scene
+
+
+def test_recovered_light_is_no_worse_than_captured():
+    outcomes = [evaluate(make_setup(seed)) for seed in SEEDS]
+    for seed, outcome in zip(SEEDS, outcomes, strict=True):
+        assert outcome.ratio <= NO_WORSE, seed
+    summary = summarise(outcomes)
+    # And is worth its while: nothing at all would be no worse either.
+    assert summary["error_recovered"] < 0.95 * summary["error_clipped"]

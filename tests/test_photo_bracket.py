@@ -1,0 +1,120 @@
+"""Brackets of photographs: alignment, exposures against pixels, the response."""
+
+import itertools
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.photo_room import exposed, photograph, sphere
+from warp_ar.errors import UsageError
+from warp_ar.input.ball_finder import silhouette
+from warp_ar.input.bracket import MOVED, agree_exposures, align, register, thin_exposures
+from warp_ar.kernels.color import decode_table
+
+TENTH = 0.1
+"""Pixels: what alignment is asked for."""
+
+
+def circle():
+    points, _ = silhouette(photograph()[1], sphere())
+    middle = points.mean(0)
+    return (*middle, float(np.linalg.norm(points - middle, axis=1).mean()))
+
+
+def shifted(codes, dx, dy):
+    matrix = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]])
+    return cv2.warpAffine(codes.astype(np.uint8), matrix, codes.shape[1::-1], flags=cv2.INTER_CUBIC)
+
+
+def patches(denominators, curve=None):
+    images = [exposed(d, curve=curve).astype(np.uint8) for d in denominators]
+    return align(images, [circle()] * len(images)).patches
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.4, -0.3), (2.6, 1.2)])
+def test_exposures_are_aligned_to_a_tenth_of_a_pixel(dx, dy):
+    long, short = exposed(30).astype(np.uint8), shifted(exposed(120), dx, dy)
+    found = align([long, short], [circle()] * 2)
+    assert np.abs(np.array(found.circles[1][:2]) - found.circles[0][:2] - (dx, dy)).max() < TENTH
+    assert abs(found.circles[1][2] - found.circles[0][2]) < TENTH
+    assert found.correlation[1] > 0.9
+
+
+def test_another_scene_does_not_correlate():
+    long = exposed(30).astype(np.uint8)
+    turned = np.ascontiguousarray(long[::-1])
+    x, y, r = circle()
+    found = align([long, turned], [(x, y, r), (x, long.shape[0] - 1 - y, r)])
+    assert found.correlation[1] < MOVED
+    black = np.zeros((40, 40, 3), np.uint8)
+    assert math.isnan(register(long[:40, :40], black, np.ones((40, 40), bool))[1])
+
+
+BRACKET = (15, 60, 250, 1000)
+TRUE = [1 / d for d in BRACKET]
+
+
+def test_true_exposures_and_srgb_are_confirmed():
+    agreed = agree_exposures(patches(BRACKET), "srgb", TRUE, None)
+    assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE])
+    assert agreed.curve is None
+    assert agreed.notes == ()
+
+
+def test_lying_exposures_are_refused_with_all_three_figures():
+    lying, names = [1.0, 0.8, 0.7, 0.5], [1.0, 1 / 9, 1 / 81, 1 / 729]
+    with pytest.raises(UsageError) as caught:
+        agree_exposures(patches(BRACKET), "srgb", lying, names)
+    message = str(caught.value)
+    for figure in ("EXIF says 2", "names say 729", "pixels say"):
+        assert figure in message
+    assert "--exposures" in message
+
+
+def test_names_that_the_pixels_confirm_beat_exif():
+    agreed = agree_exposures(patches(BRACKET), "srgb", [1.0, 0.8, 0.7, 0.5], TRUE)
+    assert agreed.ratios == pytest.approx([t / TRUE[0] for t in TRUE])
+    assert "names" in agreed.notes[0]
+
+
+def test_equal_pictures_contradict_unequal_exposures_under_every_response():
+    images = patches((15, 60, 60, 250))
+    with pytest.raises(UsageError, match=r"no response explains"):
+        agree_exposures(images, "srgb", [1.0, 0.25, 0.0625, 0.015], None)
+
+
+def s_curve(light):
+    """A camera's: sRGB with more contrast in the middle, darks three times darker."""
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    return code + 0.9 * code * (1 - code) * (code - 0.45)
+
+
+def test_a_response_is_estimated_where_srgb_does_not_hold():
+    bracket = (15, 30, 60, 125, 250, 500)
+    agreed = agree_exposures(patches(bracket, s_curve), "srgb", [1 / d for d in bracket], None)
+    assert agreed.curve is not None
+    assert "response is not srgb" in agreed.notes[0]
+    grid = np.linspace(0, 1, 20001)
+    truth = np.interp(np.arange(40, 230) / 255, s_curve(grid), grid)
+    scale = np.median(truth / agreed.curve[40:230, 1])
+    error = np.abs(np.log(scale * agreed.curve[40:230, 1] / truth))
+    by_srgb = decode_table("srgb")[40:230, 1]
+    before = np.abs(np.log(np.median(truth / by_srgb) * by_srgb / truth))
+    # Eight numbers describe the curve; 12 % at its worst place is a third of what sRGB errs.
+    assert error.max() < min(0.12, 0.5 * before.max())
+
+
+def test_without_any_claim_the_pixels_decide():
+    agreed = agree_exposures(patches(BRACKET), "srgb", None, None)
+    steps = [b / a for a, b in itertools.pairwise(agreed.ratios)]
+    assert steps == pytest.approx([0.25, 0.24, 0.25], rel=0.1)
+    assert "pixels alone" in agreed.notes[0]
+
+
+def test_near_exposures_are_left_out_and_said():
+    kept, notes = thin_exposures([1.0, 0.97, 0.3, 0.05], 1)
+    assert kept == (1, 2, 3)
+    assert "left out" in notes[0]
+    assert thin_exposures([1.0, 0.8, 0.63], 0)[0] == (0, 1, 2)  # thirds of a stop

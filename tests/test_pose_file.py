@@ -1,0 +1,123 @@
+"""Poses without a marker: conventions, files, and the plane under a ball."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.photo_room import ROOM, photograph, project, sphere
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SceneError, UsageError
+from warp_ar.input.support import plane_from_contact, plane_from_rectangle
+from warp_ar.scene import dumps_scene, loads_scene
+from warp_ar.scene.pose_file import load_poses, pose_of_position, rotation_of_quaternion
+
+HEAD = """schema = 1
+[camera]
+width = 8
+height = 6
+fx = 8.0
+fy = 8.0
+cx = 3.5
+cy = 2.5
+[pose]
+"""
+
+
+def pose_of(text):
+    rotation, translation = loads_scene(HEAD + text).pose.at(0)
+    return rotation, translation
+
+
+def test_all_conventions_say_the_same():
+    rotation = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0]
+    translation = np.array([0.1, 0.2, 0.9])
+    angle = np.linalg.norm([0.3, -0.2, 0.5])
+    axis = np.array([0.3, -0.2, 0.5]) / angle
+    quaternion = [float(np.cos(angle / 2)), *(np.sin(angle / 2) * axis).tolist()]
+    for text in (
+        f"R = {rotation.reshape(-1).tolist()}\nt = {translation.tolist()}",
+        f"quaternion = {[3 * q for q in quaternion]}\nt = {translation.tolist()}",
+    ):
+        found = pose_of(text)
+        assert np.allclose(found[0], rotation, atol=1e-12)
+        assert np.allclose(found[1], translation)
+    assert np.allclose(np.array(rotation_of_quaternion(*quaternion)).reshape(3, 3), rotation)
+
+
+def test_a_position_is_where_the_camera_stands():
+    rotation, translation = pose_of("position = [0.1, -0.5, 0.2]\nrotate = [-30.0, 0.0, 0.0]")
+    assert np.allclose(-rotation.T @ translation, [0.1, -0.5, 0.2])
+    # Unturned it looks along +y, upright; turned by -30 degrees about x, 30 degrees down.
+    assert np.allclose(rotation.T @ [0, 0, 1], [0, np.cos(np.pi / 6), -0.5])
+    assert np.allclose(rotation.T @ [1, 0, 0], [1, 0, 0])
+    level, _ = pose_of_position((0, 0, 0), (0, 0, 0))
+    assert np.allclose(np.array(level).reshape(3, 3).T @ [0, 1, 0], [0, 0, -1])
+
+
+COLMAP = """# Image list
+2 1 0 0 0 0.2 0 1 1 b.png
+1 2 3
+1 0.7071067811865476 0 0 0.7071067811865476 0.1 0 1 1 a.png
+"""
+
+
+def test_poses_of_a_clip(tmp_path):
+    (tmp_path / "images.txt").write_text(COLMAP)
+    scene = loads_scene(HEAD + 'file = "images.txt"\n', tmp_path / "scene.toml")
+    assert len(scene.pose.poses) == 2
+    assert scene.pose.at(0)[1][0] == 0.1  # by name, not by number
+    assert np.allclose(scene.pose.at(0)[0], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert scene.pose.at(3)[1][0] == 0.2  # a looped clip begins again
+    assert loads_scene(dumps_scene(scene), tmp_path / "scene.toml") == scene
+    entries = [{"R": np.eye(3).tolist(), "t": [0, 0, 1]}, {"R": list(range(9)), "t": [0, 0, 1]}]
+    (tmp_path / "poses.json").write_text(json.dumps(entries[:1]))
+    assert load_poses(tmp_path / "poses.json")[0][1] == (0.0, 0.0, 1.0)
+    (tmp_path / "poses.json").write_text(json.dumps(entries))
+    with pytest.raises(SceneError, match="pose 1: expected R, a rotation matrix"):
+        load_poses(tmp_path / "poses.json")
+    (tmp_path / "images.txt").write_text("1 0 0 0 0 0 0 1 1 a.png\n")
+    with pytest.raises(SceneError, match="QW QX QY QZ"):
+        load_poses(tmp_path / "images.txt")
+
+
+def test_frames_take_their_poses_in_turn(tmp_path, device):
+    (tmp_path / "images.txt").write_text(COLMAP)
+    scene = loads_scene(HEAD + 'file = "images.txt"\n', tmp_path / "scene.toml")
+    with Pipeline(scene, device=device, quality="low", outputs=("pose", "image")) as pipeline:
+        shifts = [pipeline(np.zeros((6, 8, 3), np.uint8)).pose.translation[0] for _ in range(3)]
+    assert shifts == [0.1, 0.2, 0.1]
+
+
+def normal_error(rotation):
+    """Degrees between a plane's normal and the table's."""
+    true = photograph()[2][:, 2]
+    return np.degrees(np.arccos(np.clip(rotation[:, 2] @ true, -1, 1)))
+
+
+def test_the_plane_by_a_rectangle():
+    corners = [project([x, y, 0.0]) for x, y in ((-0.1, -0.07), (0.1, -0.07), (0.1, 0.07), (-0.1, 0.07))]
+    camera = photograph()[1]
+    for order in (corners, corners[::-1]):
+        found = plane_from_rectangle(camera, [list(p) for p in order], (0.2, 0.14))
+        assert normal_error(found.pose.rotation) < 1e-3
+        assert np.linalg.det(found.pose.rotation) == pytest.approx(1.0)
+        assert np.allclose(found.pose.translation, photograph()[3], atol=1e-6)
+    moved = [list(p + np.array([0.7, -0.7])) for p in corners[:2]] + [list(p) for p in corners[2:]]
+    found = plane_from_rectangle(camera, moved, (0.2, 0.14))
+    assert normal_error(found.pose.rotation) < 4 * found.tilt_deviation
+    with pytest.raises(UsageError, match="span an area"):
+        plane_from_rectangle(camera, [[0, 0], [1, 1], [2, 2], [3, 3]], (0.2, 0.14))
+
+
+def test_the_plane_by_the_balls_contact():
+    camera = photograph()[1]
+    contact = project([0.0, 0.0, 0.0])
+    exact = plane_from_contact(sphere(), camera, contact, ROOM.radius)
+    assert normal_error(exact.pose.rotation) < 1e-3
+    assert np.allclose(exact.pose.translation, photograph()[3], atol=1e-6)
+    off = plane_from_contact(sphere(), camera, contact + np.array([2.0, 0.0]), ROOM.radius, picked=2.0)
+    assert 0.5 < normal_error(off.pose.rotation) < 1.5 * off.tilt_deviation
+    with pytest.raises(UsageError, match="not on the ball"):
+        plane_from_contact(sphere(), camera, (1.0, 1.0))

@@ -1,0 +1,259 @@
+"""Captured light: an environment that is kept in a file, and lights other pictures than the one it was captured from.
+
+The file is an OpenEXR latlong: channels R, G, B (linear, in camera values of the exposure that was shown: 1 clips) and
+``confidence`` (0 where nothing was seen and neighbours filled in, to 1). Attributes say how to read it: ``axes``,
+``chromaticities``, ``whiteLevel`` (the value at which the capture's camera clipped), ``exposure`` (t ISO / (100 N^2), 0
+if not known), ``lowerBound`` (the share of the light that is a lower bound, because even the shortest exposure clips)
+and ``emitters``, JSON. A file without them is an environment of somebody else's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.files import is_file, limits, too_much, write_whole
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+
+AXES = "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y"
+REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities of red, green, blue and white that sRGB's primaries have."""
+BRIGHT = 6.0
+"""Times the mean radiance from which on a texel is part of an emitter."""
+MOST_EMITTERS = 12
+LEAST_SHARE = 0.01
+"""Of the irradiance that all directions bring, what an emitter must have to be listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CapturedEmitter:
+    """A bright source in captured light, which the map holds as well."""
+
+    direction: tuple[float, float, float]
+    """Unit, from the ball's centre."""
+    solid_angle: float
+    """Steradians."""
+    power: tuple[float, float, float]
+    """Radiance times solid angle, RGB."""
+    low: tuple[float, float, float]
+    """Lower end of the interval that holds its power."""
+    high: tuple[float, float, float] | None
+    """Upper end; None where it clips in every exposure."""
+    distance: float | None = None
+    """Metres from ``origin``; None: as distant as the environment."""
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where direction and distance count from, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Light:
+    """Light of an environment, with what is known of how far it holds."""
+
+    radiance: Map
+    """Linear RGB, float32 (height, 2 height, 3), in camera values of the exposure that was shown."""
+    confidence: Map
+    """0 to 1, float32 (height, 2 height)."""
+    emitters: tuple[CapturedEmitter, ...] = ()
+    """Bright sources, most powerful first."""
+    white_level: float = 1.0
+    """Value at which the capture's camera clipped."""
+    exposure: float | None = None
+    """t ISO / (100 N^2) of the exposure that was shown, if known."""
+    lower_bound: float = 0.0
+    """Share of the light that is a lower bound, 0 to 1."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the light as OpenEXR.
+
+        Raises:
+            SinkError: The file cannot be written.
+        """
+        path = Path(path)
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "software": "warp_ar",
+            "axes": AXES,
+            "chromaticities": REC_709,
+            "whiteLevel": float(self.white_level),
+            "exposure": float(self.exposure or 0.0),
+            "lowerBound": float(self.lower_bound),
+            "emitters": json.dumps([dataclasses.asdict(emitter) for emitter in self.emitters]),
+        }
+        channels = {"RGB": np.ascontiguousarray(self.radiance), "confidence": np.ascontiguousarray(self.confidence)}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, lambda part: OpenEXR.File(header, channels).write(str(part)))
+        except (RuntimeError, OSError) as error:
+            raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Light:
+        """Read a captured light, or any latlong OpenEXR with channels R, G and B.
+
+        Raises:
+            SceneError: The file cannot be used.
+        """
+        path = Path(path)
+        header, channels = _read_exr(path)
+        if "RGB" not in channels and "RGBA" in channels:
+            channels["RGB"] = channels["RGBA"][..., :3]
+        if "RGB" not in channels and {"R", "G", "B"} <= channels.keys():
+            channels["RGB"] = np.stack([channels[name] for name in "RGB"], -1)
+        if "RGB" not in channels:
+            raise SceneError(f"{path} has channels {', '.join(channels)}; R, G and B are needed")
+        radiance = np.ascontiguousarray(channels["RGB"], np.float32)
+        height, width = radiance.shape[:2]
+        if width != 2 * height or height < 2:
+            raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
+        # Maps in the wild hold negative pixels, infinities and NaN.
+        radiance = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6, neginf=0.0), 0.0, 1e6)
+        confidence = channels.get("confidence", np.ones((height, width), np.float32))
+        return cls(
+            radiance,
+            np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32),
+            _parse_emitters(path, header.get("emitters", "[]")),
+            float(header.get("whiteLevel", 1.0)),
+            float(header.get("exposure", 0.0)) or None,
+            float(header.get("lowerBound", 0.0)),
+        )
+
+    def resampled(self, height: int, rotation: Array | None = None) -> Map:
+        """The map at another size and turned, (height, 2 height, 3).
+
+        Args:
+            height: Rows.
+            rotation: From the light's axes to those of the result, (3, 3).
+        """
+        source = self.radiance
+        if source.shape[0] > height:
+            source = cv2.resize(source, (2 * height, height), interpolation=cv2.INTER_AREA)
+        if rotation is None or np.allclose(rotation, np.eye(3)):
+            if source.shape[0] == height:
+                return np.ascontiguousarray(source)
+            rotation = np.eye(3)
+        rows, columns = source.shape[:2]
+        # Beyond a pole lies its other side, beyond the right edge the left one.
+        poles = [np.roll(source[row : row + 1], columns // 2, 1) for row in (0, rows - 1)]
+        wide = np.concatenate([poles[0], source, poles[1]], 0)
+        wide = np.concatenate([wide[:, -1:], wide, wide[:, :2]], 1)
+        total = np.zeros((height, 2 * height, 3), np.float32)
+        for dy in (0.25, 0.75):
+            for dx in (0.25, 0.75):
+                d = latlong_directions(height, dy, dx) @ rotation  # the inverse: rotation^T d
+                y = np.arccos(np.clip(d[..., 2], -1.0, 1.0)) / math.pi * rows - 0.5
+                x = (np.arctan2(d[..., 1], d[..., 0]) / (2 * math.pi) + 0.5) * columns - 0.5
+                total += cv2.remap(
+                    wide, (np.mod(x, columns) + 1.0).astype(np.float32), (y + 1.0).astype(np.float32), cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE,
+                )  # fmt: skip
+        return np.ascontiguousarray(total / 4.0)
+
+
+def latlong_directions(height: int, dy: float = 0.5, dx: float = 0.5) -> Array:
+    """Unit directions (height, 2 height, 3) at a place within each texel."""
+    theta = (np.arange(height) + dy)[:, None] * (math.pi / height)
+    phi = (np.arange(2 * height) + dx)[None, :] * (math.pi / height) - math.pi
+    s = np.sin(theta)
+    return np.stack([s * np.cos(phi), s * np.sin(phi), np.cos(theta) + 0.0 * phi], -1)
+
+
+def texel_solid_angles(height: int) -> Array:
+    """Steradians of the texels of each row, (height, 1)."""
+    edges = np.cos(np.arange(height + 1) * math.pi / height)
+    return np.asarray((edges[:-1] - edges[1:])[:, None] * (math.pi / height))
+
+
+def find_emitters(radiance: Map, clipped: Map, error: float) -> tuple[CapturedEmitter, ...]:
+    """Bright sources of a map, by what they bring.
+
+    Args:
+        radiance: (height, 2 height, 3).
+        clipped: Share that clips in every exposure, of the same shape.
+        error: Relative error of what does not clip.
+    """
+    height = len(radiance)
+    area = np.broadcast_to(texel_solid_angles(height), radiance.shape[:2])
+    gray = radiance.mean(2)
+    total = float((gray * area).sum())
+    bright = (gray > BRIGHT * total / (4 * math.pi)) | (clipped.max(2) > 0.5)
+    count, labels = cv2.connectedComponents(bright.astype(np.uint8), connectivity=8)
+    # The map's left and right edges are one.
+    for a, b in zip(labels[:, 0], labels[:, -1], strict=True):
+        if a and b and a != b:
+            labels[labels == b] = a
+    directions = latlong_directions(height)
+    found = []
+    for label in range(1, count):
+        inside = labels == label
+        light = radiance[inside] * area[inside][:, None]
+        power = light.sum(0).astype(float)
+        if not power.any() or power.mean() < LEAST_SHARE * total:
+            continue
+        toward = (directions[inside] * light.mean(1)[:, None]).sum(0)
+        toward /= max(float(np.linalg.norm(toward)), 1e-12)
+        clips = clipped[inside].max() > 0.0
+        found.append(
+            CapturedEmitter(
+                _triple(toward),
+                float(area[inside].sum()),
+                _triple(power),
+                _triple(power * (1 - error)),
+                None if clips else _triple(power * (1 + error)),
+            )
+        )
+    return tuple(sorted(found, key=lambda emitter: -sum(emitter.power))[:MOST_EMITTERS])
+
+
+def _triple(values: Sequence[float] | Array) -> tuple[float, float, float]:
+    x, y, z = (round(float(v), 6) for v in values)
+    return x, y, z
+
+
+def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Map]]:
+    if not is_file(path):
+        raise SceneError(f"there is no file {path}; a captured light is an OpenEXR file")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+        width, height = (int(side) for side in high - low + 1)
+        if width * height > limits().picture_pixels:
+            raise SceneError(too_much(f"{path} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
+        with OpenEXR.File(str(path)) as file:
+            header = dict(file.header())
+            return header, {name: np.array(c.pixels, np.float32) for name, c in file.channels().items()}
+    except (RuntimeError, OSError, ValueError) as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(f"{path} cannot be read as OpenEXR: {reason(error)}") from error
+
+
+def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
+    try:
+        entries = json.loads(str(text))
+        return tuple(
+            CapturedEmitter(
+                _triple(entry["direction"]),
+                float(entry["solid_angle"]),
+                _triple(entry["power"]),
+                _triple(entry["low"]),
+                None if entry["high"] is None else _triple(entry["high"]),
+                None if entry["distance"] is None else float(entry["distance"]),
+                _triple(entry["origin"]),
+            )
+            for entry in entries
+        )
+    except (ValueError, TypeError, KeyError) as error:
+        raise SceneError(f"{path}: its attribute emitters is damaged: {reason(error)}") from error

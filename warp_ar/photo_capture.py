@@ -1,0 +1,300 @@
+"""From photographs of a mirror ball, without a marker, to captured light."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import UsageError
+from warp_ar.input.ball_finder import BallOutline, far_camera, find_ball, sphere_of_circle
+from warp_ar.input.bracket import MOVED, Aligned, Circle, agree_exposures, align, thin_exposures
+from warp_ar.input.photographs import Photograph, exposures_by_exif, exposures_by_name, read_photograph
+from warp_ar.input.response import write_response
+from warp_ar.input.support import Support
+from warp_ar.light.captured import Light, find_emitters, texel_solid_angles
+from warp_ar.scene import Camera, Pose, Probe, Scene
+from warp_ar.scene.pose_file import pose_of_position
+from warp_ar.stages.quality import PRESETS
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+HEIGHT = 128
+"""Rows of the environment."""
+WINDOW = 1.25
+"""Half side, in radii, of the part of a photograph that is unwrapped."""
+LARGEST = 560.0
+"""Pixels of a ball's radius beyond which photographs are reduced: the map has no use for more."""
+BRACKET_ERROR = 0.05
+"""Relative error of merged radiance: what a response that was estimated or assumed leaves."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Capture:
+    """Captured light, and how it came about."""
+
+    light: Light
+    """The light, in axes whose z is up where the camera was level."""
+    outline: BallOutline
+    """The ball in the photograph that was shown."""
+    shown: Path
+    """That photograph."""
+    camera: Camera
+    """Of that photograph."""
+    support: Support | None
+    """The plane that the ball stands on, where it was asked for."""
+    notes: tuple[str, ...]
+    """What a user should know, a line each."""
+
+
+def capture_light(
+    paths: Sequence[str | Path],
+    *,
+    ball: Sequence[float] | None = None,
+    exposures: Sequence[float] | None = None,
+    shown: int | None = None,
+    transfer: str = "srgb",
+    focal_35mm: float | None = None,
+    support: Callable[[BallOutline, Camera], Support] | None = None,
+    reflectance: float = 0.85,
+    device: str = "auto",
+    height: int = HEIGHT,
+) -> Capture:
+    """Capture the light that a mirror ball shows in one photograph or a bracket of them.
+
+    Args:
+        paths: Photographs of the ball, from one place, at one or more exposures.
+        ball: Column, row and radius in pixels of a rough circle around the ball in the shown photograph; None: look
+            for it.
+        exposures: Seconds of each photograph, instead of what EXIF or names say.
+        shown: Which photograph's camera values the light is in; None: the one whose ball is best exposed.
+        transfer: Response that is tried first.
+        focal_35mm: Focal length for a full frame in millimetres; None: by EXIF.
+        support: Finds the plane that the ball stands on, whose axes the light then has; None: a level camera's.
+        reflectance: Of the ball.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        height: Rows of the map.
+
+    Raises:
+        SourceError: A photograph cannot be read.
+        UsageError: Exposures contradict each other, or no ball is found.
+    """
+    if not paths:
+        raise UsageError("no photographs; expected one or more of a mirror ball")
+    photos = [read_photograph(path) for path in paths]
+    if exposures is not None and len(exposures) != len(photos):
+        raise UsageError(f"{len(exposures)} exposures for {len(photos)} photographs; expected one for each")
+    if shown is not None and not 0 <= shown < len(photos):
+        raise UsageError(f"shown = {shown}: expected the number of a photograph, 0 to {len(photos) - 1}")
+    reference = photos[shown] if shown is not None else photos[_best_exposed(photos)]
+    camera, notes = _camera_of(reference, transfer, focal_35mm)
+    outline = find_ball(reference.image, camera, ball)
+    bracket = _merge_plan(photos, reference, outline, transfer, exposures)
+    notes += [*bracket.notes, _describe_outline(outline)]
+    found = None if support is None else support(outline, camera)
+    turn = np.array(pose_of_position((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0]).reshape(3, 3)
+    if found is not None:
+        turn = found.pose.rotation
+        notes.append(f"the support's normal is known within {found.tilt_deviation:.1f} degrees")
+    light, more = _unwrap(bracket, reference, camera, outline, turn, reflectance, device, height)
+    light = dataclasses.replace(light, exposure=reference.info.exposure)
+    return Capture(light, outline, reference.path, camera, found, (*notes, *more))
+
+
+def _best_exposed(photos: Sequence[Photograph]) -> int:
+    """The photograph with the most pixels between dark and clipping, in its middle."""
+
+    def share(photo: Photograph) -> float:
+        h, w = photo.image.shape[:2]
+        middle = photo.image[h // 8 : -h // 8 : 8, w // 8 : -w // 8 : 8].max(2)
+        return float(((middle > 30) & (middle < 245)).mean())
+
+    return max(range(len(photos)), key=lambda k: share(photos[k]))
+
+
+def _camera_of(photo: Photograph, transfer: str, focal_35mm: float | None) -> tuple[Camera, list[str]]:
+    info = (
+        photo.info if focal_35mm is None else dataclasses.replace(photo.info, focal_35mm=focal_35mm, focal_pixels=None)
+    )
+    camera = info.camera(transfer)
+    if camera is not None:
+        return camera, []
+    why = "has no focal length in its EXIF" if info.is_whole else "was cut, so that EXIF's focal length says nothing"
+    note = f"{photo.name} {why}: the ball is taken to be far away (--focal-35mm tells otherwise)"
+    return dataclasses.replace(far_camera(info.width, info.height), transfer=transfer), [note]
+
+
+def _describe_outline(outline: BallOutline) -> str:
+    (x, y), (dx, dy, dr) = outline.center, outline.deviation
+    return (
+        f"ball at ({x:.1f}, {y:.1f}) +/- {max(dx, dy):.2f}, radius {outline.radius:.1f} +/- {dr:.2f} pixels, "
+        f"{outline.support:.0%} of its rim seen"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Bracket:
+    """Photographs to merge, longest exposure first."""
+
+    photos: tuple[Photograph, ...]
+    circles: tuple[Circle, ...]
+    ratios: tuple[float, ...]
+    curve: Array | None
+    notes: tuple[str, ...]
+
+
+def _merge_plan(
+    photos: Sequence[Photograph],
+    reference: Photograph,
+    outline: BallOutline,
+    transfer: str,
+    given: Sequence[float] | None,
+) -> _Bracket:
+    """Which photographs to merge, where the ball is in them, and their exposures."""
+    circle = (*outline.center, outline.radius)
+    if len(photos) == 1:
+        return _Bracket((reference,), (circle,), (1.0,), None, ())
+    exif, names = exposures_by_exif(photos), exposures_by_name(photos)
+    claims = {"given": given, "exif": exif, "names": names}
+    # Brightness tells the order even where claims contradict each other.
+    order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
+    chosen = [photos[k] for k in order]
+    aligned = _align_all(chosen, chosen.index(reference), circle)
+    moved = [k for k, c in enumerate(aligned.correlation) if math.isfinite(c) and c < MOVED]
+    notes = [
+        f"{chosen[k].name} is left out: it shows something else ({aligned.correlation[k]:.0%} alike)" for k in moved
+    ]
+    notes += _shift_notes(chosen, aligned, circle)
+    stay = [k for k in range(len(chosen)) if k not in moved]
+    picked = {name: None if claim is None else [claim[order[k]] for k in stay] for name, claim in claims.items()}
+    agreed = agree_exposures(
+        [aligned.patches[k] for k in stay], transfer, picked["exif"], picked["names"], picked["given"]
+    )
+    first = [chosen[k] for k in stay].index(reference)
+    kept, more = thin_exposures(agreed.ratios, first)
+    return _Bracket(
+        tuple(chosen[stay[k]] for k in kept),
+        tuple(aligned.circles[stay[k]] for k in kept),
+        tuple(agreed.ratios[k] for k in kept),
+        agreed.curve,
+        (*notes, *agreed.notes, *more),
+    )
+
+
+def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle) -> Aligned:
+    """Align outward from the reference, to both sides."""
+    h, w = photos[reference].image.shape[:2]
+
+    def rough(photo: Photograph) -> Circle:
+        """Where the ball is in a picture of another size: cut differently around it, at about the same share."""
+        sy, sx = photo.image.shape[0] / h, photo.image.shape[1] / w
+        return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
+
+    down = align([photo.image for photo in photos[reference:]], [rough(photo) for photo in photos[reference:]])
+    up = align([photo.image for photo in photos[reference::-1]], [rough(photo) for photo in photos[reference::-1]])
+    return Aligned(
+        up.circles[:0:-1] + down.circles, up.patches[:0:-1] + down.patches, up.correlation[:0:-1] + down.correlation
+    )
+
+
+def _shift_notes(photos: Sequence[Photograph], aligned: Aligned, circle: Circle) -> list[str]:
+    shape = next(photo.image.shape for photo, found in zip(photos, aligned.circles, strict=True) if found == circle)
+    shifts = [
+        math.hypot(found[0] - circle[0], found[1] - circle[1])
+        for photo, found in zip(photos, aligned.circles, strict=True)
+        if photo.image.shape == shape
+    ]
+    most = max(shifts, default=0.0)
+    return [f"photographs lie up to {most:.1f} pixels apart at the ball; they were aligned"] if most > 0.5 else []
+
+
+def _unwrap(
+    bracket: _Bracket,
+    reference: Photograph,
+    camera: Camera,
+    outline: BallOutline,
+    turn: Array,
+    reflectance: float,
+    device: str,
+    height: int,
+) -> tuple[Light, list[str]]:
+    """The merged map of all photographs, by the pipeline that lights frames."""
+    index = bracket.photos.index(reference)
+    own = bracket.circles[index]
+    half = math.ceil(WINDOW * own[2])
+    x0, y0 = round(own[0]) - half, round(own[1]) - half
+    side = 2 * half + 1
+    window = dataclasses.replace(camera, width=side, height=side, cx=camera.cx - x0, cy=camera.cy - y0)
+    sphere = np.array(outline.sphere)
+    with tempfile.TemporaryDirectory() as folder:
+        if bracket.curve is not None:
+            response = Path(folder) / "response.txt"
+            write_response(bracket.curve, response)
+            window = dataclasses.replace(window, transfer=response)
+        scene = Scene(
+            camera=window,
+            probes=(Probe((0.0, 0.0, 0.0), 1.0, (reflectance,) * 3),),
+            has_marker=False,
+            name=reference.name,
+        )
+        times = tuple(bracket.ratios)
+        quality = dataclasses.replace(PRESETS["medium"], name="custom", environment_height=height)
+        pipeline = Pipeline(
+            scene,
+            device=device,
+            quality=quality,
+            outputs=("environment",),
+            exposures=times if len(times) > 1 else (),
+            shown=times[index] if len(times) > 1 else None,
+            synchronous=True,
+        )
+    with pipeline:
+        order = [*(k for k in range(len(times)) if k != index), index]
+        for k in order:
+            image, pose = _place(bracket, k, own, (x0, y0, side), camera, sphere, turn)
+            result = pipeline(image, time_seconds=0.0, pose=pose, exposure_time=times[k])
+        radiance = result.environment
+        assert radiance is not None
+        confidence = np.array(pipeline.arrays["environment_confidence"].numpy())
+        clipped = np.array(pipeline.arrays["environment_clipped"].numpy())
+        left_out = pipeline.bracket.notes
+    area = texel_solid_angles(height)
+    share = float((radiance * clipped * area[..., None]).sum() / max(float((radiance * area[..., None]).sum()), 1e-12))
+    notes = list(left_out)
+    if share > 0.0:
+        what = "the shortest exposure" if len(times) > 1 else "the photograph"
+        notes.append(f"{what} still clips: {share:.1%} of the light is a lower bound")
+    return Light(radiance, confidence, find_emitters(radiance, clipped, BRACKET_ERROR), 1.0, None, share), notes
+
+
+def _place(
+    bracket: _Bracket,
+    k: int,
+    own: Circle,
+    window: tuple[int, int, int],
+    camera: Camera,
+    sphere: Array,
+    turn: Array,
+) -> tuple[Image, Pose]:
+    """The window of a photograph about its ball, and the pose that puts the ball there.
+
+    Shifts of a photograph against the shown one become shifts of the ball before the camera: no pixel is resampled.
+    """
+    x0, y0, side = window
+    x, y, radius = bracket.circles[k]
+    dx, dy = round(x - own[0]), round(y - own[1])
+    image = bracket.photos[k].image
+    h, w = image.shape[:2]
+    rows = np.clip(np.arange(y0 + dy, y0 + dy + side), 0, h - 1)
+    columns = np.clip(np.arange(x0 + dx, x0 + dx + side), 0, w - 1)
+    cut = np.ascontiguousarray(image[rows[:, None], columns])
+    moved = sphere_of_circle(camera, x - dx, y - dy, radius) - sphere_of_circle(camera, *own)
+    center = sphere + moved
+    return cut, Pose(turn, center)

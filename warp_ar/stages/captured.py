@@ -1,0 +1,54 @@
+"""The environment from a file instead of from a ball in the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.light.captured import Light
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+
+
+class Captured(Stage):
+    """The light of a file, at the quality's size and in the scene's axes; it runs once."""
+
+    name: ClassVar[str] = "captured"
+    summary: ClassVar[str] = "reads the environment from a file"
+    unread: ClassVar[str] = "nothing asks for the environment"
+    settings: ClassVar[tuple[str, ...]] = ("environment_height",)
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; four bilinear samples a texel where the light is turned",
+        bound=0.0,
+        cause="a copy where it is neither turned nor resized",
+        measured=0.0,
+        rows=(4, 6),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Needs a file."""
+        if features.request.scene.captured is None:
+            return LeftOut("the scene names no captured light")
+        return Wiring(("captured_light",), ("environment",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The map."""
+        height = self.request.quality.environment_height
+        return {"environment": ArraySpec((height, 2 * height), wp.vec3)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """Copy what was read; reading it is done here, once."""
+        spec = self.request.scene.captured
+        assert spec is not None
+        light = Light.load(spec.file)
+        turn = rotation_matrix(spec.rotate)
+        radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
+
+        def copy(rows: Rows | None) -> None:
+            arrays["environment"].assign(radiance)
+
+        return [Pass(copy, on_host=True)]
