@@ -24,14 +24,17 @@ from numpy.typing import NDArray
 from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import UsageError
 from warp_ar.input.ball import posed_frames
-from warp_ar.input.ball_outline import locate_ball
+from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
+from warp_ar.input.checkup import source_of
 from warp_ar.input.response import measure_response, write_response
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import open_source
 from warp_ar.output.places import check_places, check_replaceable
-from warp_ar.scene import Marker, load_scene, loads_scene
+from warp_ar.scene import Marker, bundled_scenes, load_scene, loads_scene
+from warp_ar.scene.amend import amend_scene
+from warp_ar.scene.keys import INTRINSICS
 
 Image = NDArray[np.uint8]
 
@@ -92,6 +95,8 @@ def make_parser() -> argparse.ArgumentParser:
     option("pictures", nargs="+", metavar="PATH|INDEX", help="folders, pictures, videos, or a capture device")
     option("--dictionary", metavar="NAME", help="OpenCV's dictionary (default: that of the board in the pictures)")
     option("--board", metavar="TEXT", help=board + " (default: the one in the pictures)")
+    text = "write the calibration beside this scene, as camera.yml, and into its [camera]; its comments stay"
+    option("--write", type=Path, metavar="SCENE", help=text)
     option("--frames", type=int, metavar="N", help="stop after N frames of each video or device")
     option = add("ball", "measure where a scene's mirror ball stands", None)
     option(
@@ -101,6 +106,8 @@ def make_parser() -> argparse.ArgumentParser:
     )
     option("--source", metavar="PATH|INDEX", help="frames, if not the scene's own")
     option("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
+    option("--keep-radius", action="store_true", help="believe the scene's radius instead of measuring it")
+    option("--write", action="store_true", help="write center and radius into the scene file; its comments stay")
     option = add("response", "measure the response curve from pictures of one still scene", "response.txt")
     option("pictures", nargs="+", metavar="PATH", help="pictures, in the order of --exposures")
     option(
@@ -111,11 +118,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _run_ball(options: argparse.Namespace) -> None:
     scene = load_scene(options.scene)
+    if options.write and scene.path in bundled_scenes().values():
+        raise UsageError(f"--write: {options.scene} comes with the program and is not written into; copy it first")
     if not scene.probes:
         raise UsageError(f"{options.scene}: expected a [probe] with a rough center and the radius")
-    spec = options.source
-    if spec is None:
-        spec = scene.source.path or scene.source.camera if scene.source is not None else None
+    spec = source_of(scene, options.source)
     if spec is None:
         raise UsageError(f"{options.scene}: names no frames; give --source")
     with open_source(spec) as source:
@@ -126,15 +133,21 @@ def _run_ball(options: argparse.Namespace) -> None:
     views = views[:: -(-len(views) // 12)]
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
-        report = locate_ball(views, camera, probe, scene.proxies, others)
+        report = measure_ball(views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius)
         moved = 1e3 * math.dist(report.center, probe.center)
         x, y, z = report.center
-        how = "by its outline, height as given"
-        if report.deviation is not None:
-            how = f"by the desk in it, +/- {1e3 * report.deviation:.2f} mm"
-        print(f"probe {index}: center = [{x:.5f}, {y:.5f}, {z:.5f}]  ({moved:.1f} mm off the scene's; {how})")
-        if report.contrast < 0.2:
-            say(f"probe {index}: little contrast at the ball's rim ({report.contrast:.0%}); check the result")
+        print(
+            f"probe {index}: center = [{x:.5f}, {y:.5f}, {z:.5f}]  +/- {2e3 * report.deviation:.1f} mm "
+            f"({moved:.1f} mm off the scene's; {report.how})"
+        )
+        known = "assumed" if report.radius_deviation is None else f"+/- {2e3 * report.radius_deviation:.1f} mm"
+        print(f"probe {index}: radius = {report.radius:.5f}  {known}")
+        if report.radius_deviation is None and not options.keep_radius:
+            say(f"probe {index}: the frames are too alike to tell the radius; it is the scene's. Move the camera around")
+        if options.write and scene.path is not None:
+            center = [round(value, 5) for value in report.center]
+            amend_scene(scene.path, "probe", {"center": center, "radius": round(report.radius, 5)}, index=index)
+            print(f"{scene.path}: [probe] has them now")
 
 
 def _check_output(options: argparse.Namespace) -> None:
@@ -145,7 +158,20 @@ def _check_output(options: argparse.Namespace) -> None:
         say(replaced)
 
 
+def _target(options: argparse.Namespace) -> Path | None:
+    """The scene file that a calibrated camera goes into, with its file beside it; None without ``--write``."""
+    if options.command != "camera" or options.write is None:
+        return None
+    path = load_scene(options.write).path
+    assert path is not None
+    if path in bundled_scenes().values():
+        raise UsageError(f"--write: {options.write} comes with the program and is not written into; copy it first")
+    options.output = path.parent / options.output.name
+    return path
+
+
 def _run(options: argparse.Namespace) -> int:
+    target = _target(options)
     if options.command != "ball":
         _check_output(options)
     if options.command == "card":
@@ -166,6 +192,9 @@ def _run(options: argparse.Namespace) -> int:
         )
         for warning in report.warnings:
             say(warning)
+        if target is not None:
+            amend_scene(target, "camera", {"calibration": options.output.name}, remove=(*INTRINSICS, "field_of_view"))
+            print(f"{target}: [camera] names it now")
     elif options.command == "response":
         curve = measure_response(list(_pictures(options.pictures)), options.exposures)
         write_response(curve, options.output)

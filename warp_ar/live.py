@@ -13,6 +13,7 @@ import os
 import secrets
 import signal
 import sys
+import threading
 import time
 import webbrowser
 from collections.abc import Sequence
@@ -201,6 +202,66 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     say(message)
 
 
+def _quick_check(options: argparse.Namespace, scene: Scene) -> None:
+    """Say in one line each what is guessed, and the worst of what is wrong with the set-up.
+
+    Frames of a capture device are left to the run itself: a device is not opened twice.
+    """
+    from warp_ar.input.checkup import check_up, source_of
+
+    source = source_of(scene, options.source)
+    recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
+    found = check_up(scene, source if recorded else None, quick=True)
+    # What the run itself cannot start with, it says itself.
+    found = [finding for finding in found if not finding.name.startswith(("source.", "marker.", "camera.aspect"))]
+    worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
+    for finding in [*worst, *(finding for finding in found if finding.name == "camera.guessed")]:
+        more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
+        say(f"{finding.text}; to do: {finding.remedy}{more}")
+
+
+class _Evidence:
+    """What frames show of a run: whether any was changed, and some by which to look for the ball."""
+
+    def __init__(self) -> None:
+        self.changed = False
+        self.views: list[tuple[Any, Any]] = []
+        self._count = 0
+
+    def add(self, image: Any, result: Any) -> None:
+        """Note a frame and what it became."""
+        self._count += 1
+        self.changed = self.changed or bool((result.image != image).any())
+        # The first, second, fourth, eighth, ...: all parts of a run, in few frames.
+        if result.pose is not None and self._count & (self._count - 1) == 0:
+            self.views = [*self.views, (image.copy(), result.pose)][-4:]
+
+
+def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
+    """Complain about a run that showed no marker, no ball, or changed nothing, though its scene calls for it.
+
+    Raises:
+        RunError: It did.
+    """
+    from warp_ar.input.checkup import ball_is_seen
+
+    _check_marker(log, session.scene, live=False)
+    scene, source = session.scene, session.scene.source
+    generated = source is not None and source.synthetic is not None
+    reads_ball = any(stage.name == "unwrap" for stage, _ in session.pipeline.plan.stages)
+    if reads_ball and evidence.views and not generated:
+        camera = scene.camera.scaled_to(*session.source.size)
+        if not ball_is_seen(scene, camera, evidence.views):
+            raise RunError(
+                "no mirror ball was found where [probe] has it, so its light is not that of the desk; "
+                "check center and radius, and see python -m warp_ar.doctor"
+            )
+    if log.count > 0 and not evidence.changed and (scene.objects or scene.lights):
+        raise RunError(
+            "no frame was changed: no [[object]] and no [[light]] reaches the picture; check their at, in metres"
+        )
+
+
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
@@ -232,6 +293,8 @@ def serve_page(options: argparse.Namespace) -> int:
         else load_context(Path(options.tls))
     )
     port = DEFAULT_PORT if options.port is None else options.port
+    # Beside the page, which does not wait for it.
+    threading.Thread(target=_quick_check, args=(options, scene), daemon=True).start()
 
     def make_host(**callbacks: Any) -> Any:
         # On the page's own thread, when it is served already: it loads Warp and all that uses it.
@@ -374,6 +437,7 @@ def light_clip(options: argparse.Namespace) -> int:
             stack.enter_context(lights)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
+        _quick_check(options, session.scene)
         _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()
@@ -383,12 +447,12 @@ def light_clip(options: argparse.Namespace) -> int:
         for words in (*replaced, sink.replaced, "" if lights is None else lights.replaced):
             if words:
                 say(words)
-        log = RunLog(session.pipeline)
+        log, evidence = RunLog(session.pipeline), _Evidence()
         try:
             with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
-                _light_frames(options, session, log, sink, lights, stop)
-            if log.count < MARKER_PATIENCE and stop.code is None:
-                _check_marker(log, session.scene, live=source.live)
+                _light_frames(options, session, log, sink, lights, stop, evidence)
+            if stop.code is None:
+                _check_run(log, session, evidence)
         except WarpArError as error:
             problem = _write_report(options.report, log, balls)
             also = f"; and {problem}" if problem else ""
@@ -427,7 +491,13 @@ def _open_session(options: argparse.Namespace, scene: Scene, outputs: tuple[str,
 
 
 def _light_frames(
-    options: argparse.Namespace, session: Session, log: RunLog, sink: Sink, lights: EnvironmentSink | None, stop: _Stop
+    options: argparse.Namespace,
+    session: Session,
+    log: RunLog,
+    sink: Sink,
+    lights: EnvironmentSink | None,
+    stop: _Stop,
+    evidence: _Evidence,
 ) -> None:
     """Let frames flow until they end, or until a signal asks to stop."""
     source = session.source
@@ -444,8 +514,9 @@ def _light_frames(
     )
     bar = progress.add_task("frames", total=total, fps=0.0)
     with progress:
-        for _, result in itertools.islice(session, options.frames):
+        for frame, result in itertools.islice(session, options.frames):
             image, decode_ms = result.image, session.decode_ms
+            evidence.add(frame.image, result)
             start = time.perf_counter()
             sink.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3

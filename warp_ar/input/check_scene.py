@@ -38,9 +38,9 @@ def check_scene(scene: Scene) -> list[Finding]:
     for index, probe in enumerate(scene.probes):
         label = "[probe]" if len(scene.probes) == 1 else f"[[probe]] {index}"
         found += _check_ball(scene, probe, label)
-    if not scene.probes:
+    if scene.objects and not scene.probes and not scene.lights:
         found.append(
-            Finding("probe.none", "the scene has no mirror ball, so the environment is unknown", "add [probe] with center and radius")
+            Finding("probe.none", "the scene has neither a mirror ball nor a light: its objects are black", "add [probe] with center and radius")
         )
     for kind, items in (("object", scene.objects), ("light", scene.lights), ("proxy", scene.proxies)):
         for index, item in enumerate(items):
@@ -54,10 +54,6 @@ def check_scene(scene: Scene) -> list[Finding]:
         if size > FARTHEST:
             text = f"[[object]] {index}: {size:g} m large{_in_metres(size, 1.0)}"
             found.append(Finding("units.object", text, "write metres, or set scale"))
-    if (scene.objects or scene.lights) and not scene.proxies:
-        found.append(
-            Finding("proxy.none", "no [[proxy]]: nothing receives shadows or virtual light", 'add [[proxy]] shape = "plane", size = [1.6, 1.2]')
-        )
     return found
 
 

@@ -33,7 +33,7 @@ def starter_scene(
         mesh: Path of the object's mesh, relative to the file.
     """
     board = "" if marker.board is None else str(marker.board)
-    spot = ", ".join(f"{value:g}" for value in center)
+    spot = ", ".join(repr(float(value)) for value in center)
     parts: list[tuple[str, str, list[tuple[str, str, str]]]] = [
         (
             "[camera]",

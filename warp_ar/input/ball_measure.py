@@ -1,0 +1,100 @@
+"""A mirror ball's centre and radius with intervals that hold: its outlines first, then the desk that it mirrors.
+
+The mirrored desk gives the centre within a fraction of a millimetre, but only for the radius that is assumed: a radius
+1 mm wrong moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval does not
+tell. So the radius comes from the outlines, and what is uncertain of it is added to the centre's interval.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.errors import UsageError
+from warp_ar.input.ball import fit_ball
+from warp_ar.input.ball_outline import outline_search
+from warp_ar.input.ball_solve import find_outlines, ground_below, solve_ball
+from warp_ar.scene import Camera, Pose, Probe, Proxy
+
+Image = NDArray[np.uint8]
+
+SLOPE = 1.8
+"""Metres that the centre moves for each metre that the radius is wrong."""
+OUTLINES = 6
+"""Frames whose outlines are looked for: each takes half a second."""
+SEARCH = 5e-3
+"""Metres around the outlines' centre in which the mirrored desk is compared."""
+ASSUMED = 0.01
+"""Share of a radius that is only assumed by which it may be off: a ruler's error."""
+SEARCH_DEVIATION = 0.0015
+"""Metres: standard deviation of a centre that only a single outline's contrast tells."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BallMeasurement:
+    """A measured mirror ball; metres, in the marker's frame."""
+
+    center: tuple[float, float, float]
+    """Centre."""
+    deviation: float
+    """Standard deviation of the centre along its worst axis."""
+    radius: float
+    """Radius."""
+    radius_deviation: float | None
+    """Its standard deviation; None: it was assumed."""
+    how: str
+    """What told, in words."""
+
+
+def measure_ball(
+    views: Sequence[tuple[Image, Pose]],
+    camera: Camera,
+    probe: Probe,
+    proxies: Sequence[Proxy] = (),
+    others: Sequence[Probe] = (),
+    *,
+    keep_radius: bool = False,
+) -> BallMeasurement:
+    """Centre and radius of a mirror ball.
+
+    Args:
+        views: RGB frames with ``camera_from_world``.
+        camera: The camera.
+        probe: The ball; its centre within its radius, its radius within a fifth.
+        proxies: What stands on the desk.
+        others: Other balls.
+        keep_radius: Believe the probe's radius.
+
+    Raises:
+        UsageError: The ball is in too few frames.
+    """
+    few = views[:: -(-len(views) // OUTLINES)]
+    outlines = find_outlines(few, camera, probe)
+    if not outlines:
+        report = outline_search(views, camera, probe.center, probe.radius)
+        return BallMeasurement(report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given")
+    ground = ground_below(probe, proxies)
+    standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
+    solution = solve_ball(outlines, camera, probe, ground if standing else None)
+    assumed = keep_radius or solution.radius_assumed
+    radius = probe.radius if assumed else solution.radius
+    deviation = ASSUMED * radius if assumed else solution.radius_deviation
+    own = max(solution.center_deviation)
+    better = None
+    try:
+        found = dataclasses.replace(probe, center=solution.center, radius=radius)
+        better = fit_ball(few, camera, found, proxies, others, search=SEARCH)
+    except UsageError:
+        pass
+    told = None if assumed else deviation
+    if better is not None and better.is_good:
+        spread = math.hypot(better.deviation, SLOPE * deviation)
+        center = tuple(float(value) for value in better.center)
+        # Both are right within their intervals, or the mirrored desk has been confused with another part of it.
+        if math.dist(center, solution.center) < 3 * math.hypot(spread, own) and spread < own:
+            return BallMeasurement((center[0], center[1], center[2]), spread, radius, told, "by the desk in it")
+    return BallMeasurement(solution.center, own, radius, told, f"by {len(outlines)} outlines")

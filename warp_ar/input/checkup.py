@@ -1,0 +1,76 @@
+"""All checks of a set-up, and their quick half."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+from warp_ar.errors import SceneError, SourceError
+from warp_ar.input.ball_solve import find_outlines
+from warp_ar.input.check_ball import LOST, check_balls
+from warp_ar.input.check_pictures import check_pictures, take_look
+from warp_ar.input.check_scene import check_scene
+from warp_ar.input.finding import Finding, worst_first
+from warp_ar.input.sources import open_source
+from warp_ar.scene import Camera, Pose, Scene
+
+FRAMES: Final = 120
+"""Frames that are looked at."""
+QUICK_FRAMES: Final = 12
+"""Frames that the quick half looks at."""
+
+
+def source_of(scene: Scene, given: str | int | Path | None = None) -> str | int | Path | None:
+    """What ``open_source`` calls the frames: those that are given, else the scene's own."""
+    if given is not None or scene.source is None:
+        return given
+    spec = scene.source
+    return spec.path or (f"synthetic:{spec.synthetic}" if spec.synthetic is not None else spec.camera)
+
+
+def check_up(
+    scene: Scene, source: str | int | Path | None, *, frames: int = FRAMES, quick: bool = False
+) -> list[Finding]:
+    """What is wrong with a set-up, the worst first.
+
+    Args:
+        scene: The scene.
+        source: The frames; None: look at the scene's numbers alone.
+        frames: How many to look at.
+        quick: Look at a few only, which takes about a second.
+    """
+    found = check_scene(scene)
+    if source is not None:
+        found += _check_source(scene, source, QUICK_FRAMES if quick else frames, 1 if quick else 4, found)
+    return worst_first(found)
+
+
+def _check_source(
+    scene: Scene, source: str | int | Path, frames: int, views: int, before: list[Finding]
+) -> list[Finding]:
+    own = scene.source
+    exposures = own.exposures or () if own is not None else ()
+    try:
+        with open_source(source, exposures=exposures) as opened:
+            look = take_look(scene, opened, frames)
+    except SourceError as error:
+        return [Finding("source.unreadable", str(error), "check [source], or give --source")]
+    except SceneError as error:
+        return [Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")]
+    found = check_pictures(scene, look)
+    # Where the scene's own numbers cannot be, a picture says nothing more about them.
+    if any(finding.name.startswith("units.") for finding in before):
+        return found
+    told = {finding.name for finding in before}
+    if "ball.sunk" in told:
+        return [*found, *(f for f in check_balls(scene, look, views) if f.name != "ball.place")]
+    return [*found, *check_balls(scene, look, views)]
+
+
+def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
+    """Whether any of some posed RGB frames shows any of the scene's mirror balls."""
+    kept = list(views)
+    return any(
+        outline.support > LOST for probe in scene.probes for outline, _ in find_outlines(kept, camera, probe)
+    )

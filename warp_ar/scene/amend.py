@@ -1,0 +1,53 @@
+"""Results written into a scene file; its comments, its order and its other keys stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.files import read_text, write_whole
+from warp_ar.scene.reader import loads_scene
+
+
+def amend_scene(
+    path: Path, section: str, values: Mapping[str, Any], *, index: int = 0, remove: tuple[str, ...] = ()
+) -> None:
+    """Set keys of one section of a scene file.
+
+    Args:
+        path: The file.
+        section: Such as ``probe``; of several of its kind, the one at ``index``.
+        values: Keys with numbers, texts, or lists of numbers.
+        index: Which of several.
+        remove: Keys that the new ones stand for.
+
+    Raises:
+        SceneError: The file cannot be read, has no such section, or would no longer be a scene; it is left as it was.
+        SinkError: It cannot be written.
+    """
+    text = read_text(path, SceneError, expected="TOML")
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise SceneError(f"{path}: not valid TOML: {error}") from error
+    table: Any = document.get(section)
+    if isinstance(table, list):
+        table = table[index] if index < len(table) else None
+    if table is None:
+        raise SceneError(f"{path}: [{section}] is missing: there is nothing to write {', '.join(values)} into")
+    for key in remove:
+        if key in table:
+            del table[key]
+    for key, value in values.items():
+        table[key] = value
+    made = tomlkit.dumps(document)
+    loads_scene(made, path)
+    try:
+        write_whole(path, made.encode())
+    except OSError as error:
+        raise SinkError(f"{path}: cannot be written: {reason(error)}") from error
