@@ -1,4 +1,4 @@
-"""Errors of a ball's outline in rendered photographs: column, row and radius in pixels, and what was stated for them."""
+"""Errors of a ball's outline in rendered photographs: column, row and radius in pixels, against the stated ones."""
 
 from __future__ import annotations
 

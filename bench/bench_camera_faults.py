@@ -1,7 +1,8 @@
 """Errors of light and picture for each fault of a simulated camera, alone and all together.
 
-Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual things really there, with which the
-program's is compared. Clipped pixels of those frames stay at 1 before the sensor: the lens mixes them too dark. ``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
+Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual things really there, which the
+program's is compared with. Clipped pixels of those frames stay at 1 before the sensor: the lens mixes them too dark.
+``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
