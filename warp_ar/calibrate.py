@@ -38,6 +38,7 @@ from warp_ar.scene.keys import INTRINSICS
 
 Image = NDArray[np.uint8]
 
+
 def _marker(options: argparse.Namespace) -> Marker | None:
     """The marker that options describe, checked as a scene's is; None where none of them is given."""
     given = {key: getattr(options, key, None) for key in ("dictionary", "board", "id", "size")}
@@ -84,7 +85,9 @@ def make_parser() -> argparse.ArgumentParser:
         return command.add_argument
 
     board = f'a board, as in a scene: "{SHEET.board}" or "grid 4x3 0.04 0.01", lengths in metres'
-    option = add("card", "write the card, or a marker or board of your own, as a page that prints at true size", "card.pdf")
+    option = add(
+        "card", "write the card, or a marker or board of your own, as a page that prints at true size", "card.pdf"
+    )
     option("--dictionary", metavar="NAME", help=f"OpenCV's dictionary of a marker of your own ({Marker.dictionary})")
     option("--id", type=int, metavar="N", help="which marker (0), instead of the card")
     option("--size", type=float, metavar="X", help="side of its black square in metres (0.08), instead of the card")
@@ -143,7 +146,9 @@ def _run_ball(options: argparse.Namespace) -> None:
         known = "assumed" if report.radius_deviation is None else f"+/- {2e3 * report.radius_deviation:.1f} mm"
         print(f"probe {index}: radius = {report.radius:.5f}  {known}")
         if report.radius_deviation is None and not options.keep_radius:
-            say(f"probe {index}: the frames are too alike to tell the radius; it is the scene's. Move the camera around")
+            say(
+                f"probe {index}: the frames are too alike to tell the radius; it is the scene's. Move the camera around"
+            )
         if options.write and scene.path is not None:
             center = [round(value, 5) for value in report.center]
             amend_scene(scene.path, "probe", {"center": center, "radius": round(report.radius, 5)}, index=index)
@@ -176,7 +181,9 @@ def _run(options: argparse.Namespace) -> int:
         _check_output(options)
     if options.command == "card":
         write_card(_marker(options) or SHEET, options.output, options.paper, options.dpi)
-        print(f"{options.output}: print at 100 %, without fitting to the page, and check with a ruler that 100 mm are 100 mm")
+        print(
+            f"{options.output}: print at 100 %, not fitted to the page, and check with a ruler that 100 mm are 100 mm"
+        )
     elif options.command == "camera":
         report = calibrate_camera(_pictures(options.pictures, options.frames), _marker(options))
         write_camera(report, options.output)

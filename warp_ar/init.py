@@ -1,4 +1,4 @@
-"""``python -m warp_ar.init my_desk``: a folder to start one's own desk from, with a scene, a teapot and the card to print.
+"""``python -m warp_ar.init my_desk``: a folder to start from, with a scene, a teapot and the card to print.
 
 The folder runs at once with a guessed camera; what is guessed is said whenever it is run.
 """

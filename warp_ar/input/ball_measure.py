@@ -76,7 +76,9 @@ def measure_ball(
     outlines = find_outlines(few, camera, probe)
     if not outlines:
         report = outline_search(views, camera, probe.center, probe.radius)
-        return BallMeasurement(report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given")
+        return BallMeasurement(
+            report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
+        )
     ground = ground_below(probe, proxies)
     standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
     solution = solve_ball(outlines, camera, probe, ground if standing else None)

@@ -4,10 +4,11 @@ An outline tells three things: where the ball's centre is seen, and how large th
 a small near ball and a large far one alike; frames from several sides, or a ball known to stand on the table, do not.
 The unknowns (c, r) minimise
 
-    sum_i |(m(R_i c + t_i, r) - m_i) / sigma_i|^2 + ((c_z - r - ground) / sigma_ground)^2,   m = (f x/z, f y/z, f r/|q|),
+    sum_i |(m(R_i c + t_i, r) - m_i) / sigma_i|^2 + ((c_z - r - ground) / sigma_ground)^2,
+    m(q, r) = (f x/z, f y/z, f r/|q|),
 
-by Gauss-Newton with Huber's weights. What spoils a rim (a band of light inside it, what is behind it) spoils it in every
-frame alike, so that frames do not average out: the interval is that of one typical frame, not of their mean.
+by Gauss-Newton with Huber's weights. What spoils a rim (a band of light inside it, what is behind it) spoils it in
+every frame alike, so that frames do not average out: the interval is that of one typical frame, not of their mean.
 """
 
 from __future__ import annotations
@@ -78,9 +79,7 @@ def rough_circle(camera: Camera, pose: Pose, probe: Probe) -> tuple[float, float
     )
 
 
-def find_outlines(
-    views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe
-) -> list[tuple[BallOutline, Pose]]:
+def find_outlines(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> list[tuple[BallOutline, Pose]]:
     """The ball's outline in each frame that shows it near where the scene has it."""
     found = []
     for image, pose in views:
@@ -168,4 +167,4 @@ def _minimise(residuals: object, start: Array, free: NDArray[np.int_], frames: i
             break
     e = residuals(x)
     spread = max(1.0, float(np.median(np.abs(e))) / 0.6745) ** 2
-    return x, np.linalg.pinv(normal) * spread * frames
+    return x, np.asarray(np.linalg.pinv(normal) * spread * frames, float)

@@ -129,5 +129,6 @@ def _why_lost(look: Look, views: tuple[tuple[Image, Pose], ...], label: str, con
     except UsageError:
         return Finding("ball.unfound", f"{label}: no ball is seen where the scene has it", command)
     x, y = outline.center
-    text = f"{label}: no ball where the scene has it; there may be one at ({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"
+    where = f"({x:.0f}, {y:.0f}), {2 * outline.radius:.0f} pixels wide"
+    text = f"{label}: no ball where the scene has it; there may be one at {where}"
     return Finding("ball.unfound", text, command)

@@ -136,7 +136,9 @@ def _why_unseen(marker: Marker, look: Look) -> Finding:
         return Finding("marker.mirrored", text, "turn the camera's mirroring off")
     level = float(look.table[image].mean())
     if level < 0.01:
-        return Finding("picture.dark", f"the picture is dark: {level:.1%} of clipping on average", "uncover the camera, add light")
+        return Finding(
+            "picture.dark", f"the picture is dark: {level:.1%} of clipping on average", "uncover the camera, add light"
+        )
     if float((image >= CLIPPED).mean()) > 0.7:
         return Finding("picture.clipped", "the picture is overexposed: most of it clips", "set a shorter exposure")
     name, seen = find_markers(image)
@@ -158,7 +160,10 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     The squared residuals are a parabola about their least; leaving out one frame after the other says how sure it is.
     """
     images = [image for image, _ in look.views[:: -(-len(look.views) // FOCAL_VIEWS)]]
-    factors = np.exp(np.linspace(-0.3, 0.3, 21))
+    # Where it lies is looked for in few frames, and measured in all around there.
+    rough = np.exp(np.linspace(-0.3, 0.3, 9))
+    few = [_squared_errors(marker, look.camera, images[:: -(-len(images) // 3)], factor).sum() for factor in rough]
+    factors = rough[int(np.argmin(few))] * np.array([0.94, 0.97, 1.0, 1.03, 1.06])
     squares = np.array([_squared_errors(marker, look.camera, images, factor) for factor in factors])
     kept = np.isfinite(squares).all(0)
     if kept.sum() < 4:
@@ -169,8 +174,8 @@ def _check_focal(marker: Marker, look: Look) -> list[Finding]:
     left = np.array([_lowest(factors, squares.sum(1) - squares[:, k])[0] for k in range(count)])
     deviation = math.sqrt((count - 1) / count * float(((left - left.mean()) ** 2).sum()))
     # Views from one side alone leave the least so flat that anything moves it.
-    gain = squares[len(factors) // 2].sum() / squares.sum(1).min()
-    if abs(best - 1) < max(FOCAL, 3 * deviation) or gain < 1.02:
+    as_given = _squared_errors(marker, look.camera, images, 1.0)[kept].sum()
+    if abs(best - 1) < max(FOCAL, 3 * deviation) or as_given < 1.02 * squares.sum(1).min():
         return []
     text = (
         f"[camera] fx = {look.camera.fx:.0f}: the card's perspective in {count} views fits "
@@ -190,10 +195,8 @@ def _squared_errors(marker: Marker, camera: Camera, images: Sequence[Image], fac
 
 
 def _lowest(factors: Array, totals: Array) -> tuple[float, float]:
-    """Where the parabola through the five totals about the least is lowest, and its curvature."""
-    at = int(np.clip(np.argmin(totals), 2, len(factors) - 3))
-    near = slice(at - 2, at + 3)
-    curve, slope, _ = np.polyfit(factors[near], totals[near], 2)
+    """Where the parabola through the totals is lowest, and its curvature."""
+    curve, slope, _ = np.polyfit(factors, totals, 2)
     if curve <= 0:
         return float(factors[np.argmin(totals)]), 0.0
     return float(np.clip(-slope / (2 * curve), factors[0], factors[-1])), float(curve)
@@ -238,15 +241,19 @@ def _check_light(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]]
         found.append(Finding("card.dark", text, "add light, or set a longer exposure"))
     elif np.median(ratios) > CONTRAST:
         text = f"the card's black is {np.median(ratios):.0%} of its white: haze, gloss, or another transfer curve"
-        found.append(Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer"))
+        found.append(
+            Finding("card.contrast", text, "turn the card out of the lamp's reflection; check [camera] transfer")
+        )
     if np.median(uneven) > SHADOW:
-        text = f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"
+        text = (
+            f"a shadow lies across the card: its white differs by a factor of {math.exp(float(np.median(uneven))):.1f}"
+        )
         found.append(Finding("card.shadow", text, "move what shades the card, or the card"))
     return [*found, *_check_drift(look, views, np.array(whites))]
 
 
 def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array) -> list[Finding]:
-    """Drifts of the camera's own: what a lamp changes, it changes differently on every side; a camera changes all alike."""
+    """Drifts of the camera's own: it changes all of the picture alike; a lamp changes every side differently."""
     found: list[Finding] = []
     if len(whites) < 2:
         return found
@@ -267,7 +274,9 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))
-    if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and width[k] < abs(shift[k]):
+    # A lamp that goes changes level and colour together; a camera's balance hardly changes the level.
+    alike = width[k] < 0.75 * abs(shift[k]) and abs(change) < 0.4
+    if abs(shift[k]) > TINT and abs(tints[-1, k] - tints[0, k]) > TINT and alike:
         text = f"the white balance drifts: {'red' if k == 0 else 'blue'} by a factor of {math.exp(shift[k]):.2f}"
         found.append(Finding("camera.balance", text, "lock the camera's white balance"))
     return found

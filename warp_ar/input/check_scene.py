@@ -10,7 +10,7 @@ import numpy as np
 from warp_ar.input.ball_solve import ground_below
 from warp_ar.input.card import card_size
 from warp_ar.input.finding import Finding
-from warp_ar.scene import CharucoBoard, Probe, Scene
+from warp_ar.scene import CharucoBoard, Light, Object, Probe, Proxy, Scene
 
 LARGEST_BALL: Final = 0.3
 """Metres: no mirror ball on a desk has a larger radius, gazing globes included."""
@@ -40,14 +40,24 @@ def check_scene(scene: Scene) -> list[Finding]:
         found += _check_ball(scene, probe, label)
     if scene.objects and not scene.probes and not scene.lights:
         found.append(
-            Finding("probe.none", "the scene has neither a mirror ball nor a light: its objects are black", "add [probe] with center and radius")
+            Finding(
+                "probe.none",
+                "the scene has neither a mirror ball nor a light: its objects are black",
+                "add [probe] with center and radius",
+            )
         )
-    for kind, items in (("object", scene.objects), ("light", scene.lights), ("proxy", scene.proxies)):
+    placed: dict[str, tuple[Object | Light | Proxy, ...]]
+    placed = {"object": scene.objects, "light": scene.lights, "proxy": scene.proxies}
+    for kind, items in placed.items():
         for index, item in enumerate(items):
             far = float(np.linalg.norm(item.at))
             if far > FARTHEST:
                 found.append(
-                    Finding("units.at", f"[[{kind}]] {index}: at is {far:g} m from the card{_in_metres(far, 1.0)}", "write metres")
+                    Finding(
+                        "units.at",
+                        f"[[{kind}]] {index}: at is {far:g} m from the card{_in_metres(far, 1.0)}",
+                        "write metres",
+                    )
                 )
     for index, item in enumerate(scene.objects):
         size = item.scale * max(item.radius, item.major_radius, *item.size)
@@ -91,12 +101,13 @@ def _check_camera(scene: Scene) -> list[Finding]:
         text = f"[camera] fx = {camera.fx:g}: a field of view of {field:.0f} degrees at {camera.width} pixels"
         found.append(Finding("camera.field", text, f"write the focal length in pixels; {measure}"))
     if abs(camera.fy / camera.fx - 1) > SQUARE:
-        text = f"[camera] fx = {camera.fx:g} and fy = {camera.fy:g}: pixels {abs(camera.fy / camera.fx - 1):.0%} from square"
+        off = abs(camera.fy / camera.fx - 1)
+        text = f"[camera] fx = {camera.fx:g} and fy = {camera.fy:g}: pixels {off:.0%} from square"
         found.append(Finding("camera.square", text, measure))
     middle = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    off = np.abs(np.array([camera.cx, camera.cy]) - middle).max() / camera.width
-    if off > CENTRAL:
-        text = f"[camera] cx = {camera.cx:g}, cy = {camera.cy:g}: {off:.0%} of the width from the picture's middle"
+    aside = float(np.abs(np.array([camera.cx, camera.cy]) - middle).max()) / camera.width
+    if aside > CENTRAL:
+        text = f"[camera] cx = {camera.cx:g}, cy = {camera.cy:g}: {aside:.0%} of the width from the picture's middle"
         found.append(Finding("camera.center", text, measure))
     return found
 
@@ -107,7 +118,9 @@ def _check_ball(scene: Scene, probe: Probe, label: str) -> list[Finding]:
         text = f"{label} radius = {radius:g} m{_in_metres(radius, 0.15)}"
         return [Finding("units.ball", text, "write the radius in metres")]
     if radius < SMALLEST_BALL:
-        return [Finding("units.ball", f"{label} radius = {radius:g} m: smaller than a pea", "write the radius in metres")]
+        return [
+            Finding("units.ball", f"{label} radius = {radius:g} m: smaller than a pea", "write the radius in metres")
+        ]
     if far > FARTHEST:
         text = f"{label} center is {far:g} m from the card{_in_metres(far, 1.0)}"
         return [Finding("units.ball", text, "write the center in metres")]

@@ -71,6 +71,4 @@ def _check_source(
 def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
     """Whether any of some posed RGB frames shows any of the scene's mirror balls."""
     kept = list(views)
-    return any(
-        outline.support > LOST for probe in scene.probes for outline, _ in find_outlines(kept, camera, probe)
-    )
+    return any(outline.support > LOST for probe in scene.probes for outline, _ in find_outlines(kept, camera, probe))

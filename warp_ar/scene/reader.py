@@ -233,9 +233,12 @@ def _read_camera(table: _Table, source: object = None) -> Camera:
         for key in INTRINSICS:
             if key in table:
                 table.fail(key, "not used beside field_of_view; give either the numbers or the guess")
-        return Camera.guessed(*_NOMINAL_SIZE, table.number("field_of_view", low=5.0, high=150.0, unit="degrees"), transfer)
+        field = table.number("field_of_view", low=5.0, high=150.0, unit="degrees")
+        return Camera.guessed(*_NOMINAL_SIZE, field, transfer)
     if not any(key in table for key in INTRINSICS):
-        table.fail("width", f"give {', '.join(INTRINSICS[:6])}, or field_of_view, or calibration with the path of OpenCV's YAML or JSON")
+        names = ", ".join(INTRINSICS[:6])
+        right = f"give {names}, or field_of_view, or calibration with the path of OpenCV's YAML or JSON"
+        table.fail("width", right)
     return Camera(
         width=table.integer("width", low=1, high=MOST_PIXELS),
         height=table.integer("height", low=1, high=MOST_PIXELS),
@@ -581,7 +584,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     if top.data["schema"] is True or top.data["schema"] != SCHEMA:
         top.fail("schema", f"this program reads schema {SCHEMA}")
     if "camera" not in data:
-        raise SceneError(f"{label}: [camera] is missing: give {', '.join(INTRINSICS[:6])}, calibration or field_of_view")
+        names = ", ".join(INTRINSICS[:6])
+        raise SceneError(f"{label}: [camera] is missing: give {names}, calibration or field_of_view")
 
     def one(section: str, keys: Sequence[str], read: Any) -> Any:
         return read(_Table(label, folder, section, data[section], keys)) if section in data else None

@@ -77,13 +77,19 @@ def starter_scene(
         ),
     ]
     known = {(key.section, key.name): key for key in keys()}
-    lines = ["# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up."]
+    lines = [
+        "# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up."
+    ]
     lines += [f"schema = {SCHEMA}", f"name = {json.dumps(name, ensure_ascii=False)}"]
     for head, comment, entries in parts:
         lines += ["", *(f"# {line}" for line in textwrap.wrap(comment, _WIDTH)), head]
         for section, key, value in entries:
             known_key = known[section, key]
-            unit = "" if known_key.unit.split()[0] in known_key.meaning.lower() or known_key.unit == "-" else f" ({known_key.unit})"
+            unit = (
+                ""
+                if known_key.unit.split()[0] in known_key.meaning.lower() or known_key.unit == "-"
+                else f" ({known_key.unit})"
+            )
             lines += [f"# {line}" for line in textwrap.wrap(f"{known_key.meaning}{unit}", _WIDTH)]
             lines.append(f"{key} = {value}")
     return "\n".join(lines) + "\n"

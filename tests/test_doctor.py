@@ -1,0 +1,262 @@
+"""Wrong set-ups are named, each as what it is; right ones raise no alarm."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from warp_ar import doctor
+from warp_ar.errors import SceneError
+from warp_ar.input.check_ball import check_balls
+from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_scene import check_scene
+from warp_ar.input.checkup import check_up
+from warp_ar.input.finding import Finding, fault_errors, worst_first
+from warp_ar.input.sources import open_source
+from warp_ar.scene import Scene, load_scene, loads_scene
+from warp_ar.scene.amend import amend_scene
+
+FRAMES = 96
+CALM = 40
+"""Frames of the clip in which its own light hardly changes."""
+CLIPS = ("desk", "darken", "wire_opposing")
+
+
+@pytest.fixture(scope="module")
+def looks():
+    """What the frames of each clip show, looked at once."""
+    found = {}
+    for name in CLIPS:
+        scene = load_scene(name)
+        with open_source(str(scene.source.path)) as source:
+            found[name] = take_look(scene, source, FRAMES)
+    return found
+
+
+def ball(scene: Scene, **changes) -> Scene:
+    return dataclasses.replace(scene, probes=(dataclasses.replace(scene.probes[0], **changes),))
+
+
+def camera(scene: Scene, **factors) -> Scene:
+    values = {key: getattr(scene.camera, key) * factor for key, factor in factors.items()}
+    return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, **values))
+
+
+def marker(scene: Scene, **changes) -> Scene:
+    return dataclasses.replace(scene, marker=dataclasses.replace(scene.marker, **changes))
+
+
+def thing(scene: Scene, **changes) -> Scene:
+    return dataclasses.replace(scene, objects=(dataclasses.replace(scene.objects[0], **changes),))
+
+
+NUMBERS = {
+    "radius in millimetres": ("units.ball", lambda s: ball(s, radius=35.0)),
+    "radius in centimetres": ("units.ball", lambda s: ball(s, radius=3.5)),
+    "center in millimetres": ("units.ball", lambda s: ball(s, center=(-120.0, 30.0, 34.6))),
+    "radius of a pinhead": ("units.ball", lambda s: ball(s, radius=0.0005)),
+    "marker in millimetres": ("units.card", lambda s: marker(s, size=80.0)),
+    "marker in centimetres": ("units.card", lambda s: marker(s, size=8.0)),
+    "marker of a millimetre": ("units.card", lambda s: marker(s, size=0.001)),
+    "grey paper": ("card.white", lambda s: marker(s, white=0.2)),
+    "sunk ball": ("ball.sunk", lambda s: ball(s, center=(-0.12, 0.03, 0.02))),
+    "ball's height forgotten": ("ball.sunk", lambda s: ball(s, center=(-0.12, 0.03, 0.0))),
+    "ball on the marker": ("ball.on_card", lambda s: ball(s, center=(0.0, 0.0, 0.0346))),
+    "black ball": ("ball.reflectance", lambda s: ball(s, reflectance=(0.05, 0.05, 0.05))),
+    "focal length in millimetres": ("camera.field", lambda s: camera(s, fx=4 / 640, fy=4 / 640)),
+    "pixels that are not square": ("camera.square", lambda s: camera(s, fy=1.1)),
+    "center of another size": ("camera.center", lambda s: camera(s, cx=2.0, cy=2.0)),
+    "object in millimetres": ("units.at", lambda s: thing(s, at=(150.0, 55.0, 0.0))),
+    "no ball and no light": ("probe.none", lambda s: dataclasses.replace(s, probes=(), lights=())),
+}
+
+
+@pytest.mark.parametrize("fault", NUMBERS)
+def test_wrong_numbers_are_named(fault):
+    name, change = NUMBERS[fault]
+    assert name in [finding.name for finding in check_scene(change(load_scene("desk")))]
+
+
+def test_guess_is_named():
+    scene = loads_scene("schema = 1\n[camera]\nfield_of_view = 60.0\n")
+    assert [finding.name for finding in check_scene(scene)] == ["camera.guessed"]
+
+
+SEEN = {
+    "another marker": ("marker.other", lambda s: marker(s, id=3)),
+    "another dictionary": ("marker.other", lambda s: marker(s, dictionary="DICT_6X6_250")),
+    "focal length 3 % long": ("camera.focal", lambda s: camera(s, fx=1.03, fy=1.03)),
+    "focal length 3 % short": ("camera.focal", lambda s: camera(s, fx=0.97, fy=0.97)),
+    "focal length of another size": ("camera.focal", lambda s: camera(s, fx=0.8, fy=0.8)),
+}
+
+
+@pytest.mark.parametrize("fault", SEEN)
+def test_wrong_camera_and_card_are_seen(fault):
+    name, change = SEEN[fault]
+    scene = change(load_scene("desk"))
+    with open_source(str(scene.source.path)) as source:
+        look = take_look(scene, source, FRAMES)
+    assert name in [finding.name for finding in check_pictures(scene, look)]
+
+
+BALLS = {
+    "radius 10 % long": ("ball.radius", lambda s: ball(s, radius=0.0385, center=(-0.12, 0.03, 0.0381))),
+    "radius 10 % short": ("ball.radius", lambda s: ball(s, radius=0.0315, center=(-0.12, 0.03, 0.0311))),
+    "10 mm aside": ("ball.place", lambda s: ball(s, center=(-0.11, 0.03, 0.0346))),
+    "10 mm behind": ("ball.place", lambda s: ball(s, center=(-0.12, 0.042, 0.0346))),
+    "on the other side": ("ball.unfound", lambda s: ball(s, center=(0.12, 0.03, 0.0346))),
+    "out of the picture": ("ball.outside", lambda s: ball(s, center=(0.9, 0.03, 0.0346))),
+}
+
+
+@pytest.mark.parametrize("fault", BALLS)
+def test_wrong_balls_are_seen(fault, looks):
+    name, change = BALLS[fault]
+    found = check_balls(change(load_scene("desk")), looks["desk"], 2)
+    assert name in [finding.name for finding in found]
+
+
+def spoiled(look: Look, change) -> Look:
+    """The same look with every picture changed; ``change`` takes a picture and its number."""
+    views = tuple((change(image, k), pose) for k, (image, pose) in enumerate(look.views))
+    return dataclasses.replace(look, views=views, images=tuple(image for image, _ in views))
+
+
+def gain(factor):
+    return lambda image, _: np.clip(image * np.asarray(factor), 0, 255).astype(np.uint8)
+
+
+def painted(color, share=1.0):
+    def change(image, _):
+        mask = np.zeros(image.shape[:2], np.uint8)
+        cv2.circle(mask, (186, 252), 34, 255, -1)
+        mask[:, round(152 + 68 * share) :] = 0
+        return np.where(mask[..., None] > 0, np.uint8(color), image)
+
+    return change
+
+
+PICTURES = {
+    "overexposed": ("card.clipped", gain(2.2)),
+    "underexposed": ("card.dark", gain(0.2)),
+    "haze": ("card.contrast", lambda image, _: (170 + image // 4).astype(np.uint8)),
+    "out of focus": ("picture.blurred", lambda image, _: cv2.GaussianBlur(image, (0, 0), 4.0)),
+    "exposure drifts": ("camera.drift", lambda image, k: gain(1 - 0.3 * k / CALM)(image, k)),
+    "white balance drifts": ("camera.balance", lambda image, k: gain([1 - 0.2 * k / CALM, 1, 1])(image, k)),
+}
+
+
+@pytest.mark.parametrize("fault", PICTURES)
+def test_wrong_pictures_are_seen(fault, looks):
+    name, change = PICTURES[fault]
+    look = dataclasses.replace(looks["desk"], views=looks["desk"].views[:CALM], errors=looks["desk"].errors[:CALM])
+    found = check_pictures(load_scene("desk"), spoiled(look, change))
+    assert name in [finding.name for finding in found]
+
+
+def test_shadow_across_the_card_is_seen(looks):
+    look, scene = looks["desk"], load_scene("desk")
+    pose = look.views[0][1]
+    middle = pose.apply(np.zeros(3))
+    column = round(look.camera.cx + look.camera.fx * middle[0] / middle[2])
+
+    def change(image, _):
+        out = image.copy()
+        out[:, :column] = out[:, :column] // 3
+        return out
+
+    found = check_pictures(scene, spoiled(dataclasses.replace(look, views=look.views[:4]), change))
+    assert "card.shadow" in [finding.name for finding in found]
+
+
+def test_painted_and_hidden_balls_are_seen(looks):
+    scene = load_scene("desk")
+    look = dataclasses.replace(looks["desk"], views=looks["desk"].views[:1])
+    found = check_balls(scene, spoiled(look, painted(90)), 1)
+    assert {finding.name for finding in found} & {"ball.unfound", "ball.dull"}
+
+
+def test_pictures_without_the_marker_say_why(looks):
+    scene = load_scene("desk")
+    image = looks["desk"].images[0]
+    for name, picture in (
+        ("marker.mirrored", np.ascontiguousarray(image[:, ::-1])),
+        ("picture.dark", np.zeros_like(image)),
+        ("picture.clipped", np.full_like(image, 255)),
+        ("marker.unseen", np.full_like(image, 100)),
+    ):
+        look = dataclasses.replace(looks["desk"], images=(picture,), views=(), errors=())
+        assert [finding.name for finding in check_pictures(scene, look)] == [name]
+
+
+RIGHT = {
+    "as it is": lambda image, _: image,
+    "a little darker": gain(0.8),
+    "a little brighter": gain(1.08),
+    "warm light": gain([1.0, 0.9, 0.75]),
+    "cold light": gain([0.8, 0.92, 1.0]),
+    "noise": lambda image, k: np.clip(image + np.random.default_rng(k).normal(0, 4, image.shape), 0, 255).astype(
+        np.uint8
+    ),
+    "a little soft": lambda image, _: cv2.GaussianBlur(image, (0, 0), 0.8),
+    "compressed": lambda image, _: cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 80])[1], 1),
+    "grey": lambda image, _: np.repeat(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)[..., None], 3, 2),
+    "flickering a little": lambda image, k: gain(1 + 0.03 * np.sin(k))(image, k),
+}
+
+
+@pytest.mark.parametrize(("clip", "change"), list(itertools.product(CLIPS, RIGHT)))
+def test_right_set_ups_raise_no_alarm(clip, change, looks):
+    look = looks[clip]
+    few = dataclasses.replace(look, views=look.views[::4], images=look.images[::4], errors=look.errors[::4])
+    few = spoiled(few, RIGHT[change])
+    scene = load_scene(clip)
+    found = [*check_scene(scene), *check_pictures(scene, few), *check_balls(scene, few, 1)]
+    assert [(finding.name, finding.text) for finding in found] == []
+
+
+def test_command_says_it_and_ends_with_1(capsys, tmp_path):
+    scene = load_scene("desk")
+    path = tmp_path / "scene.toml"
+    text = scene.path.read_text().replace("radius = 0.035", "radius = 35.0")
+    text = text.replace('"clips/', f'"{scene.path.parent}/clips/').replace('"meshes/', f'"{scene.path.parent}/meshes/')
+    path.write_text(text)
+    assert doctor.main([str(tmp_path), "--frames", "4"]) == 1
+    said = capsys.readouterr().out
+    assert "35 millimetres are 0.035 m" in said
+    assert "do: write the radius in metres" in said
+    assert doctor.main(["nowhere"]) == 2
+
+
+def test_unreadable_source_is_a_finding(tmp_path):
+    found = check_up(load_scene("desk"), tmp_path / "nothing.mp4")
+    assert [finding.name for finding in found] == ["source.unreadable"]
+
+
+def test_costs_are_measured_and_order_the_findings():
+    errors = fault_errors()
+    assert errors["units.ball"]["error"] > errors["ball.place"]["error"] > errors["camera.focal"]["error"]
+    findings = [Finding("ball.place", "", ""), Finding("marker.unseen", "", "")]
+    assert [finding.name for finding in worst_first(findings)] == ["marker.unseen", "ball.place"]
+    assert "FLIP" in findings[0].cost
+
+
+def test_results_are_written_and_comments_stay(tmp_path):
+    path = tmp_path / "scene.toml"
+    text = "# mine\nschema = 1\n[camera] # guessed\nfield_of_view = 60.0\n[marker]\nsize = 0.08\n"
+    path.write_text(text + "[probe]\n# by ruler\nradius = 0.03 # +/- 1 mm\ncenter = [0.1, 0.0, 0.03]\n")
+    amend_scene(path, "probe", {"radius": 0.0312, "center": [0.1, 0.001, 0.0312]})
+    assert load_scene(path).probes[0].radius == 0.0312
+    for comment in ("# mine", "# guessed", "# by ruler", "# +/- 1 mm"):
+        assert comment in path.read_text()
+    before = path.read_text()
+    with pytest.raises(SceneError, match="radius"):
+        amend_scene(path, "probe", {"radius": -1.0})
+    with pytest.raises(SceneError, match=r"\[light\] is missing"):
+        amend_scene(path, "light", {"intensity": 1.0})
+    assert path.read_text() == before
