@@ -87,3 +87,8 @@ def test_bad_circles_and_pictures_without_a_ball():
         find_ball(noise)
     with pytest.raises(UsageError, match="column, row and radius"):
         find_ball(noise, rough=(10.0, 10.0, 1.0))
+
+
+def test_whole_numbers_are_a_circle_too():
+    camera = far_camera(400, 300)
+    assert np.allclose(sphere_of_circle(camera, 120, 90, 50), sphere_of_circle(camera, 120.0, 90.0, 50.0))

@@ -7,6 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from tests.error_model import check_error
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
@@ -60,8 +61,12 @@ def constant(value, height=16):
 
 def smooth(height):
     """A map that changes slowly in every direction."""
-    d = latlong_directions(height)
-    return (1.5 + d @ np.array([[0.5, 0.1, 0.0], [0.2, 0.6, 0.1], [0.3, 0.0, 0.7]])).astype(np.float32)
+    return slope(latlong_directions(height)).astype(np.float32)
+
+
+def slope(d):
+    """Its twin in float64: radiance from directions."""
+    return 1.5 + d @ np.array([[0.5, 0.1, 0.0], [0.2, 0.6, 0.1], [0.3, 0.0, 0.7]])
 
 
 def test_a_light_survives_its_file(tmp_path):
@@ -110,7 +115,7 @@ def test_turning_moves_what_is_seen_where_it_belongs():
     turn = rotation_matrix([20.0, -35.0, 110.0])
     d = latlong_directions(32)
     # What arrives from R d in the new axes arrived from d in the old ones.
-    wanted = 1.5 + (d @ turn) @ np.array([[0.5, 0.1, 0.0], [0.2, 0.6, 0.1], [0.3, 0.0, 0.7]])
+    wanted = slope(d @ turn)
     # Bilinear in a map of 64 rows, and a mean of four places a texel: second order in 2.8 degrees.
     assert np.abs(light.resampled(32, turn) - wanted).max() < 4e-3
     assert (light.resampled(64) == light.radiance).all()
@@ -160,6 +165,7 @@ def test_scale_and_turn_are_the_scenes(tmp_path, device):
         environment = pipeline(np.zeros((72, 96, 3), np.uint8)).environment
     wanted = 2.0 * Light.load(tmp_path / "light.exr").resampled(64, rotation_matrix([0.0, 0.0, 90.0]))
     assert np.allclose(environment, wanted, rtol=1e-5)
+    check_error("captured", environment, 2.0 * slope(latlong_directions(64) @ rotation_matrix([0.0, 0.0, 90.0])))
 
 
 def test_a_light_replaces_what_a_ball_shows(tmp_path, device):

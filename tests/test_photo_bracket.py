@@ -118,3 +118,10 @@ def test_near_exposures_are_left_out_and_said():
     assert kept == (1, 2, 3)
     assert "left out" in notes[0]
     assert thin_exposures([1.0, 0.8, 0.63], 0)[0] == (0, 1, 2)  # thirds of a stop
+
+
+def test_exposures_far_apart_are_not_judged_by_what_they_share():
+    images = [exposed(15).astype(np.uint8), exposed(4000).astype(np.uint8)]
+    found = align(images, [circle()] * 2, [1 / 15, 1 / 4000])
+    assert found.circles[0] == found.circles[1]
+    assert math.isnan(found.correlation[1])

@@ -166,7 +166,9 @@ def _merge_plan(
     # Brightness tells the order even where claims contradict each other.
     order = sorted(range(len(photos)), key=lambda k: -float(photos[k].image[::8, ::8].mean()))
     chosen = [photos[k] for k in order]
-    aligned = _align_all(chosen, chosen.index(reference), circle)
+    known = next((claim for claim in claims.values() if claim is not None), None)
+    times = None if known is None else [known[k] for k in order]
+    aligned = _align_all(chosen, chosen.index(reference), circle, times)
     moved = [k for k, c in enumerate(aligned.correlation) if math.isfinite(c) and c < MOVED]
     notes = [
         f"{chosen[k].name} is left out: it shows something else ({aligned.correlation[k]:.0%} alike)" for k in moved
@@ -188,7 +190,7 @@ def _merge_plan(
     )
 
 
-def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle) -> Aligned:
+def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle, times: Sequence[float] | None) -> Aligned:
     """Align outward from the reference, to both sides."""
     h, w = photos[reference].image.shape[:2]
 
@@ -197,8 +199,11 @@ def _align_all(photos: Sequence[Photograph], reference: int, circle: Circle) -> 
         sy, sx = photo.image.shape[0] / h, photo.image.shape[1] / w
         return (circle[0] + 0.5) * sx - 0.5, (circle[1] + 0.5) * sy - 0.5, circle[2] * math.sqrt(sx * sy)
 
-    down = align([photo.image for photo in photos[reference:]], [rough(photo) for photo in photos[reference:]])
-    up = align([photo.image for photo in photos[reference::-1]], [rough(photo) for photo in photos[reference::-1]])
+    def one_way(part: slice) -> Aligned:
+        own = photos[part]
+        return align([photo.image for photo in own], [rough(photo) for photo in own], times and times[part])
+
+    down, up = one_way(slice(reference, None)), one_way(slice(reference, None, -1))
     return Aligned(
         up.circles[:0:-1] + down.circles, up.patches[:0:-1] + down.patches, up.correlation[:0:-1] + down.correlation
     )

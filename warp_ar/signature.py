@@ -1,7 +1,7 @@
 """How this program signs the files that it writes, and knows them again.
 
-A PNG says it in its text, an OpenEXR in its header, a video in its comment, a report or a calibration in its first key,
-a response in its first line.
+A PNG says it in its text, an OpenEXR and an HDR in their headers, a video in its comment, a report or a calibration in
+its first key, a response in its first line.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ def is_signed(path: str | os.PathLike[str]) -> bool:
         return b"tEXtSoftware\0" + name in head
     if head.startswith(b"%PDF-"):
         return head.split(b"\n", 3)[2:3] == [b"% " + name]
+    if head.startswith(b"#?RADIANCE\n"):
+        return head.split(b"\n", 2)[1:2] == [b"SOFTWARE=" + name]
     if head.startswith(b"\x76\x2f\x31\x01"):
         return b"software\0string\0" + struct.pack("<I", len(name)) + name in head
     if head[4:8] == b"ftyp" or head.startswith(b"\x1a\x45\xdf\xa3"):

@@ -44,7 +44,10 @@ CONCERNS: dict[int, tuple[str, ...]] = {
     1: ("unwrap", "recover", "mirror_ball", "declip"),
     2: ("unwrap", "declip"),
     3: ("unwrap", "fill", "recover", "mirror_ball"),
-    4: ("unwrap", "bracket", "fill", "recover", "key_lights", "irradiance", "prefilter", "environment_samples"),
+    4: (
+        *("captured", "unwrap", "bracket", "fill", "recover"),
+        *("key_lights", "irradiance", "prefilter", "environment_samples"),
+    ),
     5: ("unwrap", "recover", "irradiance", "prefilter", *_RAYS, "declip"),
     6: (*(stage for stage in METHODS if stage != "visibility"), PIPELINE),
     7: ("bracket", "accumulate", "recover", "expose", PIPELINE),

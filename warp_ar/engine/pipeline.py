@@ -7,6 +7,7 @@ import dataclasses
 import math
 import numbers
 import os
+import pathlib
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,6 +20,7 @@ import warp as wp
 
 from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.carried_light import CarriedLight
+from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.modules import Progress
@@ -29,7 +31,7 @@ from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.tracking import Tracker, TrackState
-from warp_ar.scene import Pose, Scene
+from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
@@ -78,7 +80,7 @@ class Pipeline:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | str | os.PathLike[str],
         *,
         device: str = "auto",
         quality: str | Quality = DEFAULT_PRESET,
@@ -94,7 +96,7 @@ class Pipeline:
         """Plan, allocate and build.
 
         Args:
-            scene: What to show.
+            scene: What to show: a scene, a scene file, or a bundled scene's name.
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
@@ -110,8 +112,12 @@ class Pipeline:
 
         Raises:
             UsageError: An argument that cannot be used.
-            SceneError: The scene's camera does not fit ``size``.
+            SceneError: The scene cannot be used, or its camera does not fit ``size``.
         """
+        if isinstance(scene, str | os.PathLike):
+            scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
+        elif not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
         for exposure in exposures:
             _check_number("exposures", exposure, above=0.0)
         _check_exposure(scene)
@@ -133,6 +139,7 @@ class Pipeline:
         self._lit_time = 0.0
         self._index = 0
         self._shown: Any = None
+        self._borrowed = Borrowed(self.device)
         self._arrays = Arrays()
         self._light = CarriedLight(self._arrays, wanted="environment" in outputs)
         self._short: ShortFrames | None = None
@@ -251,8 +258,10 @@ class Pipeline:
         """Light one frame.
 
         Args:
-            image: uint8 RGB, a NumPy array (height, width, 3), or a Warp array (height, width) of ``wp.vec3ub`` on the
-                pipeline's device, which is used without a copy to the host unless the marker must be found.
+            image: uint8 RGB (height, width, 3) of NumPy or of whatever has ``__dlpack__`` or
+                ``__cuda_array_interface__`` (torch, JAX, CuPy), or a Warp array (height, width) of ``wp.vec3ub``. It
+                lies on the host or on the pipeline's device, where it is read without a copy to the host unless the
+                marker must be found; on a CUDA device it must stay as it is until it has been rendered.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
             pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
             exposure_time: Seconds; None means that of the frames that are shown.
@@ -290,7 +299,17 @@ class Pipeline:
             _check_number("exposure_time", exposure_time, above=0.0)
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
-        host_image = self._accept(image)
+        picture = adopt_frame(image, self.size, self.device)
+        result = self._light_frame(picture, time_seconds, pose, exposure_time, ahead=ahead)
+        if picture is not image and isinstance(picture, wp.array):
+            self._borrowed.keep(picture)
+        return result
+
+    def _light_frame(
+        self, image: Any, time_seconds: float | None, pose: Pose | None, exposure_time: float | None, *, ahead: bool
+    ) -> Result:
+        """Have a frame rendered whose arguments are in order."""
+        host_image = image if isinstance(image, np.ndarray) else None
         if pose is None and self.scene.pose is not None:
             pose = Pose(*self.scene.pose.at(self._begun))
         self._begun += 1
@@ -403,17 +422,3 @@ class Pipeline:
         shown = bright if self._shown is None else self._shown
         rendered = self._keep(Rendered(shown, self._light.environment, timings))
         return Result(pose, state, rendered.at_once(), shown=False)
-
-    def _accept(self, image: Any) -> npt.NDArray[np.uint8] | None:
-        width, height = self.size
-        if isinstance(image, wp.array):
-            if image.shape != (height, width) or image.dtype != wp.vec3ub or image.device != self.device:
-                raise UsageError(
-                    f"frame is a Warp array {image.shape} of {image.dtype.__name__} on {image.device}; "
-                    f"expected ({height}, {width}) of vec3ub on {self.device}"
-                )
-            return None
-        if not isinstance(image, np.ndarray) or image.shape != (height, width, 3) or image.dtype != np.uint8:
-            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise UsageError(f"frame is {got}; expected uint8 RGB ({height}, {width}, 3)")
-        return np.ascontiguousarray(image)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -103,3 +104,63 @@ class Result:
             return rendered.environment
         with exclusive(rendered.environment_array.device):
             return np.array(rendered.environment_array.numpy())
+
+    def _picture(self) -> Any:
+        """The lit frame where it lies: on the device, or on the host if it was sent ahead or passed as it came."""
+        rendered = self._rendered.result()
+        if rendered.image is not None or not isinstance(rendered.image_array, wp.array):
+            return self.image
+        return rendered.image_array
+
+    def __dlpack__(
+        self,
+        *,
+        stream: Any = None,
+        max_version: tuple[int, int] | None = None,
+        dl_device: tuple[int, int] | None = None,
+        copy: bool | None = None,
+    ) -> Any:
+        """The lit frame for ``torch.from_dlpack(result)`` and the like: uint8 RGB (height, width, 3), without a copy.
+
+        It lies on the pipeline's device and is overwritten by the next call: clone what is to last. Of a frame that was
+        submitted, as a ``Session`` does, it is the picture that was sent to the host, which lasts.
+
+        Args:
+            stream: The consumer's, by the protocol: it waits on the device for the kernels.
+            max_version: Of DLPack that the consumer reads.
+            dl_device: Where the consumer wants it; only where it lies can it have it.
+            copy: Whether it must be a copy.
+
+        Raises:
+            BufferError: The consumer wants a copy, or the picture on another device.
+        """
+        picture = self._picture()
+        if not isinstance(picture, wp.array):
+            return picture.__dlpack__(stream=stream, max_version=max_version, dl_device=dl_device, copy=copy)
+        if copy or (dl_device is not None and tuple(map(int, dl_device)) != self.__dlpack_device__()):
+            raise BufferError("a result is handed over without a copy, where it lies; copy it afterwards")
+        with exclusive(picture.device):
+            return picture.__dlpack__(stream=stream)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        """DLPack's kind and number of the device that holds what ``__dlpack__`` gives."""
+        kind, number = self._picture().__dlpack_device__()
+        return int(kind), int(number)
+
+    @property
+    def __cuda_array_interface__(self) -> dict[str, Any]:
+        """As ``__dlpack__``, for those who read this protocol; absent where the picture is not on a CUDA device.
+
+        It names Warp's stream, which a reader of version 3 waits for.
+        """
+        picture = self._picture()
+        if not isinstance(picture, wp.array):
+            raise AttributeError("__cuda_array_interface__: the picture is on the host")
+        interface: dict[str, Any] = dict(picture.__cuda_array_interface__)
+        return interface | {"version": 3, "stream": picture.device.stream.cuda_stream or 1}
+
+    def _repr_png_(self) -> bytes:
+        """The lit frame as PNG: what a notebook shows of a result."""
+        done, data = cv2.imencode(".png", cv2.cvtColor(self.image, cv2.COLOR_RGB2BGR))
+        assert done
+        return bytes(data)

@@ -120,7 +120,8 @@ def silhouette(camera: Camera, sphere: Array, count: int = PIECES) -> tuple[Arra
 def sphere_of_circle(camera: Camera, x: float, y: float, radius: float) -> Array:
     """Centre over radius, (3,), of the ball whose silhouette is about a circle in the picture."""
     distortion = np.array(camera.distortion)
-    circle = np.array([[[x + dx * radius, y + dy * radius]] for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+    around = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+    circle = np.array([[[x + dx * radius, y + dy * radius]] for dx, dy in around], float)
     flat = cv2.undistortPoints(circle, camera.matrix(), distortion)[:, 0]
     rays = np.column_stack([flat, np.ones(4)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

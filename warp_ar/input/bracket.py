@@ -53,6 +53,8 @@ HOLDS = 0.12
 """Logarithm of the factor by which a step may be off what the pixels say."""
 CONTRADICTS = 0.3
 """The same where a response is estimated with it: beyond, no response explains the exposures."""
+FAR = 40.0
+"""Ratio of exposures beyond which what one shows is black or white in the other."""
 FEATURELESS = 6.0
 """Standard deviation of codes below which a picture shows nothing."""
 MOVED = 0.75
@@ -165,18 +167,25 @@ def register(reference: Image, other: Image, disc: NDArray[np.bool_]) -> tuple[A
     return move, alike(move)
 
 
-def align(images: Sequence[Image], circles: Sequence[Circle]) -> Aligned:
+def align(images: Sequence[Image], circles: Sequence[Circle], exposures: Sequence[float] | None = None) -> Aligned:
     """Lay pictures of one ball over each other, each over its neighbour toward the first.
 
     Args:
         images: uint8 RGB, in order of exposure.
         circles: About where the ball is in each.
+        exposures: Of each, if known: pictures more than ``FAR`` apart have nothing in common to be aligned by.
     """
     size = int(min(PATCH, max(48, 2.1 * circles[0][2])))
     rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
     disc = np.hypot(rows, columns) < 0.93 * size / 2.1
     found, patches, correlation = [circles[0]], [cut_ball(images[0], circles[0], size)], [1.0]
-    for image, (x, y, radius) in zip(images[1:], circles[1:], strict=True):
+    for k, (image, (x, y, radius)) in enumerate(zip(images[1:], circles[1:], strict=True)):
+        apart = 1.0 if exposures is None else abs(math.log(exposures[k] / exposures[k + 1]))
+        if apart > math.log(FAR):
+            found.append((x, y, radius))
+            patches.append(cut_ball(image, (x, y, radius), size))
+            correlation.append(math.nan)
+            continue
         move, told = register(patches[-1], cut_ball(image, (x, y, radius), size), disc)
         pixel = 2.1 * radius / size
         circle = x + pixel * move[0], y + pixel * move[1], radius * math.exp(move[2])

@@ -176,6 +176,8 @@ class EvidenceConfig:
     """Of draws that an estimate may be too much for."""
     safety: float = 1.0
     """Of what the others allow."""
+    enough: float = 0.5
+    """Factor from which shading is taken, and not compared with the card alone: it knows where light comes from."""
     lever: float = 2.0
     """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
     lights the card is hardly known by it."""

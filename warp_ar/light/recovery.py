@@ -320,6 +320,8 @@ def _weigh(
         added = form @ (excess[:, c] * problem.lacking[:, c])
         factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
+    if found[0][1].factor >= CONFIG.evidence.enough:
+        return found[0][1]
     return max(found, key=lambda one: one[0])[1]
 
 

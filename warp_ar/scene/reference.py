@@ -18,6 +18,7 @@ from warp_ar.scene import description
 from warp_ar.scene.description import (
     Animation,
     Camera,
+    CapturedLight,
     Exposure,
     LambertMaterial,
     Light,
@@ -80,7 +81,13 @@ SECTIONS: Final[tuple[Section, ...]] = (
         (PhongMaterial, MetallicRoughnessMaterial, LambertMaterial, MirrorMaterial),
     ),
     Section("object.animate", False, "Motion of an object; a light's `animate` has the same keys.", (Animation,)),
-    Section("light", True, "A virtual light.", (Light,)),
+    Section(
+        "light",
+        True,
+        "A virtual light or, with `file`, the environment's light as `warp_ar.capture` wrote it; one may be [light].",
+        (Light, CapturedLight),
+    ),
+    Section("pose", False, "Where the camera stands, where no marker tells.", ()),
     Section("exposure", False, "A simulated shorter exposure.", (Exposure,)),
 )
 
@@ -166,12 +173,29 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
         "{ sway = [0.05, 0.0, 0.0] }",
         'kind = "point"\nat = [0.0, 0.0, 0.4]\nintensity = 2.0',
     ),
+    ("light", "file"): ("-", '"light.exr"', ""),
+    ("light", "scale"): ("-", "0.5", 'file = "light.exr"'),
+    ("light", "rotate"): ("degrees", "[0.0, 0.0, 30.0]", 'file = "light.exr"'),
+    ("pose", "R"): ("-", "[1, 0, 0, 0, 0, -1, 0, 1, 0]", "t = [0.0, 0.1, 0.6]"),
+    ("pose", "t"): ("metres", "[0.0, 0.1, 0.6]", "R = [1, 0, 0, 0, 0, -1, 0, 1, 0]"),
+    ("pose", "quaternion"): ("-", "[0.7, 0.7, 0.0, 0.0]", "t = [0.0, 0.1, 0.6]"),
+    ("pose", "position"): ("metres", "[0.0, -0.6, 0.1]", ""),
+    ("pose", "rotate"): ("degrees", "[-20.0, 0.0, 0.0]", "position = [0.0, -0.6, 0.3]"),
+    ("pose", "file"): ("-", '"images.txt"', ""),
     ("exposure", "scale"): ("-", "0.5", ""),
 }
 
 # Keys that are no fields of a dataclass.
 _MEANINGS: Final[dict[tuple[str, str], str]] = {
-    ("camera", "calibration"): "A calibration file, OpenCV's YAML, JSON or XML, instead of the numbers.",
+    ("camera", "calibration"): (
+        "A calibration file, OpenCV's YAML, JSON or XML, instead of the numbers; `exif`: EXIF of [source] path's first."
+    ),
+    ("pose", "R"): "Rotation of camera_from_world, row by row, as OpenCV has it: x right, y down, z forward.",
+    ("pose", "t"): "Translation of camera_from_world, beside R or quaternion.",
+    ("pose", "quaternion"): "Rotation of camera_from_world as COLMAP has it: w, x, y, z.",
+    ("pose", "position"): "Where the camera stands, instead of camera_from_world.",
+    ("pose", "rotate"): "About the fixed x, then y, then z axis, from a level camera that looks along +y.",
+    ("pose", "file"): "A pose for every frame: COLMAP's images.txt in order of name, or a JSON list of R and t.",
     ("object.material", "model"): "The reflection model; each has keys of its own.",
 }
 
@@ -208,7 +232,7 @@ def _default(section: Section, name: str) -> str:
         return "required" if name == "size" else "1.0"
     fields = [field for kind in section.kinds for field in dataclasses.fields(kind) if field.name == name]
     if not fields:
-        return "none" if name == "calibration" else "required"
+        return "none" if name == "calibration" or section.name == "pose" else "required"
     values = list(dict.fromkeys(_toml(field.default) for field in fields))
     return " or ".join(values)
 

@@ -1,0 +1,105 @@
+"""Errors of light and picture for each fault of a simulated camera, alone and all together.
+
+Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual things really there, which the
+program's is compared with. Clipped pixels of those frames stay at 1 before the sensor: the lens mixes them too dark.
+``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import flip_evaluator
+import numpy as np
+
+from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.scene import load_scene
+from warp_ar.session import Session
+
+TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
+QUALITY = "medium"
+
+
+def read(path: Path) -> Any:
+    return cv2.imread(str(path))[..., ::-1]
+
+
+def irradiance(radiance: Any) -> Any:
+    small = cv2.resize(np.asarray(radiance, np.float32), (64, 32), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    d = latlong_directions(32).reshape(-1, 3)
+    area = np.broadcast_to(texel_solid_angles(32), (32, 64)).reshape(-1, 1)
+    return np.maximum(latlong_directions(16).reshape(-1, 3) @ d.T, 0.0) @ (area * small)
+
+
+def flip(truth: Any, picture: Any) -> Any:
+    pair = [np.ascontiguousarray(image, np.float32) / 255 for image in (truth, picture)]
+    return flip_evaluator.evaluate(*pair, "LDR", applyMagma=False)[0].squeeze()
+
+
+def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, float]:
+    """Share of the picture's error that is kept, and errors of light and pose."""
+    names = sorted(path.name for path in (case / "camera").glob("*.png"))
+    phase = np.linspace(0.0, 1.0, len(names))
+    truths = sorted(path.name for path in (case / version).glob("*.png"))
+    clean = {name: decode_srgb(read(case / "camera" / name)) for name in names}
+    frames = expose([clean[name] for name in names], faults)
+    # The same clip with the things there, so that its noise, codec and drift are the same camera's.
+    there = [decode_srgb(read(case / version / name)) if name in truths else clean[name] for name in names]
+    wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
+    scene = load_scene(case / f"scene_{version}.toml")
+    known = (faults.distortion, 0.0, 0.0, 0.0, 0.0)
+    if faults.distortion:
+        # The calibration knows the lens: its focal length here is the picture's width.
+        scale = (scene.camera.fx / scene.camera.width) ** 2
+        known = (faults.distortion * scale, 0.0, 0.0, 0.0, 0.0)
+        scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, distortion=known))
+    kept, nothing, light, angles, shifts = [], [], [], [], []
+    poses = json.loads((case / "case.json").read_text())["poses"]
+    with tempfile.TemporaryDirectory() as folder:
+        for name, frame in zip(names, frames, strict=True):
+            cv2.imwrite(str(Path(folder) / name), frame[..., ::-1])
+        with Session(scene, source=folder, device=device, quality=QUALITY, outputs=("image", "environment")) as session:
+            for index, (name, (_, result)) in enumerate(zip(names, session, strict=False)):
+                gain = 1.0 + faults.exposure_drift * np.sin(2 * np.pi * phase[index])
+                tint = 1.0 + faults.white_balance_drift * np.array([1, 0, -1]) * phase[index]
+                env = case / "env" / f"{Path(name).stem}.npy"
+                if env.exists() and result.environment is not None:
+                    truth = irradiance(np.load(env) * gain * tint)
+                    light.append(np.linalg.norm(irradiance(result.environment) - truth) / np.linalg.norm(truth))
+                if result.pose is not None:
+                    turn = result.pose.rotation @ np.array(poses[index]["R"]).T
+                    angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+                    shifts.append(1e3 * np.linalg.norm(result.pose.translation - np.array(poses[index]["t"])))
+                if name in truths:
+                    difference = np.abs(wanted[name].astype(float) - frames[index]).max(-1)
+                    changed = cv2.GaussianBlur(difference, (0, 0), 3) > 5
+                    mask = cv2.dilate(changed.astype(np.uint8), np.ones((9, 9))) > 0
+                    kept.append(flip(wanted[name], result.image)[mask].mean())
+                    nothing.append(flip(wanted[name], frames[index])[mask].mean())
+    return {
+        "kept": float(np.mean(kept) / np.mean(nothing)),
+        "light": float(np.mean(light)) if light else float("nan"),
+        "pose_degrees": float(np.mean(angles)) if angles else float("nan"),
+        "pose_mm": float(np.mean(shifts)) if shifts else float("nan"),
+        "posed": len(angles) / len(names),
+    }
+
+
+def main(device: str) -> None:
+    if not TRUTH.is_dir():
+        print(f"camera_faults: no {TRUTH}; nothing to compare with")
+        return
+    cases = os.environ.get("WARP_AR_FAULT_CASES", "plastic_bunny_sunset,gold_torus_interior").split(",")
+    chosen = os.environ.get("WARP_AR_FAULTS", ",".join([*ALONE, "all"])).split(",")
+    for case in cases:
+        for fault in chosen:
+            figures = score(TRUTH / case, "both", ALL if fault == "all" else ALONE[fault], device)
+            rounded = {name: round(value, 4) for name, value in figures.items()}
+            print(json.dumps({"bench": "camera_faults", "case": case, "fault": fault, **rounded}), flush=True)

@@ -1,0 +1,92 @@
+"""The table of formats: every row has its test, every ending that the code takes has its row."""
+
+from __future__ import annotations
+
+import ast
+import pathlib
+import re
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+import warp_ar
+from tests.test_sources import write_video
+from warp_ar.input.frame_folder import IMAGE_SUFFIXES
+from warp_ar.input.sources import open_source
+from warp_ar.output.environment_file import ENVIRONMENT_SUFFIXES
+from warp_ar.output.video_sink import VIDEO_SUFFIXES
+from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+
+ROOT = pathlib.Path(warp_ar.__file__).parents[1]
+PAGE = ROOT / "docs" / "formats.md"
+LOSSY = 12  # codes by which a smooth picture changes in JPEG or WebP of OpenCV's default quality, or in video
+
+
+def rows(section: str) -> list[list[str]]:
+    """Cells of a section's table, without its head."""
+    text = PAGE.read_text(encoding="utf-8").split(f"## {section}\n")[1].split("\n## ")[0]
+    lines = [line for line in text.splitlines() if line.startswith("|")][2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.mark.parametrize("row", rows("In") + rows("Out"), ids=lambda row: f"{row[0]}: {row[1][:20]}")
+def test_every_row_has_its_test(row: list[str]) -> None:
+    assert len(row) == 4
+    file, name = row[3].strip("`").split("::")
+    tree = ast.parse((ROOT / "tests" / f"{file}.py").read_text(encoding="utf-8"))
+    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+@pytest.mark.parametrize(
+    ("section", "what", "suffixes"),
+    [
+        ("In", "frames", IMAGE_SUFFIXES),
+        ("In", "mesh", MESH_SUFFIXES),
+        ("Out", "lit frames", VIDEO_SUFFIXES),
+        ("Out", "environment", ENVIRONMENT_SUFFIXES),
+    ],
+)
+def test_every_ending_has_its_row(section: str, what: str, suffixes: tuple[str, ...]) -> None:
+    told = {ending for row in rows(section) if row[0] == what for ending in re.findall(r"`(\.\w+)`", row[1])}
+    assert told == set(suffixes)
+
+
+def smooth() -> np.ndarray:
+    ramp = np.linspace(20, 220, 64)
+    return np.stack([np.tile(ramp, (48, 1)), np.full((48, 64), 90.0), np.tile(ramp[::-1], (48, 1))], 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("suffix", sorted(IMAGE_SUFFIXES))
+def test_pictures_of_every_ending_are_frames(tmp_path: pathlib.Path, suffix: str) -> None:
+    (tmp_path / f"0{suffix}").write_bytes(cv2.imencode(suffix, smooth()[..., ::-1])[1].tobytes())
+    with open_source(tmp_path) as source:
+        frames = [frame.image for frame in source]
+    assert len(frames) == 1
+    allowed = LOSSY if suffix in (".jpg", ".jpeg", ".webp") else 0
+    assert np.abs(frames[0].astype(int) - smooth()).max() <= allowed
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"),
+    [(".mp4", "libx264"), (".mkv", "libx264"), (".mov", "libx264"), (".webm", "libvpx-vp9"), (".avi", "mjpeg")],
+)
+def test_videos_of_every_ending_are_frames(tmp_path: pathlib.Path, suffix: str, codec: str) -> None:
+    pictures = [smooth(), smooth()[:, ::-1].copy(), smooth()]
+    path = write_video(tmp_path / f"clip{suffix}", pictures, codec=codec)
+    with open_source(path) as source:
+        frames = [frame.image for frame in source]
+    assert len(frames) == len(pictures)
+    for frame, picture in zip(frames, pictures, strict=True):
+        assert np.abs(frame.astype(int) - picture).mean() <= LOSSY
+
+
+def test_a_gltf_is_a_mesh(tmp_path: pathlib.Path) -> None:
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(box))
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    mesh = load_mesh(tmp_path / "model.gltf")
+    np.testing.assert_allclose(sorted(np.ptp(mesh.vertices, axis=0)), (1.0, 2.0, 3.0), atol=1e-6)
+    assert len(mesh.faces) == 12

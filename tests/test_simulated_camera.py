@@ -1,0 +1,88 @@
+"""The simulated camera does what its fields say."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
+
+GREY = np.full((96, 128, 3), 0.2)
+
+
+def one(light, **faults):
+    return expose([light], Faults(**faults), phase=[0.0])[0]
+
+
+def test_a_perfect_camera_is_srgb():
+    ramp = np.repeat(np.linspace(0, 1.3, 128)[None, :, None], 96, 0).repeat(3, 2)
+    codes = one(ramp)
+    assert np.abs(decode_srgb(codes) - np.clip(ramp, 0, 1)).max() < 0.005  # half a code where sRGB is steepest
+    assert (codes[:, -1] == 255).all()
+
+
+def test_lamps_end_at_the_saturation_level():
+    assert one(np.full((8, 8, 3), 50.0), saturation=238).max() == 238
+
+
+def test_corners_lose_what_vignetting_says():
+    light = decode_srgb(one(GREY, vignetting=0.35))
+    assert light[48, 64, 1] == pytest.approx(0.2, abs=0.002)
+    assert light[0, 0, 1] == pytest.approx(0.2 * 0.65, abs=0.002)
+
+
+def test_distortion_is_opencvs():
+    board = np.zeros((240, 320, 3))
+    board[60:180, 80:240] = 0.8
+    seen = one(board, distortion=-0.2)[..., 1].astype(float)
+    matrix = np.array([[320.0, 0, 159.5], [0, 320.0, 119.5], [0, 0, 1]])
+    corner = np.array([[(79.5 - 159.5) / 320, (59.5 - 119.5) / 320, 1.0]])
+    want = cv2.projectPoints(corner, np.zeros(3), np.zeros(3), matrix, np.array([-0.2, 0, 0, 0, 0]))[0].ravel()
+    edge_x = np.interp(-seen.max() / 2, -seen[120, 160:60:-1], np.arange(160, 60, -1))
+    inside = seen[int(round(want[1])) + 2, int(round(want[0])) + 2]
+    outside = seen[int(round(want[1])) - 2, int(round(want[0])) - 2]
+    assert inside > 180
+    assert outside < 20
+    assert edge_x > 80.0  # k1 below 0 draws the picture in
+
+
+def test_drifts_follow_the_clip():
+    frames = [decode_srgb(f).mean((0, 1)) for f in expose([GREY] * 5, Faults(exposure_drift=0.33))]
+    assert frames[1][1] / frames[0][1] == pytest.approx(1.33, rel=0.02)
+    assert frames[3][1] / frames[0][1] == pytest.approx(0.67, rel=0.03)
+    last = decode_srgb(expose([GREY] * 5, Faults(white_balance_drift=0.15))[-1]).mean((0, 1))
+    assert last[0] / last[2] == pytest.approx(1.15 / 0.85, rel=0.03)
+
+
+def test_noise_grows_with_light_and_the_curve_has_contrast():
+    noise = [decode_srgb(one(np.full((96, 96, 3), level), noise=0.02)).std() for level in (0.05, 0.5)]
+    assert noise[1] / noise[0] == pytest.approx(np.sqrt((0.5 + 0.01) / (0.05 + 0.01)), rel=0.1)
+    dark, bright = (int(one(np.full((8, 8, 3), level), s_curve=1.0)[0, 0, 0]) for level in (0.03, 0.5))
+    assert dark < int(one(np.full((8, 8, 3), 0.03))[0, 0, 0]) - 7
+    assert bright > int(one(np.full((8, 8, 3), 0.5))[0, 0, 0]) + 8
+
+
+def test_a_hand_passes_in_the_middle_of_the_clip():
+    frames = expose([GREY] * 7, Faults(hand=True))
+    assert [bool(np.ptp(frame) > 5) for frame in frames] == [False, False, False, True, False, False, False]
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "h264"])
+def test_codecs_keep_the_picture_and_blur_chroma(codec):
+    half = np.full((96, 128, 3), 0.3)
+    half[:, 63:] = (0.6, 0.05, 0.05)
+    plain, packed = expose([half] * 2, Faults()), expose([half] * 2, Faults(codec=codec))
+    assert len(packed) == 2
+    difference = np.abs(packed[1].astype(int) - plain[1])
+    assert np.median(difference) <= 3
+    assert difference[:, 61:66].max() > 8
+
+
+def test_every_fault_changes_the_picture():
+    light = np.random.default_rng(1).random((64, 96, 3)) * np.linspace(0.1, 1.4, 96)[None, :, None]
+    plain = expose([light] * 7, ALONE["none"])
+    for name, faults in [*ALONE.items(), ("all", ALL)]:
+        assert any((a != b).any() for a, b in zip(expose([light] * 7, faults), plain, strict=True)) == (name != "none")
+    used = {f.name for f in dataclasses.fields(Faults) if getattr(ALL, f.name) != f.default}
+    assert used == {f.name for f in dataclasses.fields(Faults)} - {"seed"}

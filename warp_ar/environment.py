@@ -1,0 +1,89 @@
+"""``python -m warp_ar.environment FILE --output OTHER``: an environment in the axes and format of another program."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import datetime
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.errors import UsageError
+from warp_ar.output.environment_axes import AXES, LAYOUTS
+from warp_ar.output.environment_file import (
+    ENVIRONMENT_SUFFIXES,
+    read_environment,
+    read_environment_info,
+    write_environment,
+)
+from warp_ar.output.places import check_places, check_replaceable
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.environment",
+        description="Write an environment in the axes and format of another program.",
+    )
+    add = parser.add_argument
+    add("environment", type=Path, metavar="FILE", help="a latlong OpenEXR, such as --save-environment of live writes")
+    add("--output", type=Path, required=True, metavar="FILE", help="an .exr, .hdr, or .json of spherical harmonics")
+    text = "z-up (this program's own), blender (three.js too), y-up (OpenEXR, USD), opengl (default: y-up)"
+    add("--axes", choices=AXES, default="y-up", help=text)
+    add("--layout", choices=LAYOUTS, default="latlong", help="latlong, or the six faces of a cube (default: latlong)")
+    add("--size", type=int, metavar="TEXELS", help="edge of a cube's faces (default: half the rows of the environment)")
+    add("--taken", type=_time, metavar="TIME", help="when it was captured, such as 2026-05-01T12:00:00+02:00")
+    text = "where: longitude and latitude in degrees, altitude in metres"
+    add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)
+    add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: as the file says)")
+    add("--overwrite", action="store_true", help="replace a file that this program did not write")
+    return parser
+
+
+def _time(text: str) -> datetime.datetime:
+    try:
+        return datetime.datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a time such as 2026-05-01T12:00:00+02:00") from None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: convert(make_parser().parse_args(arguments)))
+
+
+def convert(options: argparse.Namespace) -> int:
+    """Read, turn and write."""
+    output: Path = options.output
+    if output.suffix.lower() not in ENVIRONMENT_SUFFIXES:
+        raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(ENVIRONMENT_SUFFIXES)}")
+    if options.size is not None and options.layout != "cube":
+        raise UsageError(f"--size {options.size} is the edge of a cube's faces; add --layout cube")
+    check_places({"the environment": [options.environment]}, {"--output": output})
+    given = {
+        "taken": options.taken,
+        "place": None if options.place is None else tuple(options.place),
+        "white_luminance": options.white_luminance,
+    }
+    info = read_environment_info(options.environment)
+    info = dataclasses.replace(info, **{name: value for name, value in given.items() if value is not None})
+    radiance = read_environment(options.environment)
+    replaced = check_replaceable(output, overwrite=options.overwrite)
+    write_environment(
+        output,
+        radiance,
+        overwrite=options.overwrite,
+        axes=options.axes,
+        layout=options.layout,
+        size=options.size,
+        info=info,
+    )
+    if replaced:
+        say(replaced)
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
