@@ -402,7 +402,7 @@ def test_a_ball_that_is_never_seen_ends_with_1(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_a_picture_that_never_changes_ends_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    far = OBJECT.replace("at = [0.1, 0.0, 0.03]", "at = [100.0, 0.0, 0.03]")
+    far = PROBE + OBJECT.replace("at = [0.1, 0.0, 0.03]", "at = [100.0, 0.0, 0.03]")
     assert run(write_scene(tmp_path, body=far), "--headless", "--frames", 2) == 1
     said = capsys.readouterr().err.splitlines()
     assert "100 millimetres are 0.1 m" in said[0] or "100 centimetres are 1 m" in said[0]
@@ -410,7 +410,7 @@ def test_a_picture_that_never_changes_ends_with_1(tmp_path: Path, capsys: pytest
 
 
 def test_a_guessed_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scene = write_scene(tmp_path, body=OBJECT)
+    scene = write_scene(tmp_path, body=PROBE + OBJECT)
     text = re.sub(r"(?m)^(width|height|fx|fy|cx|cy) = .*\n", "", scene.read_text())
     scene.write_text(text.replace("[camera]", "[camera]\nfield_of_view = 50.0"))
     assert run(tmp_path, "--headless", "--frames", 2) == 0  # the folder, which holds one scene

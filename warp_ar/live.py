@@ -211,7 +211,10 @@ def _quick_check(options: argparse.Namespace, scene: Scene) -> None:
 
     source = source_of(scene, options.source)
     recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
-    found = check_up(scene, source if recorded else None, quick=True)
+    try:
+        found = check_up(scene, source if recorded else None, quick=True)
+    except WarpArError:
+        return  # the run meets it too, and says it
     # What the run itself cannot start with, it says itself.
     found = [finding for finding in found if not finding.name.startswith(("source.", "marker.", "camera.aspect"))]
     worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
