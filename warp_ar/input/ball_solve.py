@@ -167,4 +167,6 @@ def _minimise(residuals: object, start: Array, free: NDArray[np.int_], frames: i
             break
     e = residuals(x)
     spread = max(1.0, float(np.median(np.abs(e))) / 0.6745) ** 2
-    return x, np.asarray(np.linalg.pinv(normal) * spread * frames, float)
+    # Not a pseudo-inverse, which would call certain what the frames do not tell at all.
+    certain = normal + 1e-12 * np.trace(normal) * np.eye(len(free))
+    return x, np.asarray(np.linalg.inv(certain) * spread * frames, float)
