@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.hard_cases.rig import blind_camera
 from tests.reference import latlong
 from warp_ar.kernels import change
 from warp_ar.scene import Camera, Marker, Probe, Scene
@@ -63,6 +64,8 @@ def test_readers_lag_by_no_more_than_the_stated_bound(device):
     arrays = Arrays()
     arrays.add("environment_radiance", wp.zeros((16, 32), dtype=wp.vec3))
     arrays.add("environment_confidence", wp.full((16, 32), 1.0, dtype=wp.float32))
+    for name, value in blind_camera().items():
+        arrays.add(name, value)
     stage, passes = build(Fill, arrays, device)
     d, area = latlong.directions(16, 32).reshape(-1, 3), latlong.solid_angles(16, 32).reshape(-1, 1)
     lobes = np.maximum(d @ d.T, 0) / np.pi

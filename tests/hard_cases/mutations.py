@@ -355,9 +355,9 @@ MUTATIONS = (
     Mutation(
         16,
         "any array is a frame",
-        "warp_ar/engine/pipeline.py",
-        "image.shape != (height, width, 3) or image.dtype != np.uint8",
-        "image.ndim != 3",
+        "warp_ar/engine/frame_exchange.py",
+        "if image.shape != expected or image.dtype != np.uint8:",
+        "if image.ndim != 3:",
         f"{HARD}test_rows15_16_input.py::test_what_is_no_frame_is_refused_and_the_next_one_works",
     ),
     Mutation(

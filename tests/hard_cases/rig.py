@@ -19,6 +19,8 @@ import warp as wp
 from warp_ar.engine.graph import Plan, make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.input.tracking import Track, TrackState
+from warp_ar.kernels.structs import FrameParams, RayScene
+from warp_ar.kernels.structs import Probe as BallRecord
 from warp_ar.scene import (
     Camera,
     Exposure,
@@ -353,6 +355,18 @@ def _spec_of(name: str, features: Features) -> ArraySpec:
     raise ValueError(f"no stage writes {name}")
 
 
+def blind_camera() -> dict[str, Any]:
+    """What stages read of a camera that looks nowhere: no direction is projected into its picture."""
+    return {
+        "pose": None,
+        "frame": wp.zeros((1, 1), dtype=wp.vec3ub),
+        "decode": wp.zeros(257, dtype=wp.vec3),
+        "params": wp.zeros(1, dtype=FrameParams),
+        "probes": wp.zeros(0, dtype=BallRecord),
+        "ray_scene": RayScene(),
+    }
+
+
 class LoneStage:
     """A stage of the environment by itself, with an environment of any height."""
 
@@ -367,9 +381,12 @@ class LoneStage:
         self.stage = kind(features, wiring)
         self.arrays = Arrays()
         with wp.ScopedDevice(device):
+            for name, value in blind_camera().items():
+                self.arrays.add(name, value)
             for read in wiring.reads:
-                spec = _spec_of(read, features)
-                self.arrays.add(read, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
+                if read not in self.arrays:
+                    spec = _spec_of(read, features)
+                    self.arrays.add(read, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             for own, spec in self.stage.arrays().items():
                 self.arrays.add(own, wp.full(spec.shape, spec.fill, dtype=spec.dtype))
             self.passes = self.stage.build(self.arrays, wp.get_device(device))

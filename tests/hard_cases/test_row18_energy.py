@@ -32,6 +32,7 @@ def test_a_constant_environment_under_any_mask(rig_for, seed, hidden, exponent):
     """Whatever is hidden in whichever frame: what is known has the environment's radiance to the bit, and so has the
     rest."""
     rig = rig_for("fill", "default")
+    rig.set_params(world_from_camera=np.zeros((3, 3)))  # the camera looks nowhere: its frame is no constant environment
     rng = np.random.default_rng(seed)
     radiance = np.float32(10.0**exponent)
     rig.poke("environment_confidence", 0.0)

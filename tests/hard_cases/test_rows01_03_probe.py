@@ -124,9 +124,9 @@ def test_a_constant_frame_is_a_constant_map(rig_for, method, eye, code):
 def test_a_ball_that_is_not_to_be_seen_leaves_the_light_alone(rig_for, method):
     """Documented fallback: no confidence, and the map stays as it was."""
     rig = rig_for("unwrap", method)
+    outputs = see_ball(rig, CENTER + 0.5 * RADIUS)  # from inside the ball
     rig.run("fill")
     before = rig.written("fill")
-    outputs = see_ball(rig, CENTER + 0.5 * RADIUS)  # from inside the ball
     assert (outputs["probe_confidence"] == 0).all()
     np.testing.assert_allclose(rig.run("accumulate")["environment_radiance"], rig.get("environment_radiance"))
     for name, values in rig.run("fill").items():
