@@ -24,7 +24,7 @@ HEIGHTS = (64, 128)
 
 @dataclasses.dataclass
 class Setup:
-    """A uniform environment around the bundled desk, with a lamp that clips."""
+    """A uniform environment around the bundled desk, with an emitter that clips."""
 
     height: int
     device: str
@@ -47,12 +47,12 @@ class Setup:
             self.probes = wp.array(probes, dtype=structs.Probe)
             self.radiance = wp.full(shape, wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3)
             self.clipped = wp.array(clipped, dtype=wp.vec3)
-            self.lacking = wp.zeros(shape, dtype=wp.vec3)
+            self.missing = wp.zeros(shape, dtype=wp.vec3)
             self.params = wp.array(params, dtype=structs.FrameParams)
             self.confidence = wp.full(shape, 1.0, dtype=wp.float32)
             self.recovered = wp.zeros(shape, dtype=wp.vec3)
             self.cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell)
-            self.excess = wp.zeros(self.cells.shape, dtype=wp.vec3)
+            self.recovered = wp.zeros(self.cells.shape, dtype=wp.vec3)
             seen = np.zeros(count, np.dtype(kernels.Observation.numpy_dtype()))
             ink = surfaces.kinds[surfaces.surface] == Kind.INK
             seen["visible"], seen["radiance"] = 1.0, np.where(ink, 0.02, 0.25)[:, None]
@@ -64,11 +64,11 @@ class Setup:
 
     def weigh(self) -> None:
         """Weigh the rims of what clips."""
-        kernels.weigh_rims(self.clipped, self.params, self.probes, self.lacking)
+        kernels.weigh_boundaries(self.clipped, self.params, self.probes, self.missing)
 
     def condense(self) -> None:
         """Condense the map."""
-        arrays = (self.radiance, self.confidence, self.clipped, self.lacking, self.probes, self.scene, self.cells)
+        arrays = (self.radiance, self.confidence, self.clipped, self.missing, self.probes, self.scene, self.cells)
         kernels.condense_cells(*arrays, proxies=self.proxies)
 
     def trace(self) -> None:
@@ -79,7 +79,7 @@ class Setup:
 
     def add(self) -> None:
         """Apply an excess."""
-        kernels.add_excess(self.radiance, self.confidence, self.lacking, self.cells, self.excess, self.recovered)
+        kernels.add_recovered(self.radiance, self.confidence, self.missing, self.cells, self.recovered, self.recovered)
 
     def solve(self) -> recovery.Estimate:
         """Solve on the host, warm after the first call."""
@@ -93,7 +93,7 @@ def check(setup: Setup) -> None:
     setup.trace()
     setup.add()
     total = (setup.transfer.numpy() + setup.mirrored.numpy()).sum(axis=1).max()
-    if abs(total / np.pi - 1.0) > 0.02 or not np.isfinite(setup.solve().excess).all():
+    if abs(total / np.pi - 1.0) > 0.02 or not np.isfinite(setup.solve().recovered).all():
         raise AssertionError(f"the largest irradiance of a uniform environment is {total}, not pi")
 
 

@@ -1,17 +1,17 @@
 """What else the frame says about the environment: how bright surfaces are, and which part of it lights them.
 
-The ball clips where lamps and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
+The ball clips where emitters and windows are. Surfaces that the scene models (the white card, planes, boxes) do not, or
 not there, and are lit by the same light. A surface point x with normal n and reflectance rho that shows the camera the
 radiance L receives
 
     E(x) = pi L / rho = sum over the environment's cells m of T(x, m) radiance(m),     T(x, m) = cos solid_angle
     visibility.
 
-The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_lamps``
-the same for lamps at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
-``add_excess`` puts it into the map.
+The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_emitters``
+the same for emitters at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
+``add_recovered`` puts it into the map.
 
-**Rims.** Half a pixel around a lamp clips as well: ``weigh_rims``.
+**Rims.** Half a pixel around an emitter clips as well: ``weigh_boundaries``.
 
 **Cells.** The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each
 with its mean radiance, its share at clipping, and the direction in which that share lies.
@@ -65,10 +65,11 @@ GRAZING = wp.constant(wp.float32(1.0e-3))
 MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
 """Radians: balls of less than ten pixels are taken to have ten."""
 WIDE = wp.constant(wp.float32(6.0))
-"""Half pixels: what is wider clips hardly beyond its rim, for it is not so much brighter than clipping as a lamp is."""
+"""Half pixels: what is wider clips hardly beyond its rim, for it is not so much brighter than clipping as an emitter
+is."""
 SHARPNESS = wp.constant(wp.float32(2.0))
-"""Exponent of the share around a texel of the smallest lamp."""
-RIM_REACH = wp.constant(2)
+"""Exponent of the share around a texel of the smallest emitter."""
+BOUNDARY_REACH = wp.constant(2)
 """Samples of a Gaussian to each side, one standard deviation apart."""
 MOST_LEFT = wp.constant(wp.float32(4.0))
 """How much more light what still clips of a cell may get because less of it clips."""
@@ -102,7 +103,7 @@ class Cell:
 
     radiance: wp.vec3  # mean, as captured
     clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
-    lacking: wp.vec3  # the same, rims of what clips counting less
+    missing: wp.vec3  # the same, rims of what clips counting less
     hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
     modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
     middle: wp.vec3  # unit
@@ -135,15 +136,15 @@ def mean_around(
     sine = wp.sin(PI * (wp.float32(i) + 0.5) / height)
     total = wp.vec3(0.0, 0.0, 0.0)
     total_weight = wp.float32(0.0)
-    a = wp.int32(-RIM_REACH)
+    a = wp.int32(-BOUNDARY_REACH)
     if sine < near_pole * deviation:
         # A circle of latitude is no straight line here.
         direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
         across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
         upward = wp.cross(across, direction)
-        while a <= RIM_REACH:
-            b = wp.int32(-RIM_REACH)
-            while b <= RIM_REACH:
+        while a <= BOUNDARY_REACH:
+            b = wp.int32(-BOUNDARY_REACH)
+            while b <= BOUNDARY_REACH:
                 toward = direction + deviation * (wp.float32(a) * across + wp.float32(b) * upward)
                 weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
                 total += weight * sample_latlong(clipped, toward)
@@ -154,11 +155,11 @@ def mean_around(
     down_step = deviation * height / PI
     across_step = deviation * width / (2.0 * PI * sine)
     # One row of samples at a time, those unrolled: their loads do not wait for each other.
-    while a <= RIM_REACH:
+    while a <= BOUNDARY_REACH:
         y = wp.float32(i) + down_step * wp.float32(a)
         row = wp.int32(wp.floor(y))
         part = y - wp.floor(y)
-        for b in range(wp.static(-RIM_REACH), wp.static(RIM_REACH + 1)):
+        for b in range(wp.static(-BOUNDARY_REACH), wp.static(BOUNDARY_REACH + 1)):
             x = wp.float32(j) + across_step * wp.float32(b)
             top = sample_row(clipped, row, x)
             weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
@@ -169,21 +170,21 @@ def mean_around(
 
 
 @wp.kernel(enable_backward=False)
-def weigh_rims_kernel(
+def weigh_boundaries_kernel(
     # In:
     row_start: wp.int32,
     clipped: wp.array2d[wp.vec3],
     params: wp.array[FrameParams],
     probes: wp.array[Probe],
     # Out:
-    lacking_out: wp.array2d[wp.vec3],
+    missing_out: wp.array2d[wp.vec3],
 ):
     """A texel times a power of the mean around it."""
     i, j = wp.tid()
     i += row_start
     share = clipped[i, j]
     if not wp.max(share) > 0.0:
-        lacking_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
         return
     to_ball = probes[0].center - params[0].camera_position
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
@@ -194,14 +195,14 @@ def weigh_rims_kernel(
         # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
         wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
         near = wp.pow(near, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
-    lacking_out[i, j] = share * near
+    missing_out[i, j] = share * near
 
 
-def weigh_rims(
+def weigh_boundaries(
     clipped: wp.array,
     params: wp.array,
     probes: wp.array,
-    lacking_out: wp.array,
+    missing_out: wp.array,
     *,
     rows: Rows | None = None,
 ) -> None:
@@ -213,21 +214,21 @@ def weigh_rims(
 
         2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
 
-    A lamp of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep their rims (w
-    is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
+    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep their rims
+    (w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
 
     Args:
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
         params: ``FrameParams`` (1): the camera.
         probes: ``Probe`` (P), at least one: the ball.
-        lacking_out: ``wp.vec3`` (h, w), 0 where nothing clips.
+        missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
         rows: Band of rows, None for all.
     """
     launch_rows(
-        weigh_rims_kernel,
+        weigh_boundaries_kernel,
         clipped.shape,
         [clipped, params, probes],
-        [lacking_out],
+        [missing_out],
         rows=rows,
         device=clipped.device,
     )
@@ -245,7 +246,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         radiance: wp.array2d[wp.vec3],
         confidence: wp.array2d[wp.float32],
         clipped: wp.array2d[wp.vec3],
-        lacking: wp.array2d[wp.vec3],
+        missing: wp.array2d[wp.vec3],
         probes: wp.array[Probe],
         scene: RayScene,
         # Out:
@@ -269,19 +270,19 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 cell.solid_angle += area
                 cell.radiance += area * radiance[i, j]
                 cell.clipped += area * lost
-                cell.lacking += area * seen * lacking[i, j]
+                cell.missing += area * seen * missing[i, j]
                 cell.hidden += area * (1.0 - seen)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
         cell.radiance /= cell.solid_angle
         cell.clipped /= cell.solid_angle
-        cell.lacking /= cell.solid_angle
+        cell.missing /= cell.solid_angle
         cell.hidden /= cell.solid_angle
         if wp.max(cell.clipped) > _LOST:
             cell.hidden = 0.0
         else:
             cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
-            cell.lacking += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
+            cell.missing += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
         cell.middle = wp.normalize(toward)
         cell.direction = cell.middle
         if wp.length(lost_toward) > 0.0:
@@ -297,7 +298,7 @@ def condense_cells(
     radiance: wp.array,
     confidence: wp.array,
     clipped: wp.array,
-    lacking: wp.array,
+    missing: wp.array,
     probes: wp.array,
     scene: RayScene,
     cells_out: wp.array,
@@ -311,7 +312,7 @@ def condense_cells(
         radiance: ``wp.vec3`` (h, w), complete.
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
         clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        lacking: The same from ``weigh_rims``.
+        missing: The same from ``weigh_boundaries``.
         probes: ``Probe`` (P), at least one.
         scene: Its proxies are known surfaces: what clips there is lit, not a light.
         cells_out: ``Cell``, ``cell_shape(h, w)``.
@@ -321,7 +322,7 @@ def condense_cells(
     launch_rows(
         make_condense_cells_kernel(proxies),
         cells_out.shape,
-        [radiance, confidence, clipped, lacking, probes, scene],
+        [radiance, confidence, clipped, missing, probes, scene],
         [cells_out],
         rows=rows,
         device=cells_out.device,
@@ -329,21 +330,21 @@ def condense_cells(
 
 
 @wp.func
-def lacking_share(confidence: wp.float32, lacking: wp.vec3, unseen: wp.float32) -> wp.vec3:
+def missing_share(confidence: wp.float32, missing: wp.vec3, unseen: wp.float32) -> wp.vec3:
     """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
     seen = trust(confidence)
-    return seen * lacking + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
+    return seen * missing + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
 
 
 @wp.kernel(enable_backward=False)
-def add_excess_kernel(
+def add_recovered_kernel(
     # In:
     row_start: wp.int32,
     radiance: wp.array2d[wp.vec3],
     confidence: wp.array2d[wp.float32],
-    lacking: wp.array2d[wp.vec3],
+    missing: wp.array2d[wp.vec3],
     cells: wp.array2d[Cell],
-    excess: wp.array2d[wp.vec3],
+    recovered: wp.array2d[wp.vec3],
     # Out:
     recovered_out: wp.array2d[wp.vec3],
 ):
@@ -352,36 +353,36 @@ def add_excess_kernel(
     row = row_start + band_row
     height = radiance.shape[0]
     width = radiance.shape[1]
-    top = row * height // excess.shape[0]
-    bottom = (row + 1) * height // excess.shape[0]
-    left = column * width // excess.shape[1]
-    right = (column + 1) * width // excess.shape[1]
+    top = row * height // recovered.shape[0]
+    bottom = (row + 1) * height // recovered.shape[0]
+    left = column * width // recovered.shape[1]
+    right = (column + 1) * width // recovered.shape[1]
     unseen = wp.where(cells[row, column].hidden > 0.0, 1.0, 0.0)
     now = wp.vec3(0.0, 0.0, 0.0)
     solid_angle = wp.float32(0.0)
     for i in range(top, bottom):
         area = texel_solid_angle(i, height, width)
         for j in range(left, right):
-            now += area * lacking_share(confidence[i, j], lacking[i, j], unseen)
+            now += area * missing_share(confidence[i, j], missing[i, j], unseen)
             solid_angle += area
     now /= solid_angle
-    more = excess[row, column]
-    then = cells[row, column].lacking
+    more = recovered[row, column]
+    then = cells[row, column].missing
     for c in range(3):
         if now[c] > 0.0:
             more[c] *= wp.min(then[c] / now[c], MOST_LEFT)
     for i in range(top, bottom):
         for j in range(left, right):
-            share = lacking_share(confidence[i, j], lacking[i, j], unseen)
+            share = missing_share(confidence[i, j], missing[i, j], unseen)
             recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
 
 
-def add_excess(
+def add_recovered(
     radiance: wp.array,
     confidence: wp.array,
-    lacking: wp.array,
+    missing: wp.array,
     cells: wp.array,
-    excess: wp.array,
+    recovered: wp.array,
     recovered_out: wp.array,
     *,
     rows: Rows | None = None,
@@ -390,21 +391,21 @@ def add_excess(
 
     Where more or less of a cell clips than when its excess was found, the energy stays what was found: a thousandth
     that clips can have a high excess, and in the next frame be half of the cell; a video codec takes the weakest
-    channel of a lamp across the limit and back. Below a quarter of the share the energy falls with it.
+    channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
 
     Args:
         radiance: As captured and completed, ``wp.vec3`` (h, w).
         confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        lacking: Share at clipping per channel from ``weigh_rims``, ``wp.vec3`` (h, w).
+        missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
         cells: ``Cell``, ``cell_shape(h, w)``, of when the excess was found.
-        excess: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
+        recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
         recovered_out: ``wp.vec3`` (h, w).
         rows: Band of rows of cells, None for all.
     """
     launch_rows(
-        add_excess_kernel,
-        excess.shape,
-        [radiance, confidence, lacking, cells, excess],
+        add_recovered_kernel,
+        recovered.shape,
+        [radiance, confidence, missing, cells, recovered],
         [recovered_out],
         rows=rows,
         device=recovered_out.device,
@@ -500,7 +501,7 @@ def cell_of(direction: wp.vec3, rows: wp.int32, columns: wp.int32) -> wp.int32:
 
 @functools.cache
 def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Kernels for the given kinds of proxy: observe, transfer, lamps."""
+    """Kernels for the given kinds of proxy: observe, transfer, emitters."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -604,12 +605,12 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 transfer_out[index, target] = transfer_out[index, target] + share
 
     @wp.kernel(module="unique", enable_backward=False)
-    def trace_lamps_kernel(
+    def trace_emitters_kernel(
         # In:
         row_start: wp.int32,
         points: wp.array[SurfacePoint],
         observations: wp.array[Observation],
-        lamps: wp.array[wp.vec4],
+        emitters: wp.array[wp.vec4],
         probes: wp.array[Probe],
         scene: RayScene,
         # Out:
@@ -618,23 +619,23 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
         band_row, index = wp.tid()
         row = row_start + band_row
         point = points[row]
-        lamp = lamps[index]
-        center = wp.vec3(lamp[0], lamp[1], lamp[2])
+        emitter = emitters[index]
+        center = wp.vec3(emitter[0], emitter[1], emitter[2])
         given = wp.float32(0.0)
         if observations[row].visible > 0.0:
             ray = center - point.position
             away = wp.length(ray)
             cosine = wp.dot(ray, point.normal) / away
-            if cosine > 0.0 and away > lamp[3]:
+            if cosine > 0.0 and away > emitter[3]:
                 direction = ray / away
                 given = cosine / (away * away)
                 origin = leave_surface(scene, point, direction)
-                if trace.occluded_by_proxies(scene, origin, direction, away - lamp[3]):
+                if trace.occluded_by_proxies(scene, origin, direction, away - emitter[3]):
                     given = 0.0
                 for k in range(probes.shape[0]):
                     if wp.dot(probes[k].center - point.position, direction) < away:
                         given *= 1.0 - hidden_share(
-                            probes[k].center, probes[k].radius, point.position, direction, wp.asin(lamp[3] / away)
+                            probes[k].center, probes[k].radius, point.position, direction, wp.asin(emitter[3] / away)
                         )
             for k in range(probes.shape[0]):
                 from_ball = center - probes[k].center
@@ -642,7 +643,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 given += beam * mirrored_irradiance(probes[k], point, wp.normalize(from_ball))
         transfer_out[row, index] = given
 
-    return observe_surfaces_kernel, trace_transfer_kernel, trace_lamps_kernel
+    return observe_surfaces_kernel, trace_transfer_kernel, trace_emitters_kernel
 
 
 def observe_surfaces(
@@ -719,10 +720,10 @@ def trace_transfer(
     )
 
 
-def trace_lamps(
+def trace_emitters(
     points: wp.array,
     observations: wp.array,
-    lamps: wp.array,
+    emitters: wp.array,
     probes: wp.array,
     scene: RayScene,
     transfer_out: wp.array,
@@ -731,14 +732,14 @@ def trace_lamps(
     rows: Rows | None = None,
     stream: wp.Stream | None = None,
 ) -> None:
-    """Irradiance that a surface point receives from lamps, per unit of their radiant intensity.
+    """Irradiance that a surface point receives from emitters, per unit of their radiant intensity.
 
     Args:
         points: ``SurfacePoint`` (n).
         observations: ``Observation`` (n): points that the camera does not see receive nothing.
-        lamps: ``wp.vec4`` (q): position and radius in metres.
+        emitters: ``wp.vec4`` (q): position and radius in metres.
         probes: ``Probe`` (P).
-        scene: Its proxies hide lamps.
+        scene: Its proxies hide emitters.
         transfer_out: ``wp.float32`` (n, q), per square metre.
         proxies: Kinds of proxy in the scene.
         rows: Band of points, None for all.
@@ -747,7 +748,7 @@ def trace_lamps(
     launch_rows(
         make_kernels(proxies)[2],
         transfer_out.shape,
-        [points, observations, lamps, probes, scene],
+        [points, observations, emitters, probes, scene],
         [transfer_out],
         rows=rows,
         device=transfer_out.device,

@@ -258,7 +258,7 @@ def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.Monk
             pipeline.update(scene_of(objects, lights))
             now += step
             pipeline(pictures()[picture], time_seconds=now, pose=POSES[pose])
-            asked.append(round(16 * float(pipeline.arrays["recover_excess"].numpy()[0, 0, 0])))
+            asked.append(round(16 * float(pipeline.arrays["recover_recovered"].numpy()[0, 0, 0])))
     # Three at the start, for in the first bare frame what is virtual is cleared; then one at once, when it is back.
     assert asked == [1, 2, 3, *[3] * 8, *[4] * 6]
 

@@ -13,7 +13,7 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions
 from warp_ar.light.recovery import Recovery, tie_channels
 
-LAMP = ((-0.5, -0.6, 0.6), 0.985, 30.0)
+EMITTER = ((-0.5, -0.6, 0.6), 0.985, 30.0)
 
 
 def printed(ink, *, paper=0.5, gradient=0.0):
@@ -81,24 +81,24 @@ def test_contrast_beyond_print_makes_the_card_doubtful():
 
 
 @pytest.mark.parametrize(
-    ("lacking", "expected"),
+    ("missing", "expected"),
     [((1.0, 1.0, 1.0), (1.0, 0.5, 3.0)), ((0.1, 0.1, 1.0), (1.0, 0.5, 20.0)), ((1.0, 0.2, 1.0), (1.0, 0.5, 3.0))],
 )
-def test_no_lamp_is_of_one_colour_unless_one_channel_clips(lacking, expected):
+def test_no_emitter_is_of_one_colour_unless_one_channel_clips(missing, expected):
     problem = types.SimpleNamespace(
-        parts=1, peaks=[], part=np.zeros(1, int), solid_angle=np.ones(1), lacking=np.array([lacking])
+        parts=1, candidates=[], part=np.zeros(1, int), solid_angle=np.ones(1), missing=np.array([missing])
     )
     assert tie_channels(problem, np.array([[1.0, 0.5, 20.0]]))[0] == pytest.approx(expected)
 
 
 def test_without_a_card_the_light_stays_as_captured(device, scene):
-    """The table alone shows a shadow; its reflectance is a guess, and so would be the lamp."""
+    """The table alone shows a shadow; its reflectance is a guess, and so would be the emitter."""
     light = DistantLight(device, scene)
     light.reflectance = np.full_like(light.reflectance, 0.4)
-    radiance, _, _ = lit_environment(LAMP)
+    radiance, _, _ = lit_environment(EMITTER)
     estimate, values = light.estimate(radiance)
-    assert (estimate.method, estimate.factor, estimate.lamps) == ("clipped", 0.0, ())
-    assert not estimate.excess.any()
+    assert (estimate.method, estimate.factor, estimate.emitters) == ("clipped", 0.0, ())
+    assert not estimate.recovered.any()
     assert not estimate.card.holds
     interval = estimate.irradiance
     truth = true_irradiance(interval.normals, values, radiance)
@@ -113,7 +113,7 @@ def true_irradiance(normals, cells, radiance):
 
 
 def test_with_a_card_all_is_taken_and_the_interval_holds_the_truth(device, scene):
-    radiance, _, _ = lit_environment(LAMP)
+    radiance, _, _ = lit_environment(EMITTER)
     estimate, values = DistantLight(device, scene, noise=0.1).estimate(radiance)
     assert estimate.factor == 1.0
     assert estimate.method in ("shading", "white_card")
@@ -129,7 +129,7 @@ def test_with_a_card_all_is_taken_and_the_interval_holds_the_truth(device, scene
 def test_light_holds_while_a_hand_hides_the_card(device, scene):
     """And no longer: what hides it for good may have changed the light."""
     light = DistantLight(device, scene)
-    radiance, _, _ = lit_environment(LAMP)
+    radiance, _, _ = lit_environment(EMITTER)
     problem = {}
     original = Recovery.update
 
@@ -144,4 +144,4 @@ def test_light_holds_while_a_hand_hides_the_card(device, scene):
     hidden["visible"][light.surfaces.kinds[light.surfaces.surface] <= Kind.INK] = 0.0
     for _ in range(CONFIG.card.held):
         assert problem["self"].update(*problem["args"], hidden, *problem["rest"]) is seen
-    assert not problem["self"].update(*problem["args"], hidden, *problem["rest"]).excess.any()
+    assert not problem["self"].update(*problem["args"], hidden, *problem["rest"]).recovered.any()

@@ -110,7 +110,7 @@ def cells_of(device, radiance=1.0, clipped=0.0):
     values = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
     values["middle"] = values["direction"] = d.reshape(ROWS, COLUMNS, 3)
     values["solid_angle"] = solid_angle.reshape(ROWS, COLUMNS)
-    values["radiance"], values["clipped"], values["lacking"] = radiance, clipped, clipped
+    values["radiance"], values["clipped"], values["missing"] = radiance, clipped, clipped
     return values, wp.array(values, dtype=kernels.Cell, device=device)
 
 
@@ -176,25 +176,25 @@ def test_proxies_send_the_share_to_where_the_ball_sees_them(device, scene):
     assert main @ toward / np.linalg.norm(toward) > 0.9
 
 
-def test_lamps_fall_off_and_are_shadowed(device):
+def test_emitters_fall_off_and_are_shadowed(device):
     host = empty_scene()
     center = np.array([0.0, 0.0, 0.035])
     probes = probes_of(device, center, 0.035, 1e-6)
-    lamp = np.array([0.3, 0.0, 0.335])
-    shadow = center + (center - lamp) * (center[2] / (lamp[2] - center[2]))
+    emitter = np.array([0.3, 0.0, 0.335])
+    shadow = center + (center - emitter) * (center[2] / (emitter[2] - center[2]))
     positions = [(0.3, 0.0, 0.0), (0.3, 0.4, 0.0), shadow]
     points = points_of(device, positions, [(0, 0, 1)] * 3)
     out = wp.zeros((3, 1), dtype=wp.float32, device=device)
-    lamps = wp.array([[*lamp, 0.01]], dtype=wp.vec4, device=device)
-    kernels.trace_lamps(points, seen(device, 3), lamps, probes, host.ray_scene, out, proxies=())
+    emitters = wp.array([[*emitter, 0.01]], dtype=wp.vec4, device=device)
+    kernels.trace_emitters(points, seen(device, 3), emitters, probes, host.ray_scene, out, proxies=())
     got = out.numpy()[:, 0]
     assert got[0] == pytest.approx(1 / 0.335**2, rel=1e-4)
     assert got[1] == pytest.approx(0.335 / (0.335**2 + 0.4**2) ** 1.5, rel=1e-4)
     assert got[2] < 1e-4
 
 
-def test_far_lamps_are_distant_light(device):
-    """A lamp a kilometre away lights as its cell does, ball included."""
+def test_far_emitters_are_distant_light(device):
+    """An emitter a kilometre away lights as its cell does, ball included."""
     host = empty_scene()
     probes = probes_of(device)
     values, cells = cells_of(device)
@@ -203,9 +203,9 @@ def test_far_lamps_are_distant_light(device):
     angle = np.sqrt(values["solid_angle"].ravel()[m] / np.pi)
     positions = [(0.0, 0.0, 0.0), (-0.1, 0.1, 0.0), (-0.17, -0.02, 0.0)]
     points = points_of(device, positions, [(0, 0, 1)] * 3)
-    lamps = wp.array([[*(1e3 * direction), 1e3 * np.sin(angle)]], dtype=wp.vec4, device=device)
+    emitters = wp.array([[*(1e3 * direction), 1e3 * np.sin(angle)]], dtype=wp.vec4, device=device)
     out = wp.zeros((3, 1), dtype=wp.float32, device=device)
-    kernels.trace_lamps(points, seen(device, 3), lamps, probes, host.ray_scene, out, proxies=())
+    kernels.trace_emitters(points, seen(device, 3), emitters, probes, host.ray_scene, out, proxies=())
     straight, mirrored = transfer_of(device, points, cells, probes, host.ray_scene)
     want = (straight + mirrored)[:, m] / values["solid_angle"].ravel()[m]
     assert out.numpy()[:, 0] * 1e6 == pytest.approx(want, rel=1e-3)
@@ -223,35 +223,35 @@ def ball_of(device, pixels):
     )
 
 
-def weighed_rims(device, clipped, pixels):
+def weighed_boundaries(device, clipped, pixels):
     out = wp.full(clipped.shape[:2], wp.vec3(np.nan), dtype=wp.vec3, device=device)
     source = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
-    kernels.weigh_rims(source, *ball_of(device, pixels), out)
+    kernels.weigh_boundaries(source, *ball_of(device, pixels), out)
     return out.numpy()
 
 
-def test_rims_count_less_and_the_inside_in_full(device):
+def test_boundaries_count_less_and_the_inside_in_full(device):
     height, pixels = 128, 20.0
     d = reference.cell_directions(height, 2 * height)[0].reshape(height, 2 * height, 3)
     everywhere = np.ones((height, 2 * height, 3))
-    assert weighed_rims(device, everywhere, pixels) == pytest.approx(1.0, abs=1e-5)
-    assert not weighed_rims(device, 0.0 * everywhere, pixels).any()
+    assert weighed_boundaries(device, everywhere, pixels) == pytest.approx(1.0, abs=1e-5)
+    assert not weighed_boundaries(device, 0.0 * everywhere, pixels).any()
     # A hemisphere is as wide as can be: it keeps its rim.
     depth = np.arcsin(d @ np.array([0.6, 0.0, 0.8]))
-    got = weighed_rims(device, (depth > 0.0)[..., None] * everywhere, pixels)[..., 0]
+    got = weighed_boundaries(device, (depth > 0.0)[..., None] * everywhere, pixels)[..., 0]
     assert got[depth > 0.0].min() > 0.8
-    # A lamp of two pixels across: the integral of a Gaussian over a disc is 1 - exp(-(radius / deviation)^2 / 2) in its
-    # middle, for either deviation.
+    # An emitter of two pixels across: the integral of a Gaussian over a disc is 1 - exp(-(radius / deviation)^2 / 2) in
+    # its middle, for either deviation.
     half_pixel = 1.0 / pixels
     away = np.arccos(np.clip(d @ np.array([0.6, 0.0, 0.8]), -1.0, 1.0)) / half_pixel
-    got = weighed_rims(device, (away < 2.0)[..., None] * everywhere, pixels)[..., 0]
+    got = weighed_boundaries(device, (away < 2.0)[..., None] * everywhere, pixels)[..., 0]
     near, wide = (1.0 - np.exp(-0.5 * (2.0 / deviation) ** 2) for deviation in (1.0, 6.0))
     assert got[away < 0.3].mean() == pytest.approx(near ** (2.0 * (1.0 - 2.0 * wide)), abs=0.05)
     assert got[np.abs(away - 1.8) < 0.2].mean() < 0.65 * got[away < 0.3].mean()
     assert not got[away > 2.0].any()
 
 
-def test_rims_weigh_the_same_everywhere_on_the_sphere(device):
+def test_boundaries_weigh_the_same_everywhere_on_the_sphere(device):
     height, pixels = 256, 20.0
     d, area = reference.cell_directions(height, 2 * height)
     shares = []
@@ -266,21 +266,21 @@ def test_rims_weigh_the_same_everywhere_on_the_sphere(device):
     ):
         toward = np.array(toward) / np.linalg.norm(toward)
         disc = (d @ toward > np.cos(0.12)).astype(float)
-        got = weighed_rims(device, disc.reshape(height, -1, 1) * np.ones(3), pixels).reshape(-1, 3)[:, 0]
+        got = weighed_boundaries(device, disc.reshape(height, -1, 1) * np.ones(3), pixels).reshape(-1, 3)[:, 0]
         shares.append((area @ got) / (area @ disc))
     assert 0.2 < min(shares) < 0.8
     assert np.ptp(shares) < 0.03
 
 
-def test_large_pictures_of_a_ball_have_no_rims(device):
+def test_large_pictures_of_a_ball_have_no_boundaries(device):
     clipped = np.zeros((32, 64, 3))
     clipped[10:14, 20:24] = 1.0
-    assert weighed_rims(device, clipped, 1e5) == pytest.approx(clipped, abs=1e-3)
-    assert np.isfinite(weighed_rims(device, clipped, 1e-9)).all()
+    assert weighed_boundaries(device, clipped, 1e5) == pytest.approx(clipped, abs=1e-3)
+    assert np.isfinite(weighed_boundaries(device, clipped, 1e-9)).all()
 
 
 @pytest.mark.parametrize("height", [16, 32, 48, 128])
-def test_cells_keep_energy_and_excess_returns_it(device, height, scene):
+def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     rng = np.random.default_rng(1)
     shape = (height, 2 * height)
     radiance, clipped = rng.uniform(0, 1, (*shape, 3)), (rng.uniform(0, 1, (*shape, 3)) > 0.7).astype(float)
@@ -288,7 +288,7 @@ def test_cells_keep_energy_and_excess_returns_it(device, height, scene):
     to = {"dtype": wp.vec3, "device": device}
     arrays = wp.array(radiance, **to), wp.array(confidence, dtype=wp.float32, device=device), wp.array(clipped, **to)
     weighed = wp.zeros(shape, **to)
-    kernels.weigh_rims(arrays[2], *ball_of(device, 40.0), weighed)
+    kernels.weigh_boundaries(arrays[2], *ball_of(device, 40.0), weighed)
     cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell, device=device)
     host = HostScene(dataclasses.replace(scene, objects=()), device)
     proxies = trace_config(scene).proxies
@@ -300,22 +300,22 @@ def test_cells_keep_energy_and_excess_returns_it(device, height, scene):
     # The ball stands on the table: it sees it below, and the box or the environment above.
     assert got["modelled"][-1].all()
     assert not got["modelled"][0].any()
-    excess = rng.uniform(0, 5, (*got.shape, 3)).astype(np.float32)
-    recovered = wp.zeros(shape, **to)
-    kernels.add_excess(*arrays[:2], weighed, cells, wp.array(excess, **to), recovered)
-    added = (area * (recovered.numpy() - radiance)).sum((0, 1))
-    meant = (weight * got["lacking"] * excess).sum((0, 1))
-    assert (got["lacking"] <= got["clipped"] * (1 + 1e-5)).all()
+    recovered = rng.uniform(0, 5, (*got.shape, 3)).astype(np.float32)
+    put_back = wp.zeros(shape, **to)
+    kernels.add_recovered(*arrays[:2], weighed, cells, wp.array(recovered, **to), put_back)
+    added = (area * (put_back.numpy() - radiance)).sum((0, 1))
+    meant = (weight * got["missing"] * recovered).sum((0, 1))
+    assert (got["missing"] <= got["clipped"] * (1 + 1e-5)).all()
     assert added == pytest.approx(meant, rel=1e-4)
     # More clips a frame later, or less: the energy stays. Of less than a quarter it fades.
     for share in (1.0, 0.3, 0.1, 0.01, 0.0):
         later = wp.array(np.full((*shape, 3), share), **to)
         now = wp.zeros_like(cells)
         kernels.condense_cells(*arrays, later, probes_of(device), host.ray_scene, now, proxies=proxies)
-        kernels.add_excess(*arrays[:2], later, cells, wp.array(excess, **to), recovered)
-        added = (area * (recovered.numpy() - radiance)).sum((0, 1))
-        left = np.minimum(got["lacking"], 4.0 * now.numpy()["lacking"])
-        assert added == pytest.approx((weight * left * excess).sum((0, 1)), rel=1e-4, abs=1e-6)
+        kernels.add_recovered(*arrays[:2], later, cells, wp.array(recovered, **to), put_back)
+        added = (area * (put_back.numpy() - radiance)).sum((0, 1))
+        left = np.minimum(got["missing"], 4.0 * now.numpy()["missing"])
+        assert added == pytest.approx((weight * left * recovered).sum((0, 1)), rel=1e-4, abs=1e-6)
 
 
 def look_down(device, scene, image):
@@ -388,7 +388,7 @@ def test_wide_regions_are_split_into_compact_parts():
 
 
 class DistantLight:
-    """Surfaces lit by cells and lamps exactly as the equations have it, seen by a camera that clips."""
+    """Surfaces lit by cells and emitters exactly as the equations have it, seen by a camera that clips."""
 
     def __init__(self, device, scene, *, table=0.4, box=0.3, noise=0.0):
         self.device, self.scene = device, scene
@@ -405,16 +405,18 @@ class DistantLight:
         # Faces that no camera above and in front sees.
         self.hidden = (records["normal"][:, 1] > 0.5) | (records["normal"][:, 2] < -0.5)
 
-    def trace(self, lamps):
-        out = wp.zeros((len(self.surfaces.points), len(lamps)), dtype=wp.float32, device=self.device)
-        lamps = wp.array(lamps, dtype=wp.vec4, device=self.device)
-        kernels.trace_lamps(self.points, self.seen, lamps, self.probes, self.host.ray_scene, out, proxies=self.proxies)
+    def trace(self, emitters):
+        out = wp.zeros((len(self.surfaces.points), len(emitters)), dtype=wp.float32, device=self.device)
+        emitters = wp.array(emitters, dtype=wp.vec4, device=self.device)
+        kernels.trace_emitters(
+            self.points, self.seen, emitters, self.probes, self.host.ray_scene, out, proxies=self.proxies
+        )
         return out.numpy().astype(float)
 
     def estimate(self, radiance, method="shading", extra=0.0, exposure=1.0, frames=1, camera=None):
         """Estimate from the true radiance of cells, (m, 3); ``extra`` is irradiance that does not come from cells."""
         values, _ = cells_of(self.device, np.minimum(radiance, 1.0).reshape(ROWS, COLUMNS, 3))
-        values["clipped"] = values["lacking"] = (radiance >= 1.0).reshape(ROWS, COLUMNS, 3)
+        values["clipped"] = values["missing"] = (radiance >= 1.0).reshape(ROWS, COLUMNS, 3)
         down = values["direction"][..., 2] < -0.05
         values["modelled"] = down
         cells = wp.array(values, dtype=kernels.Cell, device=self.device)
@@ -450,9 +452,9 @@ def test_white_card_finds_the_only_light(device, scene):
     radiance, (mask,), area = lit_environment(((-0.5, -0.6, 0.6), 0.985, 30.0))
     for method in ("white_card", "shading"):
         estimate, values = DistantLight(device, scene).estimate(radiance, method)
-        excess = estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
-        assert (area @ excess) == pytest.approx(area[mask].sum() * np.full(3, 29.0), rel=0.05)
-        assert not excess[~mask].any()
+        recovered = estimate.recovered.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
+        assert (area @ recovered) == pytest.approx(area[mask].sum() * np.full(3, 29.0), rel=0.05)
+        assert not recovered[~mask].any()
         assert estimate.lower_bound == (False, False, False)
 
 
@@ -463,41 +465,42 @@ def test_shading_shares_energy_between_lights_where_the_card_cannot(device, scen
     ratios = {}
     for method in ("white_card", "shading"):
         estimate, values = DistantLight(device, scene, noise=0.1).estimate(radiance, method)
-        excess = (estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
-        ratios[method] = (area[masks[0]] @ excess[masks[0]]) / (area[masks[1]] @ excess[masks[1]])
+        recovered = (estimate.recovered.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
+        ratios[method] = (area[masks[0]] @ recovered[masks[0]]) / (area[masks[1]] @ recovered[masks[1]])
     assert ratios["white_card"] == pytest.approx(1.0, abs=0.2)
     # The truth is 39 / 4; noise of 10 % on the table leaves the weak light uncertain by about a third.
     assert 6.0 < ratios["shading"] < 16.0
 
 
 @pytest.mark.parametrize("distance", [0.35, 0.5])
-def test_shading_finds_how_far_a_lamp_is(device, scene, distance):
+def test_shading_finds_how_far_an_emitter_is(device, scene, distance):
     center = np.array([-0.12, 0.03, 0.035])
     direction = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
     radiance, _, _ = lit_environment((direction, 0.996, 1.0))
     surroundings = DistantLight(device, scene, noise=0.1)
     power = 2.5
-    lamp = np.array([[*(center + distance * direction), 0.03]], np.float32)
-    extra = surroundings.trace(lamp) * distance**2 * power * np.ones(3)
+    emitter = np.array([[*(center + distance * direction), 0.03]], np.float32)
+    extra = surroundings.trace(emitter) * distance**2 * power * np.ones(3)
     estimate, _ = surroundings.estimate(radiance, extra=extra)
-    assert estimate.lamps
-    found = estimate.lamps[0]
+    assert estimate.emitters
+    found = estimate.emitters[0]
     # The grid of directions is 5.6 degrees wide, and distances are refined in steps of a tenth.
     assert found.distance == pytest.approx(distance, rel=0.15)
     assert found.direction @ direction > np.cos(0.1)
-    total = sum(lamp.power for lamp in estimate.lamps)
+    total = sum(emitter.power for emitter in estimate.emitters)
     assert total == pytest.approx(np.full(3, power), rel=0.15)
 
 
-def test_a_lamp_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
-    """The ball shows a near lamp from a point of its surface, not from its middle: two centimetres beside it here."""
+def test_an_emitter_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
+    """The ball shows a near emitter from a point of its surface, not from its middle: two centimetres beside it
+    here."""
     center, camera = np.array([-0.12, 0.03, 0.035]), np.array([0.1, -0.6, 0.5])
-    lamp = np.array([-0.35, 0.25, 0.4])
-    direction = lamp - center
+    emitter = np.array([-0.35, 0.25, 0.4])
+    direction = emitter - center
     for _ in range(30):  # the direction in which the ball shows it
         direction /= np.linalg.norm(direction)
         mirrors = mirroring_points(direction[None], center, 0.035, camera)[0]
-        direction = lamp - mirrors
+        direction = emitter - mirrors
     distance = np.linalg.norm(direction)
     direction /= distance
     # The law of reflection, and the ball's surface.
@@ -507,25 +510,25 @@ def test_a_lamp_is_where_the_ball_mirrors_it_to_the_camera(device, scene):
     assert np.linalg.norm(mirrors - center - (mirrors - center) @ direction * direction) > 0.018
     radiance, _, _ = lit_environment((direction, 0.997, 1.0))
     surroundings = DistantLight(device, scene, noise=0.1)
-    extra = surroundings.trace(np.array([[*lamp, 0.03]], np.float32)) * distance**2 * 2.5 * np.ones(3)
+    extra = surroundings.trace(np.array([[*emitter, 0.03]], np.float32)) * distance**2 * 2.5 * np.ones(3)
     off = {}
     for name, seen_from in (("its surface", camera), ("its middle", None)):
-        found = surroundings.estimate(radiance, extra=extra, camera=seen_from)[0].lamps[0]
-        off[name] = np.linalg.norm(found.origin + found.distance * found.direction - lamp)
+        found = surroundings.estimate(radiance, extra=extra, camera=seen_from)[0].emitters[0]
+        off[name] = np.linalg.norm(found.origin + found.distance * found.direction - emitter)
     # Directions are known to half a cell, 2.8 degrees; distances are refined in steps of a tenth.
     assert off["its surface"] < 0.03
     assert off["its surface"] < off["its middle"]
 
 
-def scattered(kind, count, scatter, *, lamp=None, stains=0):
-    """Points of one surface and what they show: a constant or a lamp's light, times noise."""
+def scattered(kind, count, scatter, *, emitter=None, stains=0):
+    """Points of one surface and what they show: a constant or an emitter's light, times noise."""
     rng = np.random.default_rng(2)
     points = np.zeros(count, np.dtype(kernels.SurfacePoint.numpy_dtype()))
     points["position"][:, :2] = rng.uniform(-0.1, 0.1, (count, 2))
     points["normal"], points["tangent"] = (0, 0, 1), (1, 0, 0)
     light = np.ones(count)
-    if lamp is not None:
-        away = np.array(lamp) - points["position"]
+    if emitter is not None:
+        away = np.array(emitter) - points["position"]
         light = away[:, 2] / np.linalg.norm(away, axis=1) ** 3
     light = light * np.exp(scatter * rng.normal(size=count))
     light[:stains] *= 0.3
@@ -534,12 +537,12 @@ def scattered(kind, count, scatter, *, lamp=None, stains=0):
     return noise.measured_noise(points, surface, np.array([kind]), light[:, None] * np.ones(3), exact)[0][0]
 
 
-@pytest.mark.parametrize("lamp", [None, (-0.2, 0.1, 0.4)])
+@pytest.mark.parametrize("emitter", [None, (-0.2, 0.1, 0.4)])
 @pytest.mark.parametrize("scatter", [0.015, 0.03])
-def test_noise_is_how_far_points_scatter(scatter, lamp):
+def test_noise_is_how_far_points_scatter(scatter, emitter):
     # 40 points tell a deviation to about a seventh, robustly measured; a fifth of them in shadow change little.
     for stains in (0, 8):
-        assert scattered(Kind.FACE, 40, scatter, lamp=lamp, stains=stains) == pytest.approx(scatter, rel=0.4)
+        assert scattered(Kind.FACE, 40, scatter, emitter=emitter, stains=stains) == pytest.approx(scatter, rel=0.4)
 
 
 def test_noise_is_bounded_and_needs_points():
@@ -557,8 +560,8 @@ def test_a_card_that_clips_is_a_lower_bound(device, scene):
     for method in ("white_card", "shading"):
         estimate, values = DistantLight(device, scene, table=0.3).estimate(radiance, method, exposure=1.0, extra=0.0)
         assert estimate.lower_bound == (True, True, True)
-        excess = (estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
-        totals[method] = area @ excess
+        recovered = (estimate.recovered.reshape(-1, 3) * values["clipped"].reshape(-1, 3))[:, 1]
+        totals[method] = area @ recovered
     assert totals["white_card"] < 0.95 * truth
     # Ink is assumed to reflect 4 %, as it does here; the table's 30 % is not known.
     assert totals["shading"] == pytest.approx(truth, rel=0.3)
@@ -576,8 +579,8 @@ def test_a_sky_that_clips_is_not_shrunk_to_what_the_card_proves(device, scene, c
     radiance = np.where(d[:, 2:] > 0.0, np.array(colour), 0.1)
     estimate, values = DistantLight(device, scene, table=0.35, box=0.35).estimate(radiance)
     assert estimate.lower_bound == tuple(value * scene.marker.white > 1.0 for value in colour)
-    excess = estimate.excess.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
-    found, truth = area @ excess, area @ np.maximum(radiance - 1.0, 0.0)
+    recovered = estimate.recovered.reshape(-1, 3) * values["clipped"].reshape(-1, 3)
+    found, truth = area @ recovered, area @ np.maximum(radiance - 1.0, 0.0)
     assert found == pytest.approx(truth, rel=WIDE_SKY_TOLERANCE)
 
 
@@ -627,18 +630,18 @@ def test_two_solvers_leave_blas_as_it_was():
 def test_nothing_clipped_nothing_added(device, scene):
     radiance, _, _ = lit_environment()
     estimate, _ = DistantLight(device, scene).estimate(radiance)
-    assert not estimate.excess.any()
-    assert estimate.lamps == ()
+    assert not estimate.recovered.any()
+    assert estimate.emitters == ()
 
 
 def test_estimates_are_reproducible_and_steady(device, scene):
     lights = (((-0.5, -0.6, 0.5), 0.985, 40.0), ((0.7, -0.5, 0.5), 0.985, 5.0))
     radiance, _, _ = lit_environment(*lights)
     surroundings = DistantLight(device, scene, noise=0.1)
-    once, again = (surroundings.estimate(radiance)[0].excess for _ in range(2))
+    once, again = (surroundings.estimate(radiance)[0].recovered for _ in range(2))
     assert (once == again).all()
-    later = surroundings.estimate(radiance, frames=5)[0].excess
-    # Later searches may add a peak; the same frame must not drift.
+    later = surroundings.estimate(radiance, frames=5)[0].recovered
+    # Later searches may add a candidate; the same frame must not drift.
     assert later.sum() == pytest.approx(once.sum(), rel=0.05)
 
 
@@ -647,8 +650,8 @@ def test_all_that_is_estimated_is_finite_for_absurd_frames(device, scene):
     for value in (0.0, 1e6):
         for method in ("white_card", "shading"):
             estimate, _ = DistantLight(device, scene).estimate(np.full((ROWS * COLUMNS, 3), value), method)
-            assert np.isfinite(estimate.excess).all()
-            assert (estimate.excess >= 0).all()
+            assert np.isfinite(estimate.recovered).all()
+            assert (estimate.recovered >= 0).all()
 
 
 def test_unknown_method_is_named(scene):
@@ -728,7 +731,7 @@ def shown_estimates(scene, device, count, turns=1, synchronous=False):
             if index and turns > 1:
                 now.continue_from(before)
             now(rng.integers(0, 255, (240, 320, 3), np.uint8), time_seconds=index / 30, pose=pose)
-            shown.append(int(now.arrays["recover_excess"].numpy()[0, 0, 0]))
+            shown.append(int(now.arrays["recover_recovered"].numpy()[0, 0, 0]))
     return shown
 
 
@@ -782,7 +785,7 @@ def test_a_new_solver_does_not_rest(scene):
 @pytest.mark.parametrize(
     "changed", [{"surroundings": 0.4 * 1.4}, {"table": 0.3 * 0.7}, {"surroundings": 0.25, "table": 0.2}]
 )
-def test_a_switched_lamp_is_solved_for_at_once(scene, changed):
+def test_a_switched_emitter_is_solved_for_at_once(scene, changed):
     solver = settled_solver(scene)
     assert not solver.rests(*what_is_seen())
     assert not solver.rests(*what_is_seen(**changed))
@@ -807,7 +810,7 @@ def test_light_that_changes_slowly_is_followed(scene):
     assert rested.count(False) >= 4
 
 
-def test_a_lamp_over_a_part_of_the_desk_is_other_light(scene):
+def test_an_emitter_over_a_part_of_the_desk_is_other_light(scene):
     solver = settled_solver(scene)
     cells, observations = what_is_seen()
     assert not solver.rests(cells, observations)

@@ -136,8 +136,8 @@ def furnace_for(rig_for):
         lights = rig.get("light_array")
         lights["intensity"] = 0.0
         rig.arrays["light_array"].assign(lights)
-        if "lamps" in rig.arrays:
-            rig.arrays["lamps"].zero_()
+        if "emitters" in rig.arrays:
+            rig.arrays["emitters"].zero_()
         for name, value in (("shadow_ratio", 1.0), ("physical_added", 0.0)):
             if name in rig.arrays:
                 rig.poke(name, value)

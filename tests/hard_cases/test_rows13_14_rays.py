@@ -203,8 +203,8 @@ def render(device, stage, method, scale, shift):
         if "recover" in names[: names.index(stage)]:
             # Recovery rests on a card of decimetres and looks for lamps as near as that: the same environment for all.
             rig.poke("environment", np.random.default_rng(0).uniform(0.1, 2.0, rig.get("environment").shape))
-            if "lamps" in rig.arrays:
-                rig.arrays["lamps"].zero_()
+            if "emitters" in rig.arrays:
+                rig.arrays["emitters"].zero_()
             for name in names[names.index("recover") + 1 : names.index(stage) + 1]:
                 rig.run(name)
         outputs = rig.written(stage)

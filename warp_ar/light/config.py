@@ -66,12 +66,13 @@ class PriorConfig:
     hue: float = 0.5
     """Relative standard deviation of one channel's distribution about that of all."""
     colour: float = 3.0
-    """Ratio of one channel to the median of all that light which all of them lack may have: lamps are nearly white."""
+    """Ratio of one channel to the median of all that light which all of them lack may have: emitters are nearly
+    white."""
     own_clipping: float = 3.0
     """Ratio of what a channel lacks to what the others do from which it clips for itself, as a blue sky does."""
     least: float = 0.3
     """Radiance below which relative deviations are no longer relative."""
-    surface_excess: float = 0.5
+    surface_recovered: float = 0.5
     """Radiance above clipping (standard deviation) of modelled surfaces."""
 
 
@@ -80,38 +81,40 @@ class SearchConfig:
     """How emitters are looked for."""
 
     evidence: float = 7.0
-    """Fall of the cost (twice a log likelihood) that a peak must be worth."""
+    """Fall of the cost (twice a log likelihood) that a candidate must be worth."""
     even: float = 1.6
     """Ratio of how far surfaces scatter to what is expected of them above which they are textured."""
     textured: float = 4.0
     """Exponent of what exceeds it, in the fall that is asked for there."""
     better: float = 0.1
-    """Fall of the cost for which a peak that is being added goes to a neighbouring place."""
+    """Fall of the cost for which a candidate that is being added goes to a neighbouring place."""
     worth_moving: float = 1.0
-    """The same for a peak that was known before: lamps stand still, and what differs from view to view is noise.
+    """The same for a candidate that was known before: emitters stand still, and what differs from view to view is
+    noise.
 
-    With ``better``, a lamp of ``torus`` wanders to where another comes on, a quarter of a metre from the ball.
+    With ``better``, an emitter of ``torus`` wanders to where another comes on, a quarter of a metre from the ball.
     """
     most: int = 4
-    """Most peaks at a time."""
+    """Most candidates at a time."""
     every: int = 2
-    """Estimates between searches for one more peak; the first searches for all."""
+    """Estimates between searches for one more candidate; the first searches for all."""
     later_every: int = 6
     """The same once as many estimates as ``settled`` were made."""
     first: int = 5
     """Estimates in which searches try as many directions as they ever do."""
     candidates: int = 160
-    """Directions that are tried for a peak at first."""
+    """Directions that are tried for a candidate at first."""
     later_candidates: int = 40
     """Directions that are tried in a later search, others each time."""
     distances: tuple[float, ...] = (2.0, 1.2, 0.8, 0.6, 0.45, 0.35)
-    """Metres from the ball that are tried for a lamp, beside infinity."""
+    """Metres from the ball that are tried for an emitter, beside infinity."""
     nearest: float = 0.25
-    """Metres from the ball within which no lamp is looked for: it would stand in the picture, in front of the desk."""
+    """Metres from the ball within which no emitter is looked for: it would stand in the picture, in front of the
+    desk."""
     angle: float = 0.12
-    """Radians around a peak's direction that share its light."""
+    """Radians around a candidate's direction that share its light."""
     radius_share: float = 0.06
-    """Radius of a lamp as a share of its distance: of a disc as wide as a cell."""
+    """Radius of an emitter as a share of its distance: of a disc as wide as a cell."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +128,8 @@ class SolverConfig:
     converged: float = 1.0e-3
     """Relative change of the largest unknown, in one reweighting, from which on nothing more is gained."""
     settled: int = 10
-    """Estimates, from several views, after which lamps are taken for found, and light that stays as it is for known."""
+    """Estimates, from several views, after which emitters are taken for found, and light that stays as it is for
+    known."""
     still: float = 0.02
     """Relative change, of surfaces or of the environment, below which the light is the same."""
     rest: int = 4
@@ -189,7 +193,7 @@ class EvidenceConfig:
     """How much less, relatively, the irradiance as captured may be: the ball's reflectance, the unseen cone, the
     response. This, the next and ``clipped`` hold in 19 of 20 of the tables of ``bench_never_worse``."""
     overlooked: float = 1.0
-    """How much more it may be: lamps that are too small for the ball's pixels, or saturate unnoticed."""
+    """How much more it may be: emitters that are too small for the ball's pixels, or saturate unnoticed."""
     clipped: float = 250.0
     """Radiance that what clips may have on average where nothing tells: 19 of 20 rooms have less."""
 

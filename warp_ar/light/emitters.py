@@ -1,4 +1,4 @@
-"""The search for emitters: lamps or a sun within what clips, each with a direction, a distance and a power.
+"""The search for emitters: emitters or a sun within what clips, each with a direction, a distance and a power.
 
 They are chosen one by one, among all directions that may lack light and a grid of distances, by how far they lower the
 cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then moved to
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from warp_ar.light.config import CONFIG
 from warp_ar.light.fit import Fit, fit_channel
-from warp_ar.light.problem import Peak, Problem
+from warp_ar.light.problem import Candidate, Problem
 
 Array = NDArray[np.float64]
 
@@ -44,84 +44,87 @@ class EmitterSearch:
         own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
         return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0), np.float64)
 
-    def tried(self, peak: Peak, z: Array, iterations: int) -> Fit:
-        """Fit with one peak more, starting from unknowns without it."""
-        self.problem.push(peak)
-        fit = self.fit(self.problem.with_peak(z), iterations)
+    def tried(self, candidate: Candidate, z: Array, iterations: int) -> Fit:
+        """Fit with one candidate more, starting from unknowns without it."""
+        self.problem.push(candidate)
+        fit = self.fit(self.problem.with_candidate(z), iterations)
         self.problem.pop()
         return fit
 
-    def add_peak(self, fit: Fit, candidates: Sequence[Peak], columns: Array) -> Fit | None:
-        """Add the best peak if it is worth it; returns the new fit, or None."""
+    def add_candidate(self, fit: Fit, candidates: Sequence[Candidate], columns: Array) -> Fit | None:
+        """Add the best candidate if it is worth it; returns the new fit, or None."""
         gain = self.gains(fit, columns)
-        best: tuple[Peak, float] | None = None
-        seen: list[Peak] = []
+        best: tuple[Candidate, float] | None = None
+        seen: list[Candidate] = []
         for place in np.argsort(-gain, kind="stable"):
-            peak = candidates[place]
+            candidate = candidates[place]
             if gain[place] < 0.5 * self.evidence or len(seen) == 5:
                 break
             if any(
-                peak.distance == s.distance
-                and self.problem.direction[peak.cell] @ self.problem.direction[s.cell] > 0.95
+                candidate.distance == s.distance
+                and self.problem.direction[candidate.cell] @ self.problem.direction[s.cell] > 0.95
                 for s in seen
             ):
                 continue
-            seen.append(peak)
-            cost = self.tried(peak, fit.z, 4).cost
+            seen.append(candidate)
+            cost = self.tried(candidate, fit.z, 4).cost
             if best is None or cost < best[1]:
-                best = (peak, cost)
+                best = (candidate, cost)
         if best is None or best[1] > fit.cost - self.evidence:
             return None
         self.problem.push(self.settled(*best, fit, CONFIG.search.better))
-        return self.fit(self.problem.with_peak(fit.z), CONFIG.solver.iterations)
+        return self.fit(self.problem.with_candidate(fit.z), CONFIG.solver.iterations)
 
-    def settled(self, peak: Peak, cost: float, fit: Fit, least: float) -> Peak:
-        """Where a peak that is not among the unknowns of ``fit``, and would lead to ``cost``, does best.
+    def settled(self, candidate: Candidate, cost: float, fit: Fit, least: float) -> Candidate:
+        """Where a candidate that is not among the unknowns of ``fit``, and would lead to ``cost``, does best.
 
         A step must lower the cost by more than ``least``.
         """
         for _ in range(2):
-            around = self.neighbours(peak)
+            around = self.neighbours(candidate)
             moved = False
             for place in np.argsort(-self.gains(fit, self.problem.power_columns(around)), kind="stable")[:3]:
                 other = self.tried(around[place], fit.z, 4).cost
                 if other < cost - least:
-                    peak, cost, moved = around[place], other, True
+                    candidate, cost, moved = around[place], other, True
             if not moved:
                 break
-        return peak
+        return candidate
 
-    def move_peak(self, mean: float) -> None:
-        """Move the first peak to where it does better, if that is nearby; it becomes the last."""
-        peak = self.problem.peaks.pop(0)
-        self.problem.peak_columns = self.problem.peak_columns[:, :, 1:]
+    def move_candidate(self, mean: float) -> None:
+        """Move the first candidate to where it does better, if that is nearby; it becomes the last."""
+        candidate = self.problem.candidates.pop(0)
+        self.problem.candidate_columns = self.problem.candidate_columns[:, :, 1:]
         fit = self.fit(self.problem.start(mean), CONFIG.solver.iterations)
-        self.problem.push(self.settled(peak, self.tried(peak, fit.z, 4).cost, fit, CONFIG.search.worth_moving))
+        self.problem.push(
+            self.settled(candidate, self.tried(candidate, fit.z, 4).cost, fit, CONFIG.search.worth_moving)
+        )
 
-    def neighbours(self, peak: Peak) -> list[Peak]:
+    def neighbours(self, candidate: Candidate) -> list[Candidate]:
         """Peaks in cells nearby, and at distances nearby."""
         close = np.flatnonzero(
-            (self.problem.direction @ self.problem.direction[peak.cell] > np.cos(0.2)) & self.problem.may_hold_peak
+            (self.problem.direction @ self.problem.direction[candidate.cell] > np.cos(0.2))
+            & self.problem.may_hold_candidate
         )
-        found = [Peak(int(cell), peak.distance) for cell in close]
-        if np.isfinite(peak.distance):
-            nearby = [peak.distance * factor for factor in (0.83, 0.91, 1.1, 1.2)]
-            found += [Peak(peak.cell, distance) for distance in nearby if distance > CONFIG.search.nearest]
+        found = [Candidate(int(cell), candidate.distance) for cell in close]
+        if np.isfinite(candidate.distance):
+            nearby = [candidate.distance * factor for factor in (0.83, 0.91, 1.1, 1.2)]
+            found += [Candidate(candidate.cell, distance) for distance in nearby if distance > CONFIG.search.nearest]
         return found
 
-    def find_peaks(self, z: Array, most: int, *, candidates: int = CONFIG.search.candidates, turn: int = 0) -> Array:
-        """Add up to ``most`` peaks; returns the unknowns. Each ``turn`` tries other directions, if few at a time."""
+    def find_candidates(self, z: Array, most: int, *, places: int = CONFIG.search.candidates, turn: int = 0) -> Array:
+        """Add up to ``most`` candidates; returns the unknowns. Each ``turn`` tries other directions."""
         fit = self.fit(z, CONFIG.solver.iterations)
-        cells = np.flatnonzero(self.problem.may_hold_peak)
+        cells = np.flatnonzero(self.problem.may_hold_candidate)
         if len(cells) == 0 or most < 1:
             return fit.z
-        step = -(-len(cells) // candidates)
+        step = -(-len(cells) // places)
         cells = cells[turn % step :: step]
         distances = [np.inf, *CONFIG.search.distances] if self.problem.trace is not None else [np.inf]
-        peaks = [Peak(int(cell), float(distance)) for distance in distances for cell in cells]
-        columns = self.problem.power_columns(peaks)
+        candidates = [Candidate(int(cell), float(distance)) for distance in distances for cell in cells]
+        columns = self.problem.power_columns(candidates)
         for _ in range(most):
-            better = self.add_peak(fit, peaks, columns)
+            better = self.add_candidate(fit, candidates, columns)
             if better is None:
                 break
             fit = better

@@ -83,7 +83,7 @@ def draw_missing(problem: Problem, c: int, z: Array, blocks: NDArray[np.int64], 
     """Radiance that cells lack, by problems that are a little wrong, (draws, cells).
 
     Args:
-        problem: The equations, their peaks chosen.
+        problem: The equations, their candidates chosen.
         c: Channel.
         z: Its solution.
         blocks: From ``blocks_of``.
@@ -101,10 +101,10 @@ def draw_missing(problem: Problem, c: int, z: Array, blocks: NDArray[np.int64], 
         radiance = np.maximum(problem.radiance, 0.0) ** power * ball
         varied.captured = problem.transfer @ radiance.astype(np.float32)
         drawn = fit_channel(varied, c, z, CONFIG.solver.warm_iterations).z
-        excess = problem.member @ drawn[: problem.parts]
-        for number, peak in enumerate(problem.peaks):
-            excess += problem.patch(peak.cell)[:, c] * drawn[problem.parts + number]
-        draws.append(excess * problem.lacking[:, c])
+        recovered = problem.member @ drawn[: problem.parts]
+        for number, candidate in enumerate(problem.candidates):
+            recovered += problem.patch(candidate.cell)[:, c] * drawn[problem.parts + number]
+        draws.append(recovered * problem.missing[:, c])
     return np.array(draws)
 
 
@@ -147,7 +147,7 @@ def likely_gain(added: Array, missing: Array) -> float:
 
 
 def irradiance_interval(
-    problem: Problem, excess: Array, factor: float, bounds: tuple[bool, bool, bool], spread: float | None
+    problem: Problem, recovered: Array, factor: float, bounds: tuple[bool, bool, bool], spread: float | None
 ) -> Interval:
     """Between which bounds the irradiance at the ball's place lies.
 
@@ -157,7 +157,7 @@ def irradiance_interval(
 
     Args:
         problem: The equations.
-        excess: An estimate's solution, (cells, 3).
+        recovered: An estimate's solution, (cells, 3).
         factor: Share of it that is taken, 0 to 1.
         bounds: Channels in which it is a lower bound.
         spread: Of the draws; None: there are none.
@@ -165,8 +165,8 @@ def irradiance_interval(
     config = CONFIG.evidence
     normals = np.array([[s if k == axis else 0.0 for k in range(3)] for axis in range(3) for s in (1.0, -1.0)])
     form = irradiance_form(problem, normals)
-    captured, found = form @ problem.radiance, form @ (excess * problem.lacking)
-    most = form @ (config.clipped * problem.lacking)
+    captured, found = form @ problem.radiance, form @ (recovered * problem.missing)
+    most = form @ (config.clipped * problem.missing)
     reach = config.interval * np.hypot(0.0 if spread is None else spread, config.found)
     low = (1.0 - config.capture) * captured + factor * np.maximum(1.0 - reach, 0.0) * found
     high = (1.0 + config.overlooked) * captured + (2.0 - factor) * (1.0 + reach) * found

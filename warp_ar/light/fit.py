@@ -49,7 +49,7 @@ def fit_channel(
         c: Channel.
         z: Unknowns to start from.
         iterations: Of reweighting.
-        centre: Draws parts and peaks to itself instead of to means.
+        centre: Draws parts and candidates to itself instead of to means.
         other: Unknowns of a channel that is known better: surfaces are of about that reflectance.
     """
     return _Channel(problem, c, len(z), centre, other).solve(z, iterations)
@@ -73,7 +73,7 @@ class _Channel:
         light = problem.light[rows, c]
         self.matrix = np.zeros((len(rows), unknowns))
         self.matrix[:, :parts] = problem.columns[c][rows] / light[:, None]
-        self.matrix[:, parts:mean_at] = problem.peak_columns[c][rows] / light[:, None]
+        self.matrix[:, parts:mean_at] = problem.candidate_columns[c][rows] / light[:, None]
         self.matrix[np.arange(len(rows)), u_at + self.surface] = -1.0
         self.target = -problem.captured[rows, c] / light
         surfaces = CONFIG.surfaces
@@ -143,7 +143,7 @@ class _Channel:
         u = np.maximum(z[u_at:], 1e-3)
         if self.centre is None:
             about = np.maximum(z[mean_at : u_at - 1][problem.component], LEAST)
-            deviation[:parts] = np.where(problem.is_surface, priors.surface_excess, priors.inside * about)
+            deviation[:parts] = np.where(problem.is_surface, priors.surface_recovered, priors.inside * about)
             deviation[parts:mean_at] = 10.0 * np.maximum(z[parts:mean_at], LEAST)
         else:
             deviation[:parts] = priors.hue * np.maximum(self.centre[:parts], 0.1)

@@ -17,8 +17,8 @@ def measured_noise(
 ) -> tuple[Array, Array]:
     """Relative standard deviation of one equation, by surface: how far its points scatter about a smooth course.
 
-    The course is a quadratic in the surface's own coordinates, of the logarithm: a lamp's light falls off like that.
-    An even box or card says more than a table's texture, and more than all boxes and cards would have it.
+    The course is a quadratic in the surface's own coordinates, of the logarithm: an emitter's light falls off like
+    that. An even box or card says more than a table's texture, and more than all boxes and cards would have it.
 
     Args:
         points: Records of ``SurfacePoint``, (n,).

@@ -18,11 +18,11 @@ from warp_ar.light.surfaces import Surfaces
 Array = NDArray[np.float64]
 
 Trace = Callable[[NDArray[np.float32]], Array]
-"""Irradiance at every surface point per unit intensity of lamps (q, 4: position, radius), (n, q)."""
+"""Irradiance at every surface point per unit intensity of emitters (q, 4: position, radius), (n, q)."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Peak:
+class Candidate:
     """A candidate for an emitter."""
 
     cell: int
@@ -70,19 +70,19 @@ class Problem:
             observations: Records of ``Observation``, (n,).
             surfaces: The points.
             white: Reflectance of the card's paper.
-            trace: Traces lamps at finite distances; None: all light is distant.
+            trace: Traces emitters at finite distances; None: all light is distant.
             origin: From ``mirroring_points``, (rows * columns, 3).
         """
         self.shape = cells.shape
         self.trace, self.origin = trace, origin
-        self._traced: dict[Peak, Array] = {}
-        self.peaks: list[Peak] = []
+        self._traced: dict[Candidate, Array] = {}
+        self.candidates: list[Candidate] = []
         clipped = self._read_cells(cells)
         self._group_cells(clipped)
         self._read_points(observations, surfaces, white)
         through_balls = self._aim_transfer(cells, transfer, mirrored, surfaces, clipped)
         self._sum_light(through_balls)
-        self.peak_columns = np.zeros((3, len(self.index), 0))
+        self.candidate_columns = np.zeros((3, len(self.index), 0))
         self.ties = [
             (a, b)
             for a in range(len(self.kinds))
@@ -94,13 +94,13 @@ class Problem:
         """The map's side; returns the share of each cell that clips in any channel, (m,)."""
         self.radiance = cells["radiance"].reshape(-1, 3).astype(float)
         self.lost = cells["clipped"].reshape(-1, 3).astype(float)
-        self.lacking = cells["lacking"].reshape(-1, 3).astype(float)
+        self.missing = cells["missing"].reshape(-1, 3).astype(float)
         self.direction = cells["direction"].reshape(-1, 3).astype(float)
         self.solid_angle = cells["solid_angle"].ravel().astype(float)
         self.modelled = cells["modelled"].ravel() > 0.5
         # None where nothing is seen: shading may say that light is missing, hardly where it comes from.
         seen = cells["hidden"].ravel() <= 0.0
-        self.may_hold_peak = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
+        self.may_hold_candidate = (self.lost.max(axis=1) > 0.1) & ~self.modelled & seen
         return np.asarray(self.lost.max(axis=1) - cells["hidden"].ravel(), np.float64)
 
     def _group_cells(self, clipped: Array) -> None:
@@ -155,18 +155,18 @@ class Problem:
         through_balls = mirrored[self.index]
         self.transfer = transfer[self.index]
         # What clips in a cell lies off its middle, for which transfer was traced.
-        lamps = np.flatnonzero((clipped > LOST) & ~self.modelled)
+        emitters = np.flatnonzero((clipped > LOST) & ~self.modelled)
         normals = surfaces.points["normal"][self.index]
-        cosine = normals @ cells["middle"].reshape(-1, 3)[lamps].T
-        turned = np.clip(normals @ cells["direction"].reshape(-1, 3)[lamps].T, 0.0, 2.0 * np.maximum(cosine, 0.0))
-        self.transfer[:, lamps] *= np.where(cosine > 0.0, turned / np.maximum(cosine, 1e-6), 1.0)
+        cosine = normals @ cells["middle"].reshape(-1, 3)[emitters].T
+        turned = np.clip(normals @ cells["direction"].reshape(-1, 3)[emitters].T, 0.0, 2.0 * np.maximum(cosine, 0.0))
+        self.transfer[:, emitters] *= np.where(cosine > 0.0, turned / np.maximum(cosine, 1e-6), 1.0)
         self.transfer += through_balls
         return through_balls
 
     def _sum_light(self, through_balls: NDArray[Any]) -> None:
         """Irradiance as captured, the share of it that comes by way of balls, and that of each part per radiance."""
         # With what clips taken to be some ten times as bright: only the order of magnitude matters.
-        bright = (self.radiance + 10.0 * self.lacking * self.radiance).mean(axis=1)
+        bright = (self.radiance + 10.0 * self.missing * self.radiance).mean(axis=1)
         sums = self.transfer @ np.column_stack([self.radiance, bright]).astype(np.float32)
         self.captured = sums[:, :3]
         mirrored_sums = through_balls @ bright.astype(np.float32)
@@ -176,7 +176,7 @@ class Problem:
         columns = [np.zeros((len(self.index), 0))] * 3
         if self.parts:
             sent = self.transfer[:, order]
-            columns = [np.add.reduceat(sent * self.lacking[order, c], starts, axis=1) for c in range(3)]
+            columns = [np.add.reduceat(sent * self.missing[order, c], starts, axis=1) for c in range(3)]
         self.columns = np.stack(columns)
 
     def card_means(self) -> tuple[Array, tuple[bool, bool, bool]]:
@@ -229,12 +229,13 @@ class Problem:
             return 0.0
         return max(1.0 - float(np.median(self.captured[use, c] * self.white / self.light[use, c])), 0.0)
 
-    # Unknowns stand in this order: parts, peaks, means of components, the common mean, 1 / reflectance of each surface.
+    # Unknowns stand in this order: parts, candidates, means of components, the common mean, 1 / reflectance of each
+    # surface.
 
     @property
     def first_mean(self) -> int:
         """Place of the first component's mean."""
-        return self.parts + len(self.peaks)
+        return self.parts + len(self.candidates)
 
     @property
     def first_surface(self) -> int:
@@ -249,46 +250,46 @@ class Problem:
         z[self.first_surface - 1] = mean
         return z
 
-    def with_peak(self, z: Array) -> Array:
-        """Unknowns of a problem with one peak less, and that peak at zero."""
+    def with_candidate(self, z: Array) -> Array:
+        """Unknowns of a problem with one candidate less, and that candidate at zero."""
         return np.insert(z, self.first_mean - 1, 0.0)
 
-    def power_columns(self, peaks: Sequence[Peak]) -> Array:
-        """Irradiance per unit power of peaks, (points, q)."""
-        cells = np.array([peak.cell for peak in peaks])
-        distances = np.array([peak.distance for peak in peaks])
+    def power_columns(self, candidates: Sequence[Candidate]) -> Array:
+        """Irradiance per unit power of candidates, (points, q)."""
+        cells = np.array([candidate.cell for candidate in candidates])
+        distances = np.array([candidate.distance for candidate in candidates])
         columns: Array = np.asarray(self.transfer[:, cells] / self.solid_angle[cells], np.float64)
-        near = [k for k, peak in enumerate(peaks) if np.isfinite(peak.distance)]
+        near = [k for k, candidate in enumerate(candidates) if np.isfinite(candidate.distance)]
         if self.trace is not None and near:
-            new = [k for k in near if peaks[k] not in self._traced]
+            new = [k for k in near if candidates[k] not in self._traced]
             if new:
                 at = self.origin[cells[new]] + distances[new, None] * self.direction[cells[new]]
-                lamps = np.column_stack([at, CONFIG.search.radius_share * distances[new]]).astype(np.float32)
-                traced = self.trace(lamps)[self.index] * distances[new] ** 2
-                self._traced.update((peaks[k], column) for k, column in zip(new, traced.T, strict=True))
-            columns[:, near] = np.stack([self._traced[peaks[k]] for k in near], -1)
+                emitters = np.column_stack([at, CONFIG.search.radius_share * distances[new]]).astype(np.float32)
+                traced = self.trace(emitters)[self.index] * distances[new] ** 2
+                self._traced.update((candidates[k], column) for k, column in zip(new, traced.T, strict=True))
+            columns[:, near] = np.stack([self._traced[candidates[k]] for k in near], -1)
         return columns
 
     def patch(self, cell: int) -> Array:
-        """Radiance that a unit of a peak's power is, spread over the cells around it that lack light, (m, 3)."""
-        near = (self.direction @ self.direction[cell] > np.cos(CONFIG.search.angle)) & self.may_hold_peak
+        """Radiance that a unit of a candidate's power is, spread over the cells around it that lack light, (m, 3)."""
+        near = (self.direction @ self.direction[cell] > np.cos(CONFIG.search.angle)) & self.may_hold_candidate
         near[cell] = True
-        total = self.solid_angle[near] @ self.lacking[near]
+        total = self.solid_angle[near] @ self.missing[near]
         return np.asarray(near[:, None] / np.maximum(total, 1e-6), np.float64)
 
-    def push(self, peak: Peak) -> None:
-        """Add a peak to the unknowns."""
-        patch = self.patch(peak.cell)
-        if np.isfinite(peak.distance):
-            column = self.power_columns([peak])[:, 0]
+    def push(self, candidate: Candidate) -> None:
+        """Add a candidate to the unknowns."""
+        patch = self.patch(candidate.cell)
+        if np.isfinite(candidate.distance):
+            column = self.power_columns([candidate])[:, 0]
             near = patch[:, 0] > 0.0
             block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
         else:
-            block = np.stack([self.transfer @ (patch[:, c] * self.lacking[:, c]) for c in range(3)])
-        self.peaks.append(peak)
-        self.peak_columns = np.concatenate([self.peak_columns, block[:, :, None]], axis=2)
+            block = np.stack([self.transfer @ (patch[:, c] * self.missing[:, c]) for c in range(3)])
+        self.candidates.append(candidate)
+        self.candidate_columns = np.concatenate([self.candidate_columns, block[:, :, None]], axis=2)
 
     def pop(self) -> None:
-        """Take the last peak away."""
-        self.peaks.pop()
-        self.peak_columns = self.peak_columns[:, :, :-1]
+        """Take the last candidate away."""
+        self.candidates.pop()
+        self.candidate_columns = self.candidate_columns[:, :, :-1]

@@ -2,9 +2,9 @@
 
 **Unknowns.** Cells of the environment that clip (``kernels/recover.py``) are grouped to regions: connected ones, split
 where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
-ball shows. Beside regions stand *peaks*: lamps or a sun within a region, or where no ball sees, each with its power p_j
->= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the unknown
-reflectance 1 / u_k; the card's is known.
+ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees, each with its
+power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the
+unknown reflectance 1 / u_k; the card's is known.
 
 **Equations.** A surface point x that shows the radiance L receives
 
@@ -18,18 +18,18 @@ only, and the estimate says so; ink, a twentieth as bright, and surfaces in shad
 their reflectances allow.
 
 **Priors** decide what surfaces do not see. A region's s_r scatters about the mean of its connected component, that
-about one mean of all, times (solid angle)^-1/2: halfway between lamps of equal radiance and lamps of equal power, for
-what is small and still clips tends to be brighter than what is wide. The common mean is free; where nothing but the
+about one mean of all, times (solid angle)^-1/2: halfway between emitters of equal radiance and emitters of equal power,
+for what is small and still clips tends to be brighter than what is wide. The common mean is free; where nothing but the
 card is used it is what makes the card right, and that alone is the method ``white_card``. Clipped pixels that show a
 modelled surface (the card in the ball, a box) are lit, not lights: they stay close to clipping. Channels share their
 distribution: a second pass draws each to the mean of all three, in the hue of their totals.
 
 **Peaks** are chosen one by one, among all directions that may lack light and a grid of distances, by how far they
 lower the cost to second order, (b' W r)^2 / (b' W b - b' W Z H^-1 Z' W b); the best few are fitted in earnest, then
-moved to neighbouring cells and distances while that helps, and kept if the cost falls by more than ``evidence``. A
-lamp at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D. D counts
-from where the ball mirrors the lamp to the camera, which may lie a ball's radius beside its middle. A lamp that is
-known moves only for a larger gain: lamps stand still.
+moved to neighbouring cells and distances while that helps, and kept if the cost falls by more than ``evidence``. An
+emitter at the distance D lights x by cos D^2 / |p - x|^2: its shadows and the falling off of its light tell D. D counts
+from where the ball mirrors the emitter to the camera, which may lie a ball's radius beside its middle. An emitter that
+is known moves only for a larger gain: emitters stand still.
 
 Every deviation is relative to an unknown, a mean or a reflectance. The derivative with respect to that unknown is kept:
 without it, the more parts and equations there are, the more all of them would shrink together.
@@ -64,7 +64,7 @@ from warp_ar.light.evidence import (
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
-from warp_ar.light.problem import Peak, Problem, Trace, mirroring_points
+from warp_ar.light.problem import Candidate, Problem, Trace, mirroring_points
 from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.stillness import Stillness
 from warp_ar.light.surfaces import Surfaces
@@ -75,7 +75,7 @@ METHODS: Final = ("clipped", "white_card", "shading")
 
 
 @dataclasses.dataclass(frozen=True)
-class Lamp:
+class FoundEmitter:
     """A source of light that was found by what it does."""
 
     origin: Array
@@ -92,16 +92,16 @@ class Lamp:
 class Estimate:
     """What clipping took, as far as one frame tells."""
 
-    excess: NDArray[np.float32]
+    recovered: NDArray[np.float32]
     """Radiance that a wholly clipped texel lacks, (rows, columns, 3) of cells."""
     lower_bound: tuple[bool, bool, bool]
     """Channels in which the card clips or is not seen: there the total is a lower bound, or rests on priors."""
-    lamps: tuple[Lamp, ...] = ()
+    emitters: tuple[FoundEmitter, ...] = ()
     """Peaks, by falling power."""
     method: str = "clipped"
     """What the estimate rests on: that which was asked for, or what evidence was left for."""
     factor: float = 0.0
-    """Share of the method's own solution that evidence allows, 0 to 1; ``excess`` and ``lamps`` hold it."""
+    """Share of the method's own solution that evidence allows, 0 to 1; ``excess`` and ``emitters`` hold it."""
     card: CardCheck = NO_CARD
     """What speaks for the card being in the picture."""
     irradiance: Interval | None = None
@@ -109,7 +109,7 @@ class Estimate:
 
 
 class Recovery:
-    """Estimates what clipping took, frame by frame; keeps the lamps that it found."""
+    """Estimates what clipping took, frame by frame; keeps the emitters that it found."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class Recovery:
             surfaces: From ``find_surfaces``.
             white: Reflectance of the card's paper.
             center: Centre of the ball, metres.
-            radius: Of the ball, metres: lamps are seen from its surface. 0: from its centre.
+            radius: Of the ball, metres: emitters are seen from its surface. 0: from its centre.
             method: ``white_card`` or ``shading``.
 
         Raises:
@@ -136,7 +136,7 @@ class Recovery:
             raise ValueError(f"recover: no method {method!r} to estimate; expected {' or '.join(METHODS[1:])}")
         self.surfaces, self.method = surfaces, method
         self._white, self._center, self._radius = white, np.array(center, float), radius
-        self._peaks: list[Peak] = []
+        self._candidates: list[Candidate] = []
         self._frames = 0
         self._solved = 0
         self._stillness = Stillness()
@@ -172,8 +172,8 @@ class Recovery:
             transfer: From ``trace_transfer``, straight, (n, rows * columns).
             mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).
-            trace: Traces lamps at finite distances; None: all light is distant.
-            camera: Where the camera stands, metres, (3,); None: lamps are as seen from the ball's centre.
+            trace: Traces emitters at finite distances; None: all light is distant.
+            camera: Where the camera stands, metres, (3,); None: emitters are as seen from the ball's centre.
         """
         with ONE_BLAS_THREAD:
             origin = mirroring_points(
@@ -192,7 +192,7 @@ class Recovery:
         self._unseen = 0
         means, bounds = problem.card_means()
         by_card = problem.member @ (problem.expected[problem.component][:, None] * means)
-        if self.method == "white_card" or not (problem.parts or problem.may_hold_peak.any()):
+        if self.method == "white_card" or not (problem.parts or problem.may_hold_candidate.any()):
             factor = problem.card_factor(bounds, doubt_of(card.contrast))
             self._held = self._estimate(problem, by_card, bounds, "white_card", factor, card)
             return self._held
@@ -201,22 +201,30 @@ class Recovery:
         best = int(np.argmax(problem.exact.sum(axis=0) + np.array([0.0, 0.5, 0.0])))
         is_turn = self._search(problem, best, means[best])
         solution = tie_channels(problem, _solve_channels(problem, best, means, bounds))
-        # A lamp that gives nothing in any channel has gone out, or never was.
+        # An emitter that gives nothing in any channel has gone out, or never was.
         powers = solution[problem.parts :]
-        self._peaks = [peak for peak, power in zip(problem.peaks, powers, strict=True) if power.any()]
-        excess = problem.member @ solution[: problem.parts]
-        lamps = []
-        for peak, power in zip(problem.peaks, powers, strict=True):
-            excess += problem.patch(peak.cell) * power
-            lamps.append(Lamp(problem.origin[peak.cell], problem.direction[peak.cell], peak.distance, power))
-        lamps.sort(key=lambda lamp: -float(lamp.power.sum()))
+        self._candidates = [
+            candidate for candidate, power in zip(problem.candidates, powers, strict=True) if power.any()
+        ]
+        recovered = problem.member @ solution[: problem.parts]
+        emitters = []
+        for candidate, power in zip(problem.candidates, powers, strict=True):
+            recovered += problem.patch(candidate.cell) * power
+            emitters.append(
+                FoundEmitter(
+                    problem.origin[candidate.cell], problem.direction[candidate.cell], candidate.distance, power
+                )
+            )
+        emitters.sort(key=lambda emitter: -float(emitter.power.sum()))
         if is_turn or self._evidence is None:
             c = _told_channel(problem)
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
-            self._evidence = _weigh(problem, c, start, bounds, (excess, by_card), self._blocks, doubt_of(card.contrast))
+            self._evidence = _weigh(
+                problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast)
+            )
         evidence = self._evidence
         if evidence.method == "shading":
-            self._held = self._estimate(problem, excess, bounds, *evidence.parts, card, tuple(lamps))
+            self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
         else:
             self._held = self._estimate(problem, by_card, bounds, *evidence.parts, card)
         return self._held
@@ -224,13 +232,13 @@ class Recovery:
     def _without_card(self, problem: Problem, card: CardCheck) -> Estimate:
         """What is held while the card is hidden for a while, else the light as captured.
 
-        Without a surface of known reflectance only the shape of shadows tells how bright a lamp is, and texture,
+        Without a surface of known reflectance only the shape of shadows tells how bright an emitter is, and texture,
         gloss and clutter look like shadows.
         """
         self._unseen += 1
         if self._held is not None and self._unseen <= CONFIG.card.held:
             return self._held
-        self._held, self._peaks, self._evidence = None, [], None
+        self._held, self._candidates, self._evidence = None, [], None
         nothing = np.zeros((len(problem.solid_angle), 3))
         return self._estimate(problem, nothing, (True, True, True), "clipped", 0.0, card)
 
@@ -241,20 +249,20 @@ class Recovery:
             Whether it was.
         """
         config = CONFIG.search
-        for peak in self._peaks:
-            if problem.may_hold_peak[peak.cell]:
-                problem.push(peak)
+        for candidate in self._candidates:
+            if problem.may_hold_candidate[candidate.cell]:
+                problem.push(candidate)
         search = EmitterSearch(problem, best)
         before = self._solved - 1
         settled = before >= CONFIG.solver.settled
-        if before and problem.peaks and (not settled or before % 2 == 0):
-            search.move_peak(mean)
-        start, left = problem.start(mean), config.most - len(problem.peaks)
+        if before and problem.candidates and (not settled or before % 2 == 0):
+            search.move_candidate(mean)
+        start, left = problem.start(mean), config.most - len(problem.candidates)
         if before == 0:
-            search.find_peaks(start, left)
+            search.find_candidates(start, left)
         elif before % (config.later_every if settled else config.every) == 1:
             candidates = config.candidates if before < config.first else config.later_candidates
-            search.find_peaks(start, min(left, 1), candidates=candidates, turn=before // config.every)
+            search.find_candidates(start, min(left, 1), places=candidates, turn=before // config.every)
         else:
             return False
         return True
@@ -262,21 +270,21 @@ class Recovery:
     def _estimate(
         self,
         problem: Problem,
-        excess: Array,
+        recovered: Array,
         bounds: tuple[bool, bool, bool],
         method: str,
         factor: float,
         card: CardCheck,
-        lamps: tuple[Lamp, ...] = (),
+        emitters: tuple[FoundEmitter, ...] = (),
     ) -> Estimate:
         """The share ``factor`` of a solution, and between which bounds that leaves irradiance."""
         if factor == 0.0:
-            method, lamps = "clipped", ()
-        lamps = tuple(dataclasses.replace(lamp, power=factor * lamp.power) for lamp in lamps)
+            method, emitters = "clipped", ()
+        emitters = tuple(dataclasses.replace(emitter, power=factor * emitter.power) for emitter in emitters)
         spread = self._evidence.spread if self._evidence is not None else None
-        interval = irradiance_interval(problem, excess, factor, bounds, spread)
-        cells = (factor * excess).reshape(*problem.shape, 3).astype(np.float32)
-        return Estimate(cells, bounds, lamps, method, factor, card, interval)
+        interval = irradiance_interval(problem, recovered, factor, bounds, spread)
+        cells = (factor * recovered).reshape(*problem.shape, 3).astype(np.float32)
+        return Estimate(cells, bounds, emitters, method, factor, card, interval)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -295,7 +303,7 @@ class _Evidence:
 
 def _told_channel(problem: Problem) -> int:
     """Of the channels in which something is missing the one that surfaces show best; green of equals."""
-    missing = problem.solid_angle @ problem.lacking
+    missing = problem.solid_angle @ problem.missing
     shown = problem.exact.sum(axis=0)
     return max(range(3), key=lambda c: (missing[c] > 0.3 * missing.max(), shown[c], c == 1))
 
@@ -316,8 +324,8 @@ def _weigh(
     total = missing.sum(axis=1)
     spread = float(total.std() / max(total.mean(), 1e-9))
     found = []
-    for method, excess in zip(("shading", "white_card"), solutions, strict=True):
-        added = form @ (excess[:, c] * problem.lacking[:, c])
+    for method, recovered in zip(("shading", "white_card"), solutions, strict=True):
+        added = form @ (recovered[:, c] * problem.missing[:, c])
         factor = min(allowed_factor(added, missing), most_by_card(form @ problem.radiance[:, c], added, share))
         found.append((likely_gain(factor * added, missing), _Evidence(method, factor, spread)))
     if found[0][1].factor >= CONFIG.evidence.enough:
@@ -326,29 +334,30 @@ def _weigh(
 
 
 def tie_channels(problem: Problem, solution: Array) -> Array:
-    """A solution without light of one channel only, unless that channel clips where others do not, (parts + peaks, 3).
+    """A solution without light of one channel only, unless that channel alone clips, (parts + candidates, 3).
 
-    What lamps look like in one channel is told by surfaces that show that channel: texture, or another response in it,
-    makes lamps of one colour. Where all channels lack light, none is more than some times the median of the three.
+    What emitters look like in one channel is told by surfaces that show that channel: texture, or another response in
+    it, makes emitters of one colour. Where all channels lack light, none is more than some times the median of the
+    three.
 
     Args:
         problem: The equations.
-        solution: Radiance of parts, then power of peaks, (parts + peaks, 3).
+        solution: Radiance of parts, then power of candidates, (parts + candidates, 3).
     """
     config = CONFIG.priors
     cells = [np.flatnonzero(problem.part == part) for part in range(problem.parts)]
-    cells += [np.array([peak.cell]) for peak in problem.peaks]
-    lacking = np.array([problem.solid_angle[own] @ problem.lacking[own] for own in cells]).reshape(-1, 3)
+    cells += [np.array([candidate.cell]) for candidate in problem.candidates]
+    missing = np.array([problem.solid_angle[own] @ problem.missing[own] for own in cells]).reshape(-1, 3)
     most = config.colour * np.median(solution, axis=1, keepdims=True)
-    alone = lacking > config.own_clipping * np.median(lacking, axis=1, keepdims=True)
+    alone = missing > config.own_clipping * np.median(missing, axis=1, keepdims=True)
     return np.asarray(np.where(alone, solution, np.minimum(solution, most)), np.float64)
 
 
 def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[bool, bool, bool]) -> Array:
-    """Radiance of parts and power of peaks in all channels, (parts + peaks, 3).
+    """Radiance of parts and power of candidates in all channels, (parts + candidates, 3).
 
     Args:
-        problem: The equations, its peaks chosen.
+        problem: The equations, its candidates chosen.
         best: The channel that surfaces show best.
         means: What the card alone has it, per channel.
         bounds: Channels in which the card does not tell.
@@ -367,10 +376,10 @@ def _solve_channels(problem: Problem, best: int, means: Array, bounds: tuple[boo
         return solution
     solid = np.bincount(
         problem.part[problem.part >= 0],
-        (problem.solid_angle * problem.lacking.max(axis=1))[problem.part >= 0],
+        (problem.solid_angle * problem.missing.max(axis=1))[problem.part >= 0],
         minlength=problem.parts,
     )
-    total = np.concatenate([solid, np.ones(len(problem.peaks))]) @ solution + 1e-9
+    total = np.concatenate([solid, np.ones(len(problem.candidates))]) @ solution + 1e-9
     shared = solution.sum(axis=1) / total.sum()
     again = CONFIG.solver.warm_iterations
     return np.stack(

@@ -35,7 +35,7 @@ class EnvironmentSamples(Stage):
         """Read the environment, write samples."""
         if not features.environment:
             return LeftOut(NO_BALL)
-        lamps = ("lamps",) if features.emitters else ()
+        lamps = ("emitters",) if features.emitters else ()
         return Wiring(("environment", *lamps), ("environment_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -84,7 +84,7 @@ class EnvironmentSamples(Stage):
 
             def place(rows: Rows | None) -> None:
                 for one in found:
-                    environment_samples.place_emitters(arrays["lamps"], one)
+                    environment_samples.place_emitters(arrays["emitters"], one)
 
             passes.append(Pass(place))
         return passes

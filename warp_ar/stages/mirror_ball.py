@@ -148,7 +148,7 @@ class MirrorBall(Stage):
             probes=arrays["probes"],
             key_lights=arrays["key_lights"] if "key_lights" in reads else None,
             irradiance=arrays[irradiance] if lit and irradiance in reads else None,
-            emitters=arrays["lamps"] if "lamps" in reads else None,
+            emitters=arrays["emitters"] if "emitters" in reads else None,
         )
         shading = config.shade
         distant = DistantLight() if shading is None else make_distant_light(self.features, arrays, self.name)

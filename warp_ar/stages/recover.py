@@ -26,12 +26,13 @@ from warp_ar.stages.shared.variants import trace_variant
 EVERY_FRAME = 3
 """Frames at a stream's start that are each estimated from: clips of a few frames get all that recovery can do."""
 EVERY_SECONDS = 0.2
-"""Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched lamp."""
+"""Between estimates after that, and no fewer than ``EVERY_FRAME`` frames: light follows as fast as a switched
+emitter."""
 LATENCY = 0.1
 """Seconds, by the frames' clock, after which an estimate takes effect, unless the request is to wait for it: it is
 solved for beside them. They are fixed, so that the same frames give the same pictures; where it is not solved for in
 time, the frame waits."""
-MOST_LAMPS = CONFIG.search.candidates * len(CONFIG.search.distances)
+MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
 @dataclasses.dataclass
@@ -63,14 +64,14 @@ class Recover(Stage):
     """Estimates what clipped texels lack from surfaces that the same light falls on.
 
     It comes after filling, not before: what the surfaces receive depends on the whole environment, the part behind the
-    ball included, and a lamp's recovered energy must not be spread into the unseen by filling.
+    ball included, and an emitter's recovered energy must not be spread into the unseen by filling.
     """
 
     name: ClassVar[str] = "recover"
     methods: ClassVar[Mapping[str, str]] = {
         "clipped": "as the camera saw it (the paper)",
         "white_card": "scaled until it lights the white card as brightly as the frame shows",
-        "shading": "shared among lamps as shading and shadows in the frame tell",
+        "shading": "shared among emitters as shading and shadows in the frame tell",
     }
     summary: ClassVar[str] = "puts back the light that clipping lost in the ball, by what it falls on"
     subject: ClassVar[str] = "light that clips in the ball"
@@ -83,7 +84,7 @@ class Recover(Stage):
         measured=0.00016,
         rows=(1, 3, 4, 5, 6, 7, 12, 13, 14, 17, 18),
     )
-    remembers: ClassVar[tuple[str, ...]] = ("recover_excess", "recover_cells", "lamps")
+    remembers: ClassVar[tuple[str, ...]] = ("recover_recovered", "recover_cells", "emitters")
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
@@ -94,7 +95,7 @@ class Recover(Stage):
             return LeftOut("the quality takes the light as the camera clipped it")
         return Wiring(
             ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
-            ("environment", "lamps") if features.emitters else ("environment",),
+            ("environment", "emitters") if features.emitters else ("environment",),
         )
 
     def arrays(self) -> Mapping[str, ArraySpec]:
@@ -106,9 +107,9 @@ class Recover(Stage):
         points = len(self._surfaces.points)
         return {
             "environment": ArraySpec(shape, wp.vec3),
-            **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "lamps"},
-            "recover_excess": ArraySpec(cells, wp.vec3),
-            "recover_lacking": ArraySpec(shape, wp.vec3),
+            **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "emitters"},
+            "recover_recovered": ArraySpec(cells, wp.vec3),
+            "recover_missing": ArraySpec(shape, wp.vec3),
             "recover_cells": ArraySpec(cells, kernels.Cell),
             "recover_cells_now": ArraySpec(cells, kernels.Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
@@ -116,8 +117,8 @@ class Recover(Stage):
             "recover_traced": ArraySpec((points,), wp.int32),
             "recover_transfer": ArraySpec((points, cells[0] * cells[1]), wp.float32),
             "recover_mirrored": ArraySpec((points, cells[0] * cells[1]), wp.float32),
-            "recover_lamps": ArraySpec((MOST_LAMPS,), wp.vec4),
-            "recover_lamp_transfer": ArraySpec((points * MOST_LAMPS,), wp.float32),
+            "recover_emitters": ArraySpec((MOST_EMITTERS,), wp.vec4),
+            "recover_emitter_transfer": ArraySpec((points * MOST_EMITTERS,), wp.float32),
             "recover_published": ArraySpec(shape, wp.vec3),
             "recover_difference": ArraySpec((height,), wp.float32),
         }
@@ -140,18 +141,18 @@ class Recover(Stage):
         points = len(self._surfaces.points)
         arrays.add("recover_status", self.status)
         equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations", "params")
-        effects = ("recover_excess", "recover_cells", *(name for name in self.wiring.writes if name == "lamps"))
+        effects = ("recover_recovered", "recover_cells", *(name for name in self.wiring.writes if name == "emitters"))
         self._equations = HostCopies({name: arrays[name] for name in equations}, device)
         self._effects = HostCopies({name: arrays[name] for name in effects}, device)
-        sides = {name: arrays[name] for name in ("recover_lamps", "recover_lamp_transfer")}
-        self._lamps = {name: HostCopies({name: array}, device) for name, array in sides.items()}
+        sides = {name: arrays[name] for name in ("recover_emitters", "recover_emitter_transfer")}
+        self._emitters = {name: HostCopies({name: array}, device) for name, array in sides.items()}
         # Streams of its own: beside frames, and beside their capture.
         self._stream = None if device.is_cpu else wp.Stream(device)
         self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
         def weigh(rows: Rows | None) -> None:
-            kernels.weigh_rims(
-                arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_lacking"], rows=rows
+            kernels.weigh_boundaries(
+                arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
             )
 
         def condense(rows: Rows | None) -> None:
@@ -159,7 +160,7 @@ class Recover(Stage):
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
                 arrays["environment_clipped"],
-                arrays["recover_lacking"],
+                arrays["recover_missing"],
                 arrays["probes"],
                 arrays["ray_scene"],
                 cells,
@@ -195,12 +196,12 @@ class Recover(Stage):
             )
 
         def add(rows: Rows | None) -> None:
-            kernels.add_excess(
+            kernels.add_recovered(
                 arrays["filled_radiance"],
                 arrays["environment_confidence"],
-                arrays["recover_lacking"],
+                arrays["recover_missing"],
                 arrays["recover_cells"],
-                arrays["recover_excess"],
+                arrays["recover_recovered"],
                 arrays["environment"],
                 rows=rows,
             )
@@ -222,7 +223,7 @@ class Recover(Stage):
         return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
 
     def host_kernels(self) -> tuple[Any, ...]:
-        """Of the solver: irradiance from lamps, at whatever places it tries."""
+        """Of the solver: irradiance from emitters, at whatever places it tries."""
         return (kernels.make_kernels(self._proxies)[2],) if self.method == "shading" else ()
 
     def begin(self) -> None:
@@ -272,26 +273,26 @@ class Recover(Stage):
         )
         return _Solution(estimate, cells)
 
-    def _trace(self, lamps: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Irradiance from lamps, (n, q); in the worker."""
-        arrays, count, points = self._arrays, len(lamps), len(self._surfaces.points)
-        places = np.zeros((MOST_LAMPS, 4), np.float32)
-        places[:count] = lamps
-        self._lamps["recover_lamps"].send({"recover_lamps": places}, self._stream)
-        target = arrays["recover_lamp_transfer"][: points * count].reshape((points, count))
-        kernels.trace_lamps(
+    def _trace(self, emitters: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Irradiance from emitters, (n, q); in the worker."""
+        arrays, count, points = self._arrays, len(emitters), len(self._surfaces.points)
+        places = np.zeros((MOST_EMITTERS, 4), np.float32)
+        places[:count] = emitters
+        self._emitters["recover_emitters"].send({"recover_emitters": places}, self._stream)
+        target = arrays["recover_emitter_transfer"][: points * count].reshape((points, count))
+        kernels.trace_emitters(
             arrays["recover_points"],
             arrays["recover_observations"],
-            arrays["recover_lamps"][:count],
+            arrays["recover_emitters"][:count],
             arrays["probes"],
             arrays["ray_scene"],
             target,
             proxies=self._proxies,
             stream=self._stream,
         )
-        received = self._lamps["recover_lamp_transfer"]
+        received = self._emitters["recover_emitter_transfer"]
         received.fetch(self._stream, self._stream, points * count)
-        flat = received.fetched()["recover_lamp_transfer"][: points * count]
+        flat = received.fetched()["recover_emitter_transfer"][: points * count]
         return np.array(flat.reshape(points, count), np.float64)
 
     def _take(self, rows: Rows | None) -> None:
@@ -303,13 +304,13 @@ class Recover(Stage):
         if solution is None:
             return
         now.estimate = solution.estimate
-        values = {"recover_excess": solution.estimate.excess, "recover_cells": solution.cells}
-        if "lamps" in self.wiring.writes:
+        values = {"recover_recovered": solution.estimate.recovered, "recover_cells": solution.cells}
+        if "emitters" in self.wiring.writes:
             records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
-            for record, lamp in zip(records, solution.estimate.lamps, strict=False):
-                record["origin"], record["direction"] = lamp.origin, lamp.direction
-                record["distance"], record["power"] = lamp.distance, lamp.power
-            values["lamps"] = records
+            for record, emitter in zip(records, solution.estimate.emitters, strict=False):
+                record["origin"], record["direction"] = emitter.origin, emitter.direction
+                record["distance"], record["power"] = emitter.distance, emitter.power
+            values["emitters"] = records
         self._effects.send(values, self._frames_stream)
 
     def close(self) -> None:
@@ -318,7 +319,7 @@ class Recover(Stage):
             self._worker.shutdown(wait=False)
 
     def resume(self, other: Stage) -> None:
-        """Keep the lamps that were found, and when; on another method, or on another desk, look anew."""
+        """Keep the emitters that were found, and when; on another method, or on another desk, look anew."""
         if not isinstance(other, Recover) or other.method != self.method:
             return
         mine, yours = self.request.scene, other.request.scene
@@ -326,8 +327,8 @@ class Recover(Stage):
             self._progress = dataclasses.replace(other._progress)
 
     def changed(self, name: str) -> bool:
-        """As ``Fill.changed``; lamps change where an estimate takes effect."""
-        if name == "lamps":
+        """As ``Fill.changed``; emitters change where an estimate takes effect."""
+        if name == "emitters":
             return self._news and (self._arrives or (self._asks and self._at_once()))
         if not self._device.is_cpu:
             return True
@@ -341,20 +342,20 @@ class Recover(Stage):
         estimate = self._progress.estimate
         if estimate is None:
             return {}
-        lamps = [
+        emitters = [
             {
-                "direction": [round(float(x), 4) for x in lamp.direction],
-                "distance": round(lamp.distance, 3) if np.isfinite(lamp.distance) else None,
-                "power": [round(float(x), 4) for x in lamp.power],
+                "direction": [round(float(x), 4) for x in emitter.direction],
+                "distance": round(emitter.distance, 3) if np.isfinite(emitter.distance) else None,
+                "power": [round(float(x), 4) for x in emitter.power],
             }
-            for lamp in estimate.lamps
+            for emitter in estimate.emitters
         ]
         report: dict[str, Any] = {
             "method": estimate.method,
             "factor": round(estimate.factor, 3),
             "card_contrast": round(estimate.card.contrast, 2),
             "lower_bound": list(estimate.lower_bound),
-            "lamps": lamps,
+            "emitters": emitters,
         }
         if estimate.irradiance is not None:
             for name in ("low", "value", "high"):

@@ -150,7 +150,7 @@ class Relight(Stage):
             "table": "summed_area",
             "key_lights": "key_lights",
             "irradiance": self.features.irradiance,
-            "emitters": "lamps",
+            "emitters": "emitters",
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)

@@ -21,7 +21,7 @@ def distant_light_reads(features: Features) -> tuple[str, ...]:
     config = features.distant
     diffuse = () if config.diffuse == "none" else (f"irradiance_{config.diffuse}",)
     specular = ("prefilter_levels",) if config.specular else ()
-    return (*diffuse, *specular, *(("lamps",) if config.emitters and (diffuse or specular) else ()))
+    return (*diffuse, *specular, *(("emitters",) if config.emitters and (diffuse or specular) else ()))
 
 
 def distant_light_arrays(features: Features, stage: str) -> Mapping[str, ArraySpec]:
@@ -50,5 +50,5 @@ def make_distant_light(features: Features, arrays: Arrays, stage: str) -> Distan
         distant.dfg = table
     distant.probes = arrays["probes"]
     if config.emitters:
-        distant.emitters = arrays["lamps"]
+        distant.emitters = arrays["emitters"]
     return distant

@@ -17,7 +17,7 @@ def relight_reads(features: Features) -> tuple[str, ...]:
         reads.append("summed_area")
     if method in ("reflectance", *LOCAL):
         reads.append(features.irradiance)
-        reads += ["lamps"] * features.emitters
+        reads += ["emitters"] * features.emitters
     if features.ambient_visibility:
         reads.append("environment_samples")
     return tuple(reads)
