@@ -338,9 +338,10 @@ def serve_page(options: argparse.Namespace) -> int:
             raise
         say(error)
         code = EXIT_USAGE
-    if not server.ended:
+    if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
-        # would wait for its thread. All files are closed and temporary folders gone by now.
+        # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary
+        # folders gone by now.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -247,6 +247,9 @@ class Crew:
         self._caller = self._serve(1)
         self._helpers = [self._serve(0) for _ in range(self._count - 1)]
         self._end = weakref.finalize(self, _stop, self._state, self._system, self._count)
+        # Not where Python ends: threads that woke up then would be unwound through native code, which aborts. Asleep
+        # they end with the process.
+        self._end.atexit = False
 
     def _serve(self, caller: int) -> _Packed:
         inputs = [wp.uint64(self._state.ctypes.data), caller]
