@@ -246,7 +246,7 @@ def receive(device, scale, shift):
     lamp = scale * np.array([0.03, 0.05, 0.4]) + shift
     out = wp.zeros((len(places), 1), dtype=wp.float32, device=device)
     lamps = wp.array([[*lamp, 0.01 * scale]], dtype=wp.vec4, device=device)
-    recover.trace_lamps(points, seen(device, len(places)), lamps, probes, host.ray_scene, out, proxies=proxies)
+    recover.trace_emitters(points, seen(device, len(places)), lamps, probes, host.ray_scene, out, proxies=proxies)
     return straight, mirrored, scale**2 * out.numpy()
 
 
