@@ -34,6 +34,7 @@ from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
+from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Request
 
@@ -246,6 +247,67 @@ class Pipeline:
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
+
+    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+
+        Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+
+        Args:
+            first: Number of the next frame in its clip.
+            saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
+                all frames to come.
+
+        Raises:
+            UsageError: The scene's light is that of a mirror ball in the frames.
+        """
+        self._check_usable()
+        self._finish()
+        if self.plan.features.observed:
+            raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
+        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._lit_time = math.inf  # no frame came before
+        self._shown = None
+        if self._tracker is not None:
+            self._tracker.reset()
+        if saturation is not None:
+            self.inputs.fix_saturation(saturation)
+        self._scheduler.restart()
+
+    def start_clock(self, seconds: float) -> None:
+        """Have animations begin at a time before the first frame; left out, they begin with it.
+
+        Args:
+            seconds: On the clock of ``time_seconds``.
+
+        Raises:
+            UsageError: A frame has been lit, the pipeline is closed, or the time is not finite.
+        """
+        self._check_usable()
+        _check_number("seconds", seconds)
+        if self._begun:
+            raise UsageError("start_clock comes before the first frame")
+        self._start_time = self._last_time = seconds
+        self._lit_time = math.inf  # no frame came before
+
+    def take_light(self, radiance: npt.NDArray[np.float32]) -> None:
+        """Light the frames to come by another environment than the captured one that the scene names.
+
+        Args:
+            radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), of the quality's
+                ``environment_height``; it is kept, not copied.
+
+        Raises:
+            UsageError: The scene names no captured light, or the map has another size.
+        """
+        self._check_usable()
+        self._finish()
+        stage = self._scheduler.stage("captured")
+        if not isinstance(stage, Captured):
+            raise UsageError("take_light needs a scene with a captured light that some stage reads")
+        stage.replace(radiance)
+        self._arrays.touch("captured_light")
 
     def __call__(
         self,

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
+from warp_ar.errors import UsageError
 from warp_ar.light.captured import Light
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
@@ -46,9 +49,22 @@ class Captured(Stage):
         assert spec is not None
         light = Light.load(spec.file)
         turn = rotation_matrix(spec.rotate)
-        radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
+        self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
 
         def copy(rows: Rows | None) -> None:
-            arrays["environment"].assign(radiance)
+            arrays["environment"].assign(self._radiance)
 
         return [Pass(copy, on_host=True)]
+
+    def replace(self, radiance: npt.NDArray[np.float32]) -> None:
+        """Light the frames to come by another map, at the quality's size and in the scene's axes.
+
+        Args:
+            radiance: Linear RGB, float32 (height, 2 height, 3); it is not copied.
+
+        Raises:
+            UsageError: It is of another size.
+        """
+        if radiance.shape != self._radiance.shape:
+            raise UsageError(f"light is {radiance.shape}; this pipeline's environment is {self._radiance.shape}")
+        self._radiance = radiance
