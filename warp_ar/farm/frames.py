@@ -80,6 +80,10 @@ class VideoPart(VideoFile):
                     return
         raise SourceError(f"{self._path} ends before frame {number}; its packets promise {self._end}")
 
+    def _passes(self) -> Generator[Frame, None, None]:
+        """One pass; frames keep the numbers of the whole."""
+        yield from self._decode()
+
     def _time_of(self, number: int) -> float:
         """Seconds of a frame since the first of the whole: by one formula, whichever part it is read in."""
         ticks = self._index.ticks
@@ -91,9 +95,13 @@ class FolderPart(FrameFolder):
 
     def __init__(self, path: Path, first: int, end: int, fps: float) -> None:
         super().__init__(path, fps=fps)
-        self._first, self._whole = first, list(self._paths)
+        self._first = first
         self._paths = self._paths[first:end]
         self.length = len(self._paths)
+
+    def _passes(self) -> Generator[Frame, None, None]:
+        """One pass; pictures keep the numbers of the whole."""
+        yield from self._decode()
 
     def _decode(self) -> Generator[Frame, None, None]:
         for frame in super()._decode():

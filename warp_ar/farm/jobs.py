@@ -97,7 +97,7 @@ class Job:
         return f"{name}/{self.kind}" + (f"-{self.number:06d}" if self.kind in ("segment", "variation") else "")
 
     def place(self, jobs: JobFile) -> Path:
-        """Where its result lies, relative to the run's folder: one folder, or the joined recording."""
+        """Where its result lies, relative to the run's folder: a folder, or the last file of several."""
         name = jobs.clips[self.clip].name
         match self.kind:
             case "survey":
@@ -109,7 +109,7 @@ class Job:
                 return Path("dataset/train") / f"{self.clip * jobs.dataset.variations + self.number:06d}"
             case "join":
                 return Path(f"{name}.mp4")
-        return Path("dataset/index")
+        return Path("dataset/annotations.json")
 
 
 def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:

@@ -75,17 +75,31 @@ class Lighter:
     def light(
         self, job: Job, scene: Scene | None = None, *, outputs: tuple[str, ...] = ("image",), every: int = 1
     ) -> Iterator[Lit]:
-        """Light the frames of a job.
+        """Light the frames of a job; of pictures alone the next is begun before one is handed out.
 
         Args:
             job: A segment or a variation.
             scene: What to show; None: the clip's own scene.
-            outputs: Resources that are kept up to date.
+            outputs: Outputs of the pipeline.
             every: One of so many frames is lit.
 
         Raises:
             WarpArError: The recording or the scene cannot be used.
         """
+        frames = self._light(job, scene, outputs, every)
+        if outputs != ("image",):
+            yield from frames
+            return
+        before = next(frames, None)
+        for lit in frames:
+            assert before is not None
+            yield before
+            before = lit
+        if before is not None:
+            yield before
+
+    def _light(self, job: Job, scene: Scene | None, outputs: tuple[str, ...], every: int) -> Iterator[Lit]:
+        """As ``light``, each frame as soon as it is handed over."""
         survey = self.survey(job.clip)
         if self._jobs.settings.light == "preroll":
             yield from self._light_alone(job, survey, outputs)
@@ -104,7 +118,7 @@ class Lighter:
                     yield Lit(frame, None, None, pipeline)
                     continue
                 self._follow(pipeline, survey, job.clip, frame.index)
-                call = pipeline if len(outputs) > 1 else pipeline.submit
+                call = pipeline.submit if outputs == ("image",) else pipeline
                 yield Lit(frame, pose, call(frame.image, time_seconds=frame.time, pose=pose), pipeline)
 
     def _follow(self, pipeline: Pipeline, survey: Survey, clip: int, frame: int) -> None:

@@ -6,6 +6,7 @@ does not depend on which frames were lit before it. The file is a ZIP of NumPy a
 - ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of the frames, and the seconds of a tick as a fraction;
 - ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
 - ``saturation`` (3,) int64: codes at which the camera's channels saturate;
+- ``size`` (2,) int64: width and height of the frames in pixels;
 - ``keys`` (k,) int64: numbers of the frames from which on ``light_000000`` ... hold, each float32 (h, 2 h, 3).
 
 A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
@@ -29,6 +30,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
+from warp_ar.input.sources import open_source
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
 from warp_ar.scene import CapturedLight, Pose, Scene
@@ -63,6 +65,8 @@ class Survey:
                 self.poses: npt.NDArray[np.float64] = values["poses"]
                 self.saturation: npt.NDArray[np.int64] = values["saturation"]
                 self.keys: npt.NDArray[np.int64] = values["keys"]
+                width, height = (int(v) for v in values["size"])
+                self.size = width, height
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
 
@@ -128,6 +132,8 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
         writer.add("tick", [index.tick.numerator, index.tick.denominator])
         writer.add("seekable", index.seekable)
         writer.add("poses", poses)
+        with open_source(path, fps=fps) as source:
+            writer.add("size", source.size)
         writer.add("saturation", look.saturation)
         writer.add("keys", look.keys)
     finally:
