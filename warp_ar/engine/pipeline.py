@@ -93,6 +93,7 @@ class Pipeline:
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        emitters: bool = False,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -111,6 +112,7 @@ class Pipeline:
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -134,7 +136,7 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
         self._begun = 0
@@ -294,12 +296,13 @@ class Pipeline:
         self._start_time = self._last_time = seconds
         self._lit_time = math.inf  # no frame came before
 
-    def take_light(self, radiance: npt.NDArray[np.float32]) -> None:
+    def take_light(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
         """Light the frames to come by another environment than the captured one that the scene names.
 
         Args:
             radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), of the quality's
                 ``environment_height``; it is kept, not copied.
+            emitters: Where its emitters are: the array ``emitters`` of a pipeline that found them, copied.
 
         Raises:
             UsageError: The scene names no captured light, or the map has another size.
@@ -309,7 +312,7 @@ class Pipeline:
         stage = self._scheduler.stage("captured")
         if not isinstance(stage, Captured):
             raise UsageError("take_light needs a scene with a captured light that some stage reads")
-        stage.replace(radiance)
+        stage.replace(radiance, emitters)
         self._arrays.touch("captured_light")
 
     def __call__(

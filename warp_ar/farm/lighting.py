@@ -107,7 +107,7 @@ class Lighter:
         path, fps = source_of(self._jobs, job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(open_part(path, survey.index, job.first, job.end, fps)) as source:
-            pipeline = self._pipeline_for(own, source.size, outputs)
+            pipeline = self._pipeline_for(own, source.size, outputs, follows=len(survey.keys) > 0)
             pipeline.restart(job.first, saturation=survey.saturation)
             self._key = None
             for frame in source:
@@ -128,11 +128,13 @@ class Lighter:
         key = survey.key_of(frame)
         if self._key != (clip, key, pipeline):
             self._key = clip, key, pipeline
-            pipeline.take_light(survey.light(key))
+            pipeline.take_light(*survey.light(key))
 
-    def _pipeline_for(self, scene: Scene, size: tuple[int, int], outputs: tuple[str, ...]) -> Pipeline:
-        """A pipeline for a scene: one that is there where only numbers differ."""
-        key = skeleton(scene), size, outputs
+    def _pipeline_for(
+        self, scene: Scene, size: tuple[int, int], outputs: tuple[str, ...], *, follows: bool
+    ) -> Pipeline:
+        """A pipeline for a scene, one that is there where only numbers differ; ``follows``: by surveyed light."""
+        key = skeleton(scene), size, outputs, follows
         pipeline = self._pipelines.pop(key, None)
         if pipeline is not None and not pipeline.update(scene):
             pipeline.close()
@@ -145,6 +147,7 @@ class Lighter:
                 size=size,
                 outputs=outputs,
                 synchronous=True,
+                emitters=follows,
             )
         self._pipelines[key] = pipeline
         while len(self._pipelines) > PIPELINES:

@@ -7,7 +7,8 @@ does not depend on which frames were lit before it. The file is a ZIP of NumPy a
 - ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
 - ``saturation`` (3,) int64: codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
-- ``keys`` (k,) int64: numbers of the frames from which on ``light_000000`` ... hold, each float32 (h, 2 h, 3).
+- ``keys`` (k,) int64: numbers of the frames from which on ``light_000000`` ... hold, each float32 (h, 2 h, 3), and
+  ``emitters_000000`` ... where the quality finds their places.
 
 A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
 value``) since the last key: the tolerance within which stages that read the environment do not run again either.
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
@@ -79,10 +81,11 @@ class Survey:
         """Number of the map that holds for a frame."""
         return max(int(np.searchsorted(self.keys, frame, side="right")) - 1, 0)
 
-    def light(self, key: int) -> Map:
-        """A map, float32 (h, 2 h, 3)."""
+    def light(self, key: int) -> tuple[Map, npt.NDArray[Any] | None]:
+        """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known."""
         with np.load(self._path) as values:
-            return np.asarray(values[f"light_{key:06d}"], np.float32)
+            name = f"emitters_{key:06d}"
+            return np.asarray(values[f"light_{key:06d}"], np.float32), values[name] if name in values else None
 
 
 class _Writer:
@@ -155,20 +158,29 @@ class _Look:
     keys: list[int] = dataclasses.field(default_factory=list)
     saturation: npt.NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.full(3, 255))
     last: Map | None = None
+    emitters: npt.NDArray[Any] | None = None
+    """Of the last key, as records of ``Emitter``."""
 
     @property
     def captures(self) -> bool:
         """Whether the light is the frames' own, not a file's."""
         return self.scene.captured is None and has_environment(self.scene)
 
-    def take(self, frame: int, environment: Map, writer: _Writer) -> None:
-        """Keep an environment if it has moved since the last one that was kept."""
+    def take(self, frame: int, environment: Map, pipeline: Pipeline, writer: _Writer) -> None:
+        """Keep an environment if it has moved since the last one that was kept, or its emitters have."""
+        emitters = None
+        if "emitters" in pipeline.arrays:
+            with exclusive(pipeline.device):
+                emitters = np.array(pipeline.arrays["emitters"].numpy())
         if self.last is not None:
             tolerated = CHANGE_FLOOR + CHANGE_SHARE * np.abs(self.last)
-            if not (np.abs(environment - self.last) > tolerated).any():
+            same = emitters is None or (self.emitters is not None and emitters.tobytes() == self.emitters.tobytes())
+            if same and not (np.abs(environment - self.last) > tolerated).any():
                 return
-        self.last = _rounded(environment)
+        self.last, self.emitters = _rounded(environment), emitters
         writer.add(f"light_{len(self.keys):06d}", self.last)
+        if emitters is not None:
+            writer.add(f"emitters_{len(self.keys):06d}", emitters)
         self.keys.append(frame)
 
 
@@ -205,13 +217,13 @@ def _look_at_frames(
                     look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
                     environment = result.environment if look.captures else None
                     if environment is not None and jobs.settings.light == "follow":
-                        look.take(frame.index, environment, writer)
+                        look.take(frame.index, environment, pipeline, writer)
                 tell(frame.index - first + 1)
             look.saturation = pipeline.inputs.saturation.levels
             if environment is None:
                 return
             if jobs.settings.light == "fixed":
-                look.take(first, environment, writer)
+                look.take(first, environment, pipeline, writer)
     kept = _rounded(environment)
     emitters = find_emitters(kept, np.zeros_like(kept), 0.0)
     Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
