@@ -149,6 +149,12 @@ def open_part(path: Path, index: FrameIndex, first: int, end: int, fps: float | 
     return FolderPart(path, first, end, fps or DEFAULT_FPS)
 
 
+def mean_rate(ticks: npt.NDArray[np.int64], tick: fractions.Fraction) -> float:
+    """Frames a second of time stamps, ``tick`` seconds each."""
+    seconds = float(int(ticks[-1] - ticks[0]) * tick)
+    return (len(ticks) - 1) / seconds if seconds > 0.0 else DEFAULT_FPS
+
+
 def shown_ticks(index: FrameIndex, fps: float | None) -> tuple[npt.NDArray[np.int64], fractions.Fraction]:
     """Time stamps of what is written, and seconds of their tick: the recording's own unless a rate is given."""
     if fps is None:

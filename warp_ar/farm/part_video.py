@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import fractions
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
 """Of x264, on every machine."""
+_MOST_SCALE = 100_000_000
 _LANGUAGES = ("language", "title", "handler_name")
 """Metadata of a stream that stays true in another file."""
 
@@ -37,17 +39,16 @@ class PartSink(ThreadedSink):
         path: The file.
         ticks: Time stamp of every frame that will come, growing.
         tick: Seconds of a tick.
+        fps: Mean rate of the whole recording: all its parts have one header.
 
     Raises:
         SinkError: A frame cannot be written.
     """
 
-    def __init__(self, path: Path, ticks: Sequence[int], tick: fractions.Fraction) -> None:
+    def __init__(self, path: Path, ticks: Sequence[int], tick: fractions.Fraction, fps: float) -> None:
         super().__init__(1)
         self.description = str(path)
-        self._path, self._ticks, self._tick = path, ticks, tick
-        seconds = float((ticks[-1] - ticks[0]) * tick)
-        self._fps = (len(ticks) - 1) / seconds if seconds > 0 else 30.0
+        self._path, self._ticks, self._tick, self._fps = path, ticks, tick, fps
         self._container: Any = None
 
     def _start(self, width: int, height: int) -> None:
@@ -125,14 +126,15 @@ def join_parts(
     """
     try:
         with contextlib.ExitStack() as stack:
-            target = stack.enter_context(av.open(str(output), "w", format="mp4"))
+            source = None if recording is None else stack.enter_context(av.open(str(recording)))
+            options = {"movie_timescale": str(_common_scale(tick, source))}
+            target = stack.enter_context(av.open(str(output), "w", format="mp4", options=options))
             with av.open(str(parts[0])) as first:
                 video = target.add_stream_from_template(first.streams.video[0])
                 header = bytes(first.streams.video[0].codec_context.extradata or b"")
             video.time_base = tick
             sound: Iterator[Any] = iter(())
-            if recording is not None:
-                source = stack.enter_context(av.open(str(recording)))
+            if source is not None:
                 sound = _sound(source, target, float(zero * tick), until)
                 for name, value in source.metadata.items():
                     target.metadata.setdefault(name, value)
@@ -155,6 +157,16 @@ def join_parts(
     except (av.FFmpegError, OSError, ValueError) as error:
         raise SinkError(f"{output} cannot be joined: {reason(error)}") from error
     return count
+
+
+def _common_scale(tick: fractions.Fraction, source: Any) -> int:
+    """Units a second in which every stream's start is a whole number.
+
+    Where a stream does not begin at 0, an edit list says so in this unit; MP4's usual milliseconds would round it.
+    """
+    ticks = [tick, *(stream.time_base for stream in source.streams.audio if stream.time_base)] if source else [tick]
+    scale = math.lcm(*(fractions.Fraction(unit).denominator for unit in ticks))
+    return scale if scale <= _MOST_SCALE else min(tick.denominator, _MOST_SCALE)
 
 
 def _video_packets(

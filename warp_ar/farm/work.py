@@ -13,7 +13,7 @@ from typing import Any
 from warp_ar.errors import WarpArError, reason
 from warp_ar.farm.dataset_files import write_dataset_files
 from warp_ar.farm.draws import NoPlace, draw_variation
-from warp_ar.farm.frames import shown_ticks
+from warp_ar.farm.frames import mean_rate, shown_ticks
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.labels import LAYERS, LabelWriter
 from warp_ar.farm.lighting import Lighter
@@ -121,7 +121,8 @@ class Work:
         survey = self._lighter.survey(job.clip)
         ticks, tick = shown_ticks(survey.index, source_of(self.context.jobs, job.clip)[1])
         count = 0
-        with PartSink(part / PART, ticks[job.first : job.end].tolist(), tick) as sink:
+        rate = mean_rate(ticks, tick)
+        with PartSink(part / PART, ticks[job.first : job.end].tolist(), tick, rate) as sink:
             for lit in self._lighter.light(job):
                 sink.write(lit.image)
                 count += 1
