@@ -32,6 +32,7 @@ def trace_object_masks_kernel(
     # Out:
     masks_out: wp.array2d[wp.uint64],
 ):
+    """Every object on its own, whichever is nearest."""
     i, j = wp.tid()
     i += row_start
     mask = wp.uint64(0)

@@ -108,11 +108,11 @@ def test_no_object_hides_the_marker_from_any_camera(drawn):
 
 def test_outlines_overlap_where_no_side_separates_them():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
-    assert _overlap(square, square + [0.9, 0.9])
-    assert not _overlap(square, square + [1.1, 0])
+    assert _overlap(square, square + 0.9)
+    assert not _overlap(square, square + 1.1)
     diamond = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
-    assert not _overlap(square, diamond + [1.8, 1.8])
-    assert _overlap(square, diamond + [1.4, 1.4])
+    assert not _overlap(square, diamond + 1.8)
+    assert _overlap(square, diamond + 1.4)
 
 
 def test_too_many_objects_for_the_region_are_told(tmp_path):

@@ -26,7 +26,9 @@ def read(path, first, end, fps=None):
 def test_parts_are_the_whole(tmp_path, bframes, fps):
     write_recording(tmp_path / "a.mp4", 12, ticks=UNEVEN, bframes=bframes)
     whole = read(tmp_path / "a.mp4", 0, 12, fps)
-    parts = [frame for first, end in ((0, 3), (3, 4), (4, 9), (9, 12)) for frame in read(tmp_path / "a.mp4", first, end, fps)]
+    parts = [
+        frame for first, end in ((0, 3), (3, 4), (4, 9), (9, 12)) for frame in read(tmp_path / "a.mp4", first, end, fps)
+    ]
     assert [frame.index for frame in parts] == list(range(12))
     for a, b in zip(whole, parts, strict=True):
         assert (a.index, a.time) == (b.index, b.time)

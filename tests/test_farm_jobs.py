@@ -60,18 +60,21 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ("schema = 2\n[[clip]]\n", "schema = 2: expected 1"),
         ("schema = 1\n", "[[clip]] is missing"),
         ("schema = 1\n[[clip]]\nscen = 1\n", 'clip[0].scen: unknown key; did you mean "scene"?'),
-        ('schema = 1\n[[clip]]\npath = "no.mp4"\n', "clip[0].path = \"no.mp4\": there is no file or folder"),
-        ('schema = 1\n[[clip]]\npath = "no*.mp4"\n', "clip[0].path = \"no*.mp4\": no file in"),
+        ('schema = 1\n[[clip]]\npath = "no.mp4"\n', 'clip[0].path = "no.mp4": there is no file or folder'),
+        ('schema = 1\n[[clip]]\npath = "no*.mp4"\n', 'clip[0].path = "no*.mp4": no file in'),
         ("schema = 1\n[[clip]]\nframes = [5, 5]\n", "clip[0].frames = [5, 5]: expected [first, behind the last]"),
         ("schema = 1\n[[clip]]\nframes = [5, 2]\n", "clip[0].frames = [5, 2]: expected two whole numbers"),
-        ('schema = 1\n[[clip]]\nname = "a/b"\n', "clip[0].name = \"a/b\": expected letters"),
-        ('schema = 1\n[[clip]]\nlight = "no.exr"\n', "clip[0].light = \"no.exr\": there is no file"),
+        ('schema = 1\n[[clip]]\nname = "a/b"\n', 'clip[0].name = "a/b": expected letters'),
+        ('schema = 1\n[[clip]]\nlight = "no.exr"\n', 'clip[0].light = "no.exr": there is no file'),
         ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected "paper", "low"'),
         ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected "follow"'),
         ("schema = 1\n[run]\nsegment_frames = 0\n[[clip]]\n", "run.segment_frames = 0: expected a whole number from 1"),
         ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.object is missing: expected at least one"),
         (f"schema = 1\n[[clip]]\n[dataset]\nvariations = 0\n{BALL}", "dataset.variations = 0: expected a whole number"),
-        (f"schema = 1\n[[clip]]\n[dataset]\nobjects = [1, 99]\n{BALL}", "dataset.objects = [1, 99]: expected 64 at most"),
+        (
+            f"schema = 1\n[[clip]]\n[dataset]\nobjects = [1, 99]\n{BALL}",
+            "dataset.objects = [1, 99]: expected 64 at most",
+        ),
         (f"schema = 1\n[[clip]]\n[dataset]\nlights = [1, 1]\n{BALL}", "dataset.lights = [1, 1]: expected at least one"),
         (f"schema = 1\n[[clip]]\n[dataset]\nexposure = [2, 1]\n{BALL}", "dataset.exposure = [2, 1]: expected a number"),
         (
@@ -80,7 +83,7 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ),
         (
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nfile = "no.ply"\n',
-            "dataset.object[0].file = \"no.ply\": there is no mesh file",
+            'dataset.object[0].file = "no.ply": there is no mesh file',
         ),
         (
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "sphere"\nradius = [0.1, 0.2]\n',
@@ -91,13 +94,23 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             'not used with shape = "sphere"; its own keys are radius',
         ),
         (f"schema = 1\n[[clip]]\n[dataset]\n{BALL}weight = 0\n", "every weight is 0"),
-        (f'schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = "wood" }}\n', 'model = "wood": expected "lambert"'),
         (
-            'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "torus"\nmajor_radius = 0.01\nminor_radius = 0.02\n',
+            f'schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = "wood" }}\n',
+            'model = "wood": expected "lambert"',
+        ),
+        (
+            'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "torus"\n'
+            "major_radius = 0.01\nminor_radius = 0.02\n",
             "dataset.object[0]",
         ),
-        (f"schema = 1\n[[clip]]\n[dataset]\n{BALL}[[dataset.light]]\n", "dataset.light[0].at is missing: expected 3 numbers"),
-        (f'schema = 1\n[run]\nlight = "preroll"\n[[clip]]\n[dataset]\n{BALL}', "a data set needs light that is captured once"),
+        (
+            f"schema = 1\n[[clip]]\n[dataset]\n{BALL}[[dataset.light]]\n",
+            "dataset.light[0].at is missing: expected 3 numbers",
+        ),
+        (
+            f'schema = 1\n[run]\nlight = "preroll"\n[[clip]]\n[dataset]\n{BALL}',
+            "a data set needs light that is captured once",
+        ),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line_with_key_and_value(tmp_path, text, told):
@@ -110,7 +123,7 @@ def test_what_is_wrong_is_told_in_one_line_with_key_and_value(tmp_path, text, to
 
 def test_a_missing_mesh_of_a_scene_is_told_before_anything_is_done(tmp_path):
     (tmp_path / "scene.toml").write_text(
-        "schema = 1\n[camera]\nfield_of_view = 60\n[source]\npath = \"a.mp4\"\n[marker]\nsize = 0.08\n"
+        'schema = 1\n[camera]\nfield_of_view = 60\n[source]\npath = "a.mp4"\n[marker]\nsize = 0.08\n'
         '[[object]]\nshape = "mesh"\nfile = "gone.ply"\n'
     )
     with pytest.raises(SceneError, match=r"gone\.ply"):
@@ -118,6 +131,8 @@ def test_a_missing_mesh_of_a_scene_is_told_before_anything_is_done(tmp_path):
 
 
 def test_a_scene_of_a_camera_is_no_clip(tmp_path):
-    (tmp_path / "scene.toml").write_text("schema = 1\n[camera]\nfield_of_view = 60\n[source]\ncamera = 0\n[marker]\nsize = 0.08\n")
+    (tmp_path / "scene.toml").write_text(
+        "schema = 1\n[camera]\nfield_of_view = 60\n[source]\ncamera = 0\n[marker]\nsize = 0.08\n"
+    )
     with pytest.raises(JobsError, match="names no recording; give the clip a path"):
         read(tmp_path, 'schema = 1\n[[clip]]\nscene = "scene.toml"\n')

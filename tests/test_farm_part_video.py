@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fractions
+import itertools
 
 import av
 import numpy as np
@@ -17,7 +18,7 @@ UNEVEN = [7, 30, 41, 100, 101, 150, 203, 260, 261, 300, 390, 391]
 
 def write_parts(folder, ticks, cuts, tick=TICK):
     parts, starts = [], []
-    for number, (first, end) in enumerate(zip(cuts, cuts[1:], strict=False)):
+    for number, (first, end) in enumerate(itertools.pairwise(cuts)):
         parts.append(folder / f"part-{number}.mp4")
         starts.append(ticks[first])
         with PartSink(parts[-1], ticks[first:end], tick, 24.0) as sink:

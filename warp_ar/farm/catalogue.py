@@ -101,7 +101,8 @@ class LightSpec:
         """One light."""
         at, target, color = (_vector(span.draw(random)) for span in (self.at, self.target, self.color))
         intensity, inner, outer, radius = (
-            round(span.draw_one(random), 6) for span in (self.intensity, self.inner_angle, self.outer_angle, self.radius)
+            round(span.draw_one(random), 6)
+            for span in (self.intensity, self.inner_angle, self.outer_angle, self.radius)
         )
         if self.kind == "point":
             return Light("point", intensity, color, at=at, radius=radius)
@@ -163,7 +164,9 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     )
     region = table.data.get("region")
     if region is not None:
-        spans = Table(label, folder, "dataset", {"region": region}, ("region",)).span("region", None, 4, low=-100, high=100)
+        spans = Table(label, folder, "dataset", {"region": region}, ("region",)).span(
+            "region", None, 4, low=-100, high=100
+        )
         x0, y0, x1, y1 = spans.low
         if not (x0 < x1 and y0 < y1) or spans.low != spans.high:
             table.fail("region", "expected [x0, y0, x1, y1] in metres with x0 < x1 and y0 < y1")

@@ -31,9 +31,15 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
     resume.add_argument("--failed", action="store_true", help="try jobs again that have failed for good")
     for command in (run, resume):
-        command.add_argument("--workers", type=int, metavar="N", help="workers here (default: one per GPU, or per 4 cores)")
         command.add_argument(
-            "--ray", nargs="?", const="", metavar="ADDRESS", help="workers of a Ray cluster, or of one that is started here"
+            "--workers", type=int, metavar="N", help="workers here (default: one per GPU, or per 4 cores)"
+        )
+        command.add_argument(
+            "--ray",
+            nargs="?",
+            const="",
+            metavar="ADDRESS",
+            help="workers of a Ray cluster, or of one that is started here",
         )
     plan = commands.add_parser("plan", help="count jobs, try three of them on a few frames, say what all would take")
     plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="clips, and what is to be made of them")
@@ -88,8 +94,8 @@ def work(options: argparse.Namespace, folder: Path) -> int:
     mine = program_version()
     if version != mine:
         raise UsageError(
-            f"{folder} was begun by {version}; this is {mine}: install that version, or begin a new run, for pictures of "
-            "two programs are not of one kind"
+            f"{folder} was begun by {version}; this is {mine}: install that version, or begin a new run, for "
+            "pictures of two programs are not of one kind"
         )
     jobs = parse_jobs(data, str(folder / "run.json"))
     with locked(folder):
@@ -147,8 +153,8 @@ def plan(options: argparse.Namespace) -> int:
     kind = "segments" if jobs.dataset is None else "variations"
     print(f"{found.clips} clips, {found.jobs} {kind}, {found.frames} frames to light, {found.surveyed} to survey")
     print(
-        f"a frame: {found.frame_ms:.1f} ms lit and written, {found.survey_ms:.1f} ms surveyed; a job: {found.job_ms:.0f} ms "
-        f"beside its frames, at quality {jobs.settings.quality} on {devices[0]}"
+        f"a frame: {found.frame_ms:.1f} ms lit and written, {found.survey_ms:.1f} ms surveyed; a job: "
+        f"{found.job_ms:.0f} ms beside its frames, at quality {jobs.settings.quality} on {devices[0]}"
     )
     for count in sorted({1, len(devices)}):
         print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(count))}")

@@ -18,6 +18,9 @@ from warp_ar.farm.labels import DEPTH_SCALE, categories
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.shapes import torus_mesh
 
+_LISTED = 50
+"""Clips that a datasheet names."""
+
 
 def write_dataset_files(jobs: JobFile, places: Sequence[Path], folder: Path, run: Path, version: str) -> dict[str, Any]:
     """Write ``models``, ``annotations.json`` and ``datasheet.md``.
@@ -76,8 +79,10 @@ def _write_models(catalogue: Sequence[ObjectSpec], folder: Path) -> None:
         x, y, z = (round(float(v), 6) for v in low)
         a, b, c = (round(float(v), 6) for v in high - low)
         table[str(number)] = {
-            **{"diameter": _diameter(np.asarray(mesh.vertices)), "min_x": x, "min_y": y, "min_z": z},
-            **{"size_x": a, "size_y": b, "size_z": c, "name": spec.name},
+            "diameter": _diameter(np.asarray(mesh.vertices)),
+            **dict(zip(("min_x", "min_y", "min_z"), (x, y, z), strict=True)),
+            **dict(zip(("size_x", "size_y", "size_z"), (a, b, c), strict=True)),
+            "name": spec.name,
         }
     (folder / "models_info.json").write_text(json.dumps(table, indent=1), encoding="utf-8")
 
@@ -124,60 +129,74 @@ def _write_coco(dataset: Dataset, places: Sequence[Path], path: Path, run: Path)
     return counts
 
 
+_SHEET = """# Datasheet
+
+{pictures} pictures with {labels} visible objects, in {made} of {planned} planned variations of {clips} clips. Made by
+{version}, quality `{quality}`, seed {seed}: the same job file gives the same bytes on any number of workers.
+
+## Composition
+
+Every picture is a frame of a recording in which virtual objects stand on the desk, lit by the light of that recording
+and by virtual lights. Labels come from the geometry that was rendered; nobody drew them.
+
+| category | name | shape | visible in pictures |
+| --- | --- | --- | --: |
+{categories}
+
+{objects[0]} to {objects[1]} objects and {lights[0]} to {lights[1]} virtual lights in a picture; exposure {low:g} to
+{high:g}. Objects stand {margin:g} m apart at least and hide the marker from no camera of the clip.
+
+## Files
+
+- `train/NNNNNN/`: a variation as a BOP scene; `scene.toml` draws it again
+- `depth`: 16-bit PNG, {step:g} mm a step along the camera's axis; 0 where nothing is modelled
+- `normals`: 16-bit PNG, (n + 1) / 2 in the camera's axes (x right, y down, z forward); 0 where nothing is modelled
+- `mask`: the silhouette within the picture, whatever is before it; `mask_visib`: what is seen of it
+- `scene_light.json`: virtual lights in the world's metres, and the environment as nine spherical harmonics of its
+  radiance; `environment_key` numbers the map in `clips/NAME/survey.npz` of the run
+- `annotations.json`: COCO, over all variations; `models/`: PLY in millimetres with `models_info.json`
+
+## Clips
+
+{recordings}
+
+## What it is not
+
+- Pixels are labelled by what is at their centre; edges in the pictures are smooth.
+- A picture with lens distortion keeps it: `cam_K` alone does not project into it, `cam_dist` says the rest.
+- Silhouettes end at the picture's border, so `visib_fract` counts no part that is beside it.
+- What is real but not modelled hides no virtual object, has no depth and no label.
+- An object that lies any way up touches the desk with its lowest point; whether it would tip over is not asked.
+- People and rooms of the recordings are in the pictures: whose consent they need is not asked here.
+"""
+
+
 def _datasheet(
     jobs: JobFile, dataset: Dataset, places: Sequence[Path], counts: collections.Counter[str], version: str
 ) -> str:
     """What the data set is, how it was made, and what it is not."""
-    planned = len(jobs.clips) * dataset.variations
-    rows = [
+    rows = (
         f"| {number} | {spec.name} | {spec.item.shape} | {counts[f'category {number}']} |"
         for number, spec in enumerate(dataset.catalogue, 1)
-    ]
-    clips = [f"- `{clip.name}`: scene `{Path(clip.scene).name}`" for clip in jobs.clips[:50]]
-    if len(jobs.clips) > 50:
-        clips.append(f"- and {len(jobs.clips) - 50} more")
-    return "\n".join(
-        [
-            "# Datasheet",
-            "",
-            f"{counts['pictures']} pictures with {counts['labels']} visible objects, in {len(places)} of {planned} planned "
-            f"variations of {len(jobs.clips)} clips. Made by {version}, quality `{jobs.settings.quality}`, seed "
-            f"{dataset.seed}: the same job file gives the same bytes on any number of workers.",
-            "",
-            "## Composition",
-            "",
-            "Every picture is a frame of a recording in which virtual objects stand on the desk, lit by the light of that "
-            "recording and by virtual lights. Labels come from the geometry that was rendered; nobody drew them.",
-            "",
-            "| category | name | shape | visible in pictures |",
-            "| --- | --- | --- | --: |",
-            *rows,
-            "",
-            f"{dataset.objects[0]} to {dataset.objects[1]} objects and {dataset.lights[0]} to {dataset.lights[1]} virtual "
-            f"lights in a picture; exposure {dataset.exposure.low[0]:g} to {dataset.exposure.high[0]:g}. Objects stand "
-            f"{dataset.margin:g} m apart at least and hide the marker from no camera of the clip.",
-            "",
-            "## Files",
-            "",
-            "- `train/NNNNNN/`: a variation as a BOP scene; `scene.toml` draws it again",
-            f"- `depth`: 16-bit PNG, {DEPTH_SCALE:g} mm a step along the camera's axis; 0 where nothing is modelled",
-            "- `normals`: 16-bit PNG, (n + 1) / 2 in the camera's axes (x right, y down, z forward); 0 where nothing is",
-            "- `mask`: the silhouette within the picture, whatever is before it; `mask_visib`: what is seen of it",
-            "- `scene_light.json`: virtual lights in the world's metres, and the environment as nine spherical harmonics of",
-            "  its radiance; `environment_key` numbers the map in `clips/NAME/survey.npz` of the run",
-            "- `annotations.json`: COCO, over all variations; `models/`: PLY in millimetres with `models_info.json`",
-            "",
-            "## Clips",
-            "",
-            *clips,
-            "",
-            "## What it is not",
-            "",
-            "- Pixels are labelled by what is at their centre; edges in the pictures are smooth.",
-            "- A picture with lens distortion keeps it: `cam_K` alone does not project into it, `cam_dist` says the rest.",
-            "- Silhouettes end at the picture's border, so `visib_fract` counts no part that is beside it.",
-            "- What is real but not modelled hides no virtual object, has no depth and no label.",
-            "- People and rooms of the recordings are in the pictures: whose consent they need is not asked here.",
-            "",
-        ]
+    )
+    clips = [f"- `{clip.name}`: scene `{Path(clip.scene).name}`" for clip in jobs.clips[:_LISTED]]
+    if len(jobs.clips) > _LISTED:
+        clips.append(f"- and {len(jobs.clips) - _LISTED} more")
+    return _SHEET.format(
+        pictures=counts["pictures"],
+        labels=counts["labels"],
+        made=len(places),
+        planned=len(jobs.clips) * dataset.variations,
+        clips=len(jobs.clips),
+        version=version,
+        quality=jobs.settings.quality,
+        seed=dataset.seed,
+        categories="\n".join(rows),
+        objects=dataset.objects,
+        lights=dataset.lights,
+        low=dataset.exposure.low[0],
+        high=dataset.exposure.high[0],
+        margin=dataset.margin,
+        step=DEPTH_SCALE,
+        recordings="\n".join(clips),
     )

@@ -218,12 +218,11 @@ class Driver:
                 state.job, state.frames, state.since = job, 0, time.monotonic()
                 self._running.add(job)
                 self._pool.give(worker, job, arguments)
-            if not self._running:
-                if any(state.ready for state in self._workers):
-                    waiting = self._again.popleft() if self._again else next_job()
-                    if waiting is None:
-                        return
-                    continue
+            if not self._running and any(state.ready for state in self._workers):
+                waiting = self._again.popleft() if self._again else next_job()
+                if waiting is None:
+                    return
+                continue
             for event in self._pool.wait(1.0):
                 self._hear(event)
             if time.monotonic() - self._lines_since > PROGRESS_SECONDS:
@@ -237,7 +236,8 @@ class Driver:
             case "ready":
                 if event.value != self._version:
                     raise RunError(
-                        f"worker {event.worker} is {event.value}, the driver is {self._version}; install one version on all"
+                        f"worker {event.worker} is {event.value}, the driver is {self._version}; "
+                        "install one version on all"
                     )
                 state.ready, state.deaths = True, 0
             case "frames":
@@ -256,7 +256,8 @@ class Driver:
     def _bury(self, event: Event, state: _Worker) -> None:
         """A worker has died; another has been started."""
         job, state.job = state.job, None
-        if not state.ready:
+        outside = isinstance(event.value, str) or is_from_outside(event.value)
+        if not state.ready and not (outside and isinstance(event.value, int)):
             state.deaths += 1
             if state.deaths >= STARTS:
                 raise RunError(
@@ -269,7 +270,6 @@ class Driver:
         self._running.discard(job)
         key = job.key(self._jobs)
         how = event.value if isinstance(event.value, str) else words_of_exit(event.value)
-        outside = isinstance(event.value, str) or is_from_outside(event.value)
         if outside and self._interrupted[key] + 1 < INTERRUPTIONS:
             self._interrupted[key] += 1
             self._again.append(job)
@@ -281,7 +281,8 @@ class Driver:
         key = job.key(self._jobs)
         if outcome.state == "full":
             raise RunError(
-                f"the disk of {self._folder} is full ({outcome.reason}); free some space, then: farm resume {self._folder}"
+                f"the disk of {self._folder} is full ({outcome.reason}); free some space, then: "
+                f"farm resume {self._folder}"
             )
         if outcome.state == "failed":
             self._manifest.add("try", key, reason=outcome.reason)
@@ -326,7 +327,7 @@ class Driver:
             self._say(f"{self._folder / PROGRESS} cannot be written: {reason(error)}")
 
     def _seconds_left(self, open_jobs: int, now: float) -> float | None:
-        """By the pace of this driver, if all clips have as many jobs as those that are known; None: too early to say."""
+        """By the pace of this driver, if other clips have as many jobs as those that are known; None: too early."""
         clips = len(self._open)
         if not self._finished_now or not clips:
             return None

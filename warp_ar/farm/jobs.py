@@ -165,7 +165,7 @@ def read_jobs(path: str | Path) -> dict[str, Any]:
     folder = path.absolute().parent
     clips = data.get("clip")
     if not isinstance(clips, list) or not clips:
-        raise JobsError(f"{label}: [[clip]] is missing: name at least one clip, such as scene = \"desk\"")
+        raise JobsError(f'{label}: [[clip]] is missing: name at least one clip, such as scene = "desk"')
     data["clip"] = [made for index, clip in enumerate(clips) for made in _resolved(label, folder, index, clip)]
     data["folder"] = str(folder)
     return data
@@ -207,7 +207,9 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         clips.append(_read_clip(Table(label, folder, f"clip[{index}]", entry, _CLIP_KEYS), names))
     dataset = None if "dataset" not in data else read_dataset(label, folder, data["dataset"])
     if dataset is not None and settings.light == "preroll":
-        raise JobsError(f'{label}: run.light = "preroll": a data set needs light that is captured once; "follow" or "fixed"')
+        raise JobsError(
+            f'{label}: run.light = "preroll": a data set needs light that is captured once; "follow" or "fixed"'
+        )
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
@@ -284,7 +286,8 @@ def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
     spec, own = jobs.clips[clip], scene_of(jobs, clip).source
     if spec.source is not None:
         return spec.source, None
-    assert own is not None and own.path is not None
+    assert own is not None
+    assert own.path is not None
     return own.path, own.fps
 
 

@@ -83,7 +83,8 @@ class LabelWriter:
         Raises:
             SinkError: A file cannot be written.
         """
-        assert lit.result is not None and lit.pose is not None
+        assert lit.result is not None
+        assert lit.pose is not None
         number, layers = lit.frame.index, lit.result.layers
         whole = self._trace(lit.pipeline)
         visible = layers["ids"]
@@ -92,7 +93,9 @@ class LabelWriter:
         depth = np.where(np.isfinite(depth) & (depth < 65535.5), depth, 0.0)
         self._put(f"depth/{number:06d}.png", np.rint(depth).astype(np.uint16))
         normals = layers["normals"] @ lit.pose.rotation.T.astype(np.float32)
-        codes = np.rint((0.5 + 0.5 * np.clip(normals, -1.0, 1.0)) * 65535.0) * (layers["normals"] != 0).any(2)[..., None]
+        codes = (
+            np.rint((0.5 + 0.5 * np.clip(normals, -1.0, 1.0)) * 65535.0) * (layers["normals"] != 0).any(2)[..., None]
+        )
         self._put(f"normals/{number:06d}.png", np.ascontiguousarray(codes[..., ::-1]).astype(np.uint16))
         self._note_frame(lit)
         self._note_light(lit, key)
@@ -157,9 +160,14 @@ class LabelWriter:
             position, direction = light.pose_at(lit.frame.time)
             lights.append(
                 {
-                    **{"kind": light.kind, "intensity": light.intensity, "color": list(light.color)},
-                    **{"position": _numbers(position), "direction": _numbers(direction), "radius": light.radius},
-                    **{"inner_angle": light.inner_angle, "outer_angle": light.outer_angle},
+                    "kind": light.kind,
+                    "intensity": light.intensity,
+                    "color": list(light.color),
+                    "position": _numbers(position),
+                    "direction": _numbers(direction),
+                    "radius": light.radius,
+                    "inner_angle": light.inner_angle,
+                    "outer_angle": light.outer_angle,
                 }
             )
         self._tables["light"][str(lit.frame.index)] = {

@@ -1,4 +1,4 @@
-"""How a worker lights the frames of a job: pipelines that are kept from one job to the next, and what they are given."""
+"""How a worker lights the frames of a job: pipelines that are kept between jobs, and what they are given."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,14 @@ class Lighter:
         self._pipelines: collections.OrderedDict[Any, Pipeline] = collections.OrderedDict()
         self._survey: tuple[int, Survey] | None = None
         self._key: tuple[int, int, Any] | None = None
+
+    def __enter__(self) -> Lighter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def close(self) -> None:
         """Let the pipelines' threads go."""

@@ -72,7 +72,9 @@ class Manifest:
             try:
                 self._take(json.loads(line))
             except (ValueError, KeyError, TypeError) as error:
-                raise RunError(f"{self.path}: line {number} is damaged ({reason(error)}); remove the line and resume") from error
+                raise RunError(
+                    f"{self.path}: line {number} is damaged ({reason(error)}); remove the line and resume"
+                ) from error
         if write:
             self._open(len(whole))
 
@@ -89,7 +91,9 @@ class Manifest:
         key = line["job"]
         match line["state"]:
             case "done":
-                self.done[key] = {name: line.get(name) for name in ("frames", "bytes", "length", "found") if name in line}
+                self.done[key] = {
+                    name: line.get(name) for name in ("frames", "bytes", "length", "found") if name in line
+                }
                 self.failed.pop(key, None)
             case "failed":
                 self.failed[key] = line["reason"]
@@ -179,7 +183,9 @@ def load_run(folder: Path) -> tuple[dict[str, Any], str]:
         data = json.loads(path.read_text(encoding="utf-8"))
         return data["jobs"], str(data["version"])
     except FileNotFoundError as error:
-        raise UsageError(f"{folder} holds no run ({RUN} is missing); begin one with: farm run JOBS.toml --output {folder}") from error
+        raise UsageError(
+            f"{folder} holds no run ({RUN} is missing); begin one with: farm run JOBS.toml --output {folder}"
+        ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunError(f"{path} cannot be read: {reason(error)}") from error
 

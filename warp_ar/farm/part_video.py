@@ -56,7 +56,10 @@ class PartSink(ThreadedSink):
         self._container.metadata["comment"] = PROGRAM
         rate = fractions.Fraction(self._fps).limit_denominator(1001)
         options = {
-            **{"preset": "veryfast", "crf": str(CRF), "bf": "0", "threads": str(ENCODER_THREADS)},
+            "preset": "veryfast",
+            "crf": str(CRF),
+            "bf": "0",
+            "threads": str(ENCODER_THREADS),
             "g": str(max(1, round(FRAGMENT_SECONDS * self._fps))),
         }
         self._stream = self._container.add_stream("libx264", rate=rate, options=options)
@@ -177,7 +180,9 @@ def _video_packets(
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
             if bytes(stream.codec_context.extradata or b"") != header:
-                raise SourceError(f"{path} was encoded in another way than the segments before it; remove it and resume")
+                raise SourceError(
+                    f"{path} was encoded in another way than the segments before it; remove it and resume"
+                )
             for packet in container.demux(stream):
                 if not packet.size:
                     continue

@@ -118,7 +118,12 @@ def _try(
     looked = few.end or 0
     say(f"{jobs.clips[clip].name}: {frames} frames in {seconds:.2f} s (the first time {whole[0] + times[0][0]:.2f} s)")
     per_frame = (seconds - begun) / max(frames - 1, 1)
-    return 1e3 * survey / max(looked - first, 1), 1e3 * per_frame, 1e3 * max(seconds - frames * per_frame, 0.0), size / max(frames, 1)
+    return (
+        1e3 * survey / max(looked - first, 1),
+        1e3 * per_frame,
+        1e3 * max(seconds - frames * per_frame, 0.0),
+        size / max(frames, 1),
+    )
 
 
 def _time(work: Work, job: Job) -> tuple[float, float, int, float]:
@@ -134,4 +139,9 @@ def _time(work: Work, job: Job) -> tuple[float, float, int, float]:
     if outcome.state != "done":
         raise RunError(f"{job.key(work.context.jobs)} cannot be tried: {outcome.reason}")
     seconds = time.perf_counter() - start
-    return seconds, float(outcome.values.get("bytes", 0)), int(outcome.values.get("frames", 0)), begun[0] if begun else 0.0
+    return (
+        seconds,
+        float(outcome.values.get("bytes", 0)),
+        int(outcome.values.get("frames", 0)),
+        begun[0] if begun else 0.0,
+    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -84,7 +85,7 @@ def cores_of(workers: int) -> list[list[int]]:
     if workers >= len(cores):
         return [[cores[n % len(cores)]] for n in range(workers)]
     ends = [round(n * len(cores) / workers) for n in range(workers + 1)]
-    return [cores[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+    return [cores[a:b] for a, b in itertools.pairwise(ends)]
 
 
 class ProcessPool:
@@ -126,13 +127,14 @@ class ProcessPool:
 
     def wait(self, seconds: float) -> list[Event]:
         """As ``Pool.wait``; a worker that died has been replaced."""
-        pipes = {pipe: worker for worker, (_, pipe) in enumerate(self._workers)}
-        events = []
-        for pipe in multiprocessing.connection.wait(list(pipes), seconds):
-            worker = pipes[pipe]  # type: ignore[index]
+        pipes: dict[Any, int] = {pipe: worker for worker, (_, pipe) in enumerate(self._workers)}
+        events: list[Event] = []
+        heard: list[Any] = multiprocessing.connection.wait(list(pipes), seconds)
+        for pipe in heard:
+            worker = pipes[pipe]
             try:
-                while pipe.poll():  # type: ignore[union-attr]
-                    kind, value = pipe.recv()  # type: ignore[union-attr]
+                while pipe.poll():
+                    kind, value = pipe.recv()
                     events.append(Event(worker, kind, value))
             except (EOFError, OSError):
                 events.append(Event(worker, "died", self._end(worker)))

@@ -149,8 +149,11 @@ def _connect(ray: Any, address: str | None) -> None:
         thread.start()
         thread.join(CONNECT_SECONDS)
         if thread.is_alive():
-            raise UsageError(f"--ray {address}: nothing answers within {CONNECT_SECONDS:g} s; start one with: ray start --head")
+            raise UsageError(
+                f"--ray {address}: nothing answers within {CONNECT_SECONDS:g} s; start one with: ray start --head"
+            )
     if failure:
         raise UsageError(
-            f"--ray {address or 'local'}: no cluster answers ({reason(failure[0])[:200]}); start one with: ray start --head"
+            f"--ray {address or 'local'}: no cluster answers ({reason(failure[0])[:200]}); start one with: "
+            "ray start --head"
         )

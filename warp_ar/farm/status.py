@@ -52,14 +52,21 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
     """The same in words."""
     done = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(status["done"].items()))
     lines = [f"{folder}: {status['clips']} clips; done: {done or 'nothing yet'}"]
-    lines.append(f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed")
+    lines.append(
+        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed"
+    )
     lines += [f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]]
     if len(status["failed"]) > 20:
         lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / 'manifest.jsonl'}")
     progress = status["progress"]
     if not status["running"]:
-        return [*lines, f"no driver is at work; go on with: farm resume {folder}" if progress else "no driver has begun"]
-    lines.append(f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed")
+        return [
+            *lines,
+            f"no driver is at work; go on with: farm resume {folder}" if progress else "no driver has begun",
+        ]
+    lines.append(
+        f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed"
+    )
     for number, worker in enumerate(progress["workers"]):
         what = f"{worker['job']}, frame {worker['frames']}" if worker["job"] else "waiting"
         lines.append(f"worker {number} on {worker['device']}: {worker['fps']:.1f} frames/s, {what}")
@@ -73,5 +80,3 @@ def words_of_seconds(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-

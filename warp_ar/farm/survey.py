@@ -60,7 +60,8 @@ class Survey:
         self._path = folder / NAME
         self.light_file = folder / LIGHT
         try:
-            with np.load(self._path) as values:
+            # Opened here: of a damaged file NumPy leaves its own open.
+            with open(self._path, "rb") as stream, np.load(stream) as values:
                 numerator, denominator = (int(v) for v in values["tick"])
                 tick = fractions.Fraction(numerator, denominator)
                 self.index = FrameIndex(values["ticks"], tick, bool(values["seekable"]))
@@ -85,7 +86,7 @@ class Survey:
         """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known."""
         with np.load(self._path) as values:
             name = f"emitters_{key:06d}"
-            return np.asarray(values[f"light_{key:06d}"], np.float32), values[name] if name in values else None
+            return np.asarray(values[f"light_{key:06d}"], np.float32), values.get(name)
 
 
 class _Writer:
@@ -198,16 +199,21 @@ def _look_at_frames(
     first, end = lit_range(jobs.clips[clip], index.length)
     given = look.scene.pose
     if given is not None:
-        for frame in range(first, end):
-            rotation, translation = given.at(frame)
-            look.poses[frame] = (*np.ravel(rotation), *np.ravel(translation))
+        for number in range(first, end):
+            rotation, translation = given.at(number)
+            look.poses[number] = (*np.ravel(rotation), *np.ravel(translation))
         if not look.captures:
             return
     outputs = ("pose", "environment") if look.captures else ("pose",)
     environment: Map | None = None
     with open_part(path, index, first, end, fps) as source:
         pipeline = Pipeline(
-            look.scene, device=device, quality=jobs.settings.quality, size=source.size, outputs=outputs, synchronous=True
+            look.scene,
+            device=device,
+            quality=jobs.settings.quality,
+            size=source.size,
+            outputs=outputs,
+            synchronous=True,
         )
         with pipeline:
             for frame in source:

@@ -119,7 +119,9 @@ class Table:
             low: Least that a number may be.
             high: Most.
         """
-        right = f"expected {'a number' if size == 1 else f'{size} numbers'} from {low:g} to {high:g}, or [lowest, highest]"
+        right = (
+            f"expected {'a number' if size == 1 else f'{size} numbers'} from {low:g} to {high:g}, or [lowest, highest]"
+        )
         value = self.data.get(key)
         if value is None:
             if default is None:

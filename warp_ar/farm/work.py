@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from warp_ar.errors import WarpArError, reason
@@ -62,6 +63,14 @@ class Work:
         """Do nothing yet."""
         self.context = context
         self._lighter = Lighter(context.jobs, context.folder, context.device)
+
+    def __enter__(self) -> Work:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def close(self) -> None:
         """Let threads go."""
