@@ -413,14 +413,12 @@ def add_recovered(
 
 
 @wp.func
-def leave_surface(scene: RayScene, point: SurfacePoint, direction: wp.vec3) -> wp.vec3:
-    """Origin of a ray from a surface point; which proxy it lies on is not kept, so the largest bounds the rounding."""
+def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
+    """How far off its surface a point may lie, metres; which proxy that is is not kept, so the largest bounds it."""
     size = wp.float32(0.0)
     for index in range(scene.proxies.shape[0]):
-        shape = scene.proxies[index]
-        size = wp.max(size, shape.scale * wp.length(shape.extent))
-    error = ROUNDING * (8.0 * wp.max(wp.abs(point.position)) + 32.0 * size)
-    return offset_origin(point.position, point.normal, direction, error)
+        size = wp.max(size, scene.proxies[index].scale * wp.length(scene.proxies[index].extent))
+    return ROUNDING * (8.0 * wp.max(wp.abs(point.position)) + 32.0 * size)
 
 
 @wp.func
@@ -586,6 +584,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
             transfer_out[index, m] = 0.0
             mirrored_out[index, m] = 0.0
         point = points[index]
+        error = surface_error(scene, point)
         for m in range(rows * columns):
             middle = cells[m // columns, m % columns].middle
             solid_angle = cells[m // columns, m % columns].solid_angle
@@ -599,7 +598,8 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 for k in range(probes.shape[0]):
                     share *= 1.0 - hidden_share(probes[k].center, probes[k].radius, point.position, middle, angle)
                 target = m
-                hit = trace.closest_proxy(scene, leave_surface(scene, point, middle), middle, FAR)
+                origin = offset_origin(point.position, point.normal, middle, error)
+                hit = trace.closest_proxy(scene, origin, middle, FAR)
                 if hit.shape >= 0:
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
@@ -629,7 +629,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
             if cosine > 0.0 and away > emitter[3]:
                 direction = ray / away
                 given = cosine / (away * away)
-                origin = leave_surface(scene, point, direction)
+                origin = offset_origin(point.position, point.normal, direction, surface_error(scene, point))
                 if trace.occluded_by_proxies(scene, origin, direction, away - emitter[3]):
                     given = 0.0
                 for k in range(probes.shape[0]):
