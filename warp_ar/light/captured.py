@@ -23,6 +23,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
 
 Array = NDArray[np.float64]
@@ -96,7 +97,7 @@ class Light:
         channels = {"RGB": np.ascontiguousarray(self.radiance), "confidence": np.ascontiguousarray(self.confidence)}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lambda part: OpenEXR.File(header, channels).write(str(part)))
+            write_whole(path, lambda part: write_exr(part, header, channels))
         except (RuntimeError, OSError) as error:
             raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
