@@ -40,7 +40,7 @@ def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path) -> None:
     whole = path.read_bytes()
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
-        with pytest.raises(OSError):
+        with pytest.raises(OSError, match="error"):
             check_whole_exr(path)
 
 
@@ -51,7 +51,7 @@ def test_the_system_says_why_a_file_lacks_its_end(tmp_path: pathlib.Path) -> Non
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
-        with pytest.raises(OSError) as caught:
+        with pytest.raises(OSError, match="large") as caught:
             write_exr(tmp_path / "a.exr", HEADER, {"Y": np.ones((20, 4), np.float32)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

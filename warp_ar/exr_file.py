@@ -78,5 +78,6 @@ def _end_of_chunks(data: bytes) -> int:
     table = struct.unpack_from(f"<{count}Q", data, at + 1)
     if min(table) < at + 1 + 8 * count:
         raise ValueError  # the table is written last
-    _, size = struct.unpack_from("<ii", data, max(table))
-    return int(max(table)) + 8 + size
+    last = int(max(table))
+    _, size = struct.unpack_from("<ii", data, last)
+    return last + 8 + int(size)

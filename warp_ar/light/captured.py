@@ -247,9 +247,10 @@ def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Map]]:
 
 def _attribute(path: Path, header: dict[str, Any], name: str, default: float) -> float:
     value = header.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not 0.0 <= value < math.inf:
+    number = float(value) if isinstance(value, numbers.Real) else math.nan
+    if not 0.0 <= number < math.inf:
         raise SceneError(f"{path}: its attribute {name} is {str(value)[:40]!r}; expected a finite number, 0 or more")
-    return float(value)
+    return number
 
 
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
