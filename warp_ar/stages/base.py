@@ -152,6 +152,7 @@ class Arrays(Mapping[str, Any]):
 
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
+NOT_ASKED = "none of its layers is asked for"
 """Reasons that several stages give."""
 
 
