@@ -1416,6 +1416,27 @@ async def test_the_page_is_there_before_anything_is_built() -> None:
 
 
 @run
+async def test_a_viewer_that_is_busy_beyond_the_end_leaves_without_an_error(caplog: pytest.LogCaptureFixture) -> None:
+    ended = asyncio.Event()
+
+    async def busy(viewer: Any) -> None:
+        while not ended.is_set():
+            with contextlib.suppress(asyncio.CancelledError):
+                await ended.wait()
+
+    async with served() as site:
+        site.server._receive = busy  # type: ignore[method-assign]
+        before = asyncio.all_tasks()
+        page = await site.session.ws_connect(f"{site.url}/live")
+        await page.receive()
+        handlers = asyncio.all_tasks() - before
+    ended.set()
+    results = await asyncio.gather(*handlers, return_exceptions=True)
+    assert [error for error in results if isinstance(error, Exception)] == []
+    assert caplog.text == ""
+
+
+@run
 async def test_a_host_that_cannot_be_built_ends_the_server_with_its_reason() -> None:
     make = functools.partial(Host, dataclasses.replace(page_scene(), source=None), device="cpu")
     with pytest.raises(UsageError, match="names no source"):

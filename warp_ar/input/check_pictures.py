@@ -299,7 +299,7 @@ def _check_blur(marker: Marker, look: Look, views: Sequence[tuple[Image, Pose]])
         pixels = _project(look.camera, pose, pattern.points)
         ahead = _project(look.camera, pose, pattern.points + 1e-4 * pattern.normals) - pixels
         scale = np.linalg.norm(ahead, axis=1)
-        room = pattern.environments * scale / 1e-4
+        room = pattern.clearances * scale / 1e-4
         chosen = room > 9.0
         if chosen.sum() < 8:
             continue
