@@ -25,7 +25,7 @@ def test_whole_files_are_whole(tmp_path: pathlib.Path, compression: str, rows: i
     pixels = np.random.default_rng(0).random((rows, 9, 3)).astype(np.float32)
     confidence = np.ones((rows, 9), np.float32)
     path = tmp_path / "a.exr"
-    write_exr(path, header, {"RGB": pixels, "confidence": confidence})
+    write_exr(path, OpenEXR.File(header, {"RGB": pixels, "confidence": confidence}))
     before = path.read_bytes()
     check_whole_exr(path)
     assert path.read_bytes() == before
@@ -34,9 +34,16 @@ def test_whole_files_are_whole(tmp_path: pathlib.Path, compression: str, rows: i
         check_whole_exr(path)
 
 
-def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int) -> None:
     path = tmp_path / "a.exr"
-    write_exr(path, {**HEADER, "compression": OpenEXR.ZIP_COMPRESSION}, {"Y": np.ones((20, 4), np.float32)})
+    header = {**HEADER, "compression": OpenEXR.ZIP_COMPRESSION}
+    pixels = np.ones((20, 4), np.float32)
+    if parts == 1:
+        image = OpenEXR.File(header, {"Y": pixels})
+    else:
+        image = OpenEXR.File([OpenEXR.Part(header, {"Y": k + pixels[: 20 - k]}, f"part {k}") for k in range(parts)])
+    write_exr(path, image)
     whole = path.read_bytes()
     for length in range(len(whole)):
         path.write_bytes(whole[:length])
@@ -52,7 +59,7 @@ def test_the_system_says_why_a_file_lacks_its_end(tmp_path: pathlib.Path) -> Non
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
     try:
         with pytest.raises(OSError, match="large") as caught:
-            write_exr(tmp_path / "a.exr", HEADER, {"Y": np.ones((20, 4), np.float32)})
+            write_exr(tmp_path / "a.exr", OpenEXR.File(HEADER, {"Y": np.ones((20, 4), np.float32)}))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert caught.value.errno == errno.EFBIG

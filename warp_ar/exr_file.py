@@ -10,30 +10,28 @@ import errno
 import os
 import pathlib
 import struct
-from collections.abc import Mapping
-from typing import Any
 
-import numpy.typing as npt
 import OpenEXR
 
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 """Rows of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB."""
 _MAGIC = b"\x76\x2f\x31\x01"
+_SEVERAL_PARTS = 0x10
+"""Bit of the second byte of the version's four."""
 
 
-def write_exr(path: pathlib.Path, header: Mapping[str, Any], channels: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write one picture of rows.
+def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:
+    """Write a picture of rows, or several.
 
     Args:
         path: The file, which is replaced.
-        header: Attributes; ``type`` must be ``OpenEXR.scanlineimage``.
-        channels: By name, (height, width) or (height, width, 3 or 4).
+        image: What it is to hold; its parts are of the type ``OpenEXR.scanlineimage``.
 
     Raises:
         OSError: Not all of it could be written.
         RuntimeError: OpenEXR cannot write this.
     """
-    OpenEXR.File(dict(header), dict(channels)).write(str(path))
+    image.write(str(path))
     check_whole_exr(path)
 
 
@@ -41,10 +39,9 @@ def check_whole_exr(path: pathlib.Path) -> None:
     """Raise OSError if a file that was written ends before its last chunk does, with what the system says of the rest.
 
     Args:
-        path: The file: one part, rows, no tiles.
+        path: The file; its parts are of rows, not of tiles.
     """
-    with path.open("rb") as stream:
-        data = stream.read()
+    data = path.read_bytes()
     try:
         end = _end_of_chunks(data)
     except (struct.error, ValueError, IndexError):
@@ -60,10 +57,27 @@ def check_whole_exr(path: pathlib.Path) -> None:
 
 
 def _end_of_chunks(data: bytes) -> int:
-    """Where the last chunk ends, by the table that points to chunks."""
+    """Where the last chunk ends, by the tables that point to chunks."""
     if data[:4] != _MAGIC:
         raise ValueError
-    at, lines, rows = 8, 0, 0
+    several = bool(data[5] & _SEVERAL_PARTS)
+    count, at = _read_header(data, 8)
+    chunks = count
+    while several and data[at] != 0:
+        count, at = _read_header(data, at)
+        chunks += count
+    at += several
+    table = struct.unpack_from(f"<{chunks}Q", data, at)
+    if min(table) < at + 8 * chunks:
+        raise ValueError  # the table is written last
+    last = int(max(table)) + (4 if several else 0)  # behind the number of the part
+    _, size = struct.unpack_from("<ii", data, last)
+    return last + 8 + int(size)
+
+
+def _read_header(data: bytes, at: int) -> tuple[int, int]:
+    """Chunks of a part by its header, and where that ends."""
+    lines, rows = 0, 0
     while (name_end := data.index(b"\0", at)) > at:
         name = data[at:name_end]
         kind_end = data.index(b"\0", name_end + 1)
@@ -74,10 +88,6 @@ def _end_of_chunks(data: bytes) -> int:
         elif name == b"dataWindow":
             _, low, _, high = struct.unpack_from("<4i", data, value)
             rows = high - low + 1
-    count = -(-rows // lines)
-    table = struct.unpack_from(f"<{count}Q", data, at + 1)
-    if min(table) < at + 1 + 8 * count:
-        raise ValueError  # the table is written last
-    last = int(max(table))
-    _, size = struct.unpack_from("<ii", data, last)
-    return last + 8 + int(size)
+    if lines < 1 or rows < 1:
+        raise ValueError
+    return -(-rows // lines), at + 1

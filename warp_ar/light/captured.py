@@ -97,7 +97,7 @@ class Light:
         channels = {"RGB": np.ascontiguousarray(self.radiance), "confidence": np.ascontiguousarray(self.confidence)}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lambda part: write_exr(part, header, channels))
+            write_whole(path, lambda part: write_exr(part, OpenEXR.File(header, channels)))
         except (RuntimeError, OSError) as error:
             raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 

@@ -136,8 +136,8 @@ def write_environment(
         if suffix == ".hdr":
             data = encode_hdr(picture, described)
         else:
-            channels = {"RGB": np.ascontiguousarray(picture)}
-            data = functools.partial(write_exr, header=_header(axes, layout, info), channels=channels)
+            image = OpenEXR.File(_header(axes, layout, info), {"RGB": np.ascontiguousarray(picture)})
+            data = functools.partial(write_exr, image=image)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, data)
