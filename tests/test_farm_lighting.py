@@ -13,8 +13,9 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey
-from warp_ar.farm.work import Context, Work
+from warp_ar.farm.work import Work
 from warp_ar.scene import Animation, dumps_scene, load_scene
 from warp_ar.session import Session
 
