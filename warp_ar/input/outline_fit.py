@@ -36,7 +36,9 @@ SPACING: Final = 4.0
 """Pixels between samples of an edge."""
 STEP: Final = 6.0
 """Codes per pixel that a step must have: more than noise and wood have."""
-POINTED: Final = 10.0
+FARTHEST: Final = 20.0
+"""Pixels that a pointed corner may be moved."""
+POINTED: Final = 8.0
 """Pixels: standard deviation of a pointed corner, over that of an edge's step of one pixel."""
 MET: Final = 1.5
 """Pixels within which an edge has met its step."""
@@ -72,8 +74,8 @@ def fit_outline(
         camera: The camera.
         pose: ``camera_from_world``.
         kind: ``plane``: corners of a rectangle that lies on the desk, around it; ``wall``: the left and right end of
-            its foot, then its top right and top left corner; ``box``: three corners of its base, around it, then the
-            corner of its top above the first.
+            its foot, then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner
+            of its top above the second, then the next corner of its top, behind: all four are seen.
         points: Pixels.
 
     Raises:
@@ -84,7 +86,7 @@ def fit_outline(
     _check(kind, start)
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
     shape = start
-    anchors = _anchors(kind, start, view)
+    anchors = _anchors(kind, start, view, np.asarray(points, float))
     for reach in REACHES:
         for _ in range(ROUNDS):
             moved = _improve(kind, shape, view, gray, reach, anchors)
@@ -92,7 +94,9 @@ def fit_outline(
                 break
             shape = moved
     met = _met(kind, shape, view, gray)
-    fitted = met >= ENOUGH and _is_sound(kind, shape)
+    # Edges that lie far from where somebody pointed are others.
+    moved_by = np.linalg.norm(view.pixels(_corners(kind, shape))[anchors[0]] - anchors[1], axis=1).max()
+    fitted = met >= ENOUGH and bool(moved_by <= FARTHEST)
     shape = shape if fitted else start
     return OutlineFit(_proxy(kind, shape), met, fitted)
 
@@ -164,21 +168,23 @@ def _start_wall(view: _View, points: Array) -> Array:
 
 def _start_box(view: _View, points: Array) -> Array:
     """x, y, angle, width, depth, height."""
-    a, b, c = view.on_desk(points[:3])
-    along, across = b - a, c - b
+    a, b = view.on_desk(points[:2])
+    along = b - a
     width = float(np.linalg.norm(along))
     if width < SMALLEST:
-        raise UsageError("two corners of the box are at one place; point out three corners of its base")
-    angle = math.atan2(along[1], along[0])
+        raise UsageError("two corners of the box are at one place; point out both ends of an edge of its base")
     sideways = np.array([-along[1], along[0]]) / width
-    depth = float(across @ sideways)
-    # The top's corner stands above the base's: the height at which the ray passes that upright.
-    way = view.rays(points[3:])[0]
-    flat = way[:2]
-    far = float(flat @ (a - view.eye[:2])) / max(float(flat @ flat), 1e-12)
-    height = float(view.eye[2] + far * way[2])
+    above, behind = view.rays(points[2:])
+    # The height at which the ray of the third point passes the second's upright.
+    flat = above[:2]
+    far = float(flat @ (b - view.eye[:2])) / max(float(flat @ flat), 1e-12)
+    height = float(view.eye[2] + far * above[2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        last = view.eye + np.float64(height - view.eye[2]) / behind[2] * behind
+    depth = float((last[:2] - b) @ sideways)
     middle = a + along / 2 + sideways * depth / 2
-    return np.array([*middle, angle, width, abs(depth), height])
+    # Corners run around the base from the end that was pointed out first, or, behind it, from the other side.
+    return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
 
 
 def _is_sound(kind: str, shape: Array) -> bool:
@@ -196,7 +202,7 @@ def _check(kind: str, shape: Array) -> None:
     order = {
         "plane": "its four corners, around it",
         "wall": "the left and right end of its foot, then its top right and top left corner",
-        "box": "three corners of its base, around it, then the corner of its top above the first",
+        "box": "both ends of an edge of its base, the corner of its top above the second, and the next one behind it",
     }[kind]
     sizes = " x ".join(f"{1e3 * side:.0f}" for side in shape[3:])
     raise UsageError(f"the points make a {kind} of {sizes} mm; expected {order}")
@@ -276,10 +282,11 @@ def _steps(gray: NDArray[np.float32], at: Array, normals: Array, reach: float) -
     return middle[best] + 0.5 * np.clip(fine, -1, 1), b
 
 
-def _anchors(kind: str, shape: Array, view: _View) -> tuple[list[int], Array]:
-    """Corners that were pointed out, and where they were."""
-    chosen = [0, 1, 2, 4] if kind == "box" else [0, 1, 2, 3]
-    return chosen, view.pixels(_corners(kind, shape))[chosen]
+def _anchors(kind: str, shape: Array, view: _View, points: Array) -> tuple[list[int], Array]:
+    """Numbers of the shape's corners that were pointed out, and where they are at first."""
+    seen = view.pixels(_corners(kind, shape))
+    chosen = [int(np.linalg.norm(seen - point, axis=1).argmin()) for point in points]
+    return chosen, seen[chosen]
 
 
 def _improve(

@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,8 @@ from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.check_pictures import Look, look_at, why_unseen
 from warp_ar.input.checkup import check_look
 from warp_ar.input.finding import Finding
+from warp_ar.input.grey_response import measure_grey_response
+from warp_ar.input.response import write_response
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Probe, Scene
 from warp_ar.viewer.controls import Controls, Notify
@@ -30,6 +33,8 @@ LOST_SECONDS: Final = 1.5
 """How long the marker must not have been seen before it is looked at why."""
 AGAIN_SECONDS: Final = 3.0
 """How often that is looked at."""
+RESPONSE: Final = "response.txt"
+"""Name of a measured response's file."""
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
 
@@ -37,14 +42,16 @@ FEWEST: Final = 3
 class SetupChecks:
     """Keeps some of the frames and looks at them on a helper's thread. The thread of the frames calls ``note``."""
 
-    def __init__(self, controls: Controls, helper: Executor, notify: Notify) -> None:
+    def __init__(self, controls: Controls, helper: Executor, notify: Notify, folder: Path) -> None:
         """Start without frames.
 
         Args:
             controls: What is shown, and where measurements go.
             helper: Looks at the frames, beside them.
             notify: Takes ``message`` whenever it has changed.
+            folder: Where a measured response is kept.
         """
+        self._folder = folder
         self._controls, self._helper, self._notify = controls, helper, notify
         self._frames: collections.deque[tuple[Image, float]] = collections.deque(maxlen=KEPT)
         self._of: object = None
@@ -103,8 +110,12 @@ class SetupChecks:
         Raises:
             UsageError: It is at that already, or there are too few frames yet.
         """
-        work: dict[str, Callable[[Scene, Look], None]] = {"check": self._check, "ball": self._ball}
-        if self._is_busy:
+        work: dict[str, Callable[[Scene, Look], None]] = {
+            "check": self._check,
+            "ball": self._ball,
+            "response": self._response,
+        }
+        if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
         if name not in work:
             raise UsageError(f"no step {name!r}; expected {', '.join(work)}")
@@ -150,6 +161,29 @@ class SetupChecks:
             f"The ball's centre was {moved:.1f} mm off; it is known to ± {2e3 * found.deviation:.1f} mm now. "
             f"Its radius: {radius}."
         )
+
+    def _response(self, scene: Scene, look: Look) -> None:
+        """Measure how the camera encodes light, by the card's greys."""
+        found = measure_grey_response(look.images)
+        path = self._folder / RESPONSE
+        write_response(found.curve, path)
+        camera = dataclasses.replace(scene.camera, transfer=path)
+        self._controls.change(lambda w: w.with_camera(camera), "measure the response")
+        middle = found.curve[128].mean()
+        self._measured["response"] = (
+            f"Code 128 is {middle:.3f} of clipping ± {2 * found.deviation[128].max():.0%} (sRGB: 0.216), by "
+            f"{found.views} pictures. Several exposures, or lamps on and off, tell it better."
+        )
+
+    def response_file(self) -> bytes:
+        """The measured response.
+
+        Raises:
+            UsageError: None was measured.
+        """
+        if "response" not in self._measured:
+            raise UsageError("no response was measured here")
+        return (self._folder / RESPONSE).read_bytes()
 
     def message(self) -> dict[str, Any]:
         """What was found and measured."""
