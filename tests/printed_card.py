@@ -31,7 +31,7 @@ def smooth_curve(rng):
 class PrintedCard:
     """A sheet of paper on a dark table, under light that falls off across it."""
 
-    def __init__(self, rng, black=None, spread=None, paper="a4"):
+    def __init__(self, rng, black=None, spread=None, paper="a4", scale=1.0):
         self.rng = rng
         self.black = rng.uniform(0.03, 0.1) if black is None else black
         self.spread = rng.normal(0.0, 0.015) if spread is None else spread
@@ -45,29 +45,38 @@ class PrintedCard:
             inked = share + 4 * self.spread * share * (1 - share)
             patch = ink[round(y) - h : round(y) + h, round(x) - w : round(x) + w]
             patch += inked - share
+        if scale != 1.0:
+            # Printers scale about the page's middle; what was cut off is white.
+            middle = np.array(ink.shape[::-1]) / 2
+            turn = np.column_stack([np.eye(2) * scale, middle * (1 - scale)])
+            ink = np.clip(cv2.warpAffine(ink, turn, ink.shape[::-1], flags=cv2.INTER_AREA), 0.0, 1.0)
+            self.origin = middle + (self.origin - middle) * scale
         self.paper = (WHITE * (1.0 - ink * (1.0 - self.black))).astype(np.float32)
         self.slope = rng.uniform(-1.5, 1.5, 2)
 
     def photograph(self, camera: Camera, pose: Pose, light: float, encode, noise=1.2):
         """An RGB frame, uint8; white paper in the card's middle has linear value ``light``."""
         across = 2
-        scaled = camera.matrix() * np.array([[across], [across], [1.0]])
-        scaled[:2, 2] += 0.5 * (across - 1)
-        to_board = np.array(
-            [
-                [1 / PER_METRE, 0, -self.origin[0] / PER_METRE],
-                [0, -1 / PER_METRE, self.origin[1] / PER_METRE],
-                [0, 0, 1],
-            ]
-        )
-        seen = scaled @ np.column_stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation]) @ to_board
+        # Where each ray meets the paper, in its own pixels.
+        sub = (np.arange(across) + 0.5) / across - 0.5
+        rows, columns = ((np.arange(side)[:, None] + sub).ravel() for side in (camera.height, camera.width))
+        flat = np.stack(np.meshgrid(columns, rows), -1)
+        if any(camera.distortion):
+            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-8)
+            matrix, lens = camera.matrix(), np.array(camera.distortion)
+            flat = cv2.undistortPoints(flat.reshape(-1, 1, 2), matrix, lens, criteria=criteria).reshape(flat.shape)
+        else:
+            flat = (flat - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        plane = np.column_stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation])
+        met = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], -1) @ np.linalg.inv(plane).T
+        places = met[..., :2] / met[..., 2:] * (PER_METRE, -PER_METRE) + self.origin
         y, x = np.mgrid[: self.paper.shape[0], : self.paper.shape[1]].astype(np.float32)
         fall = np.exp(((x - self.origin[0]) * self.slope[0] - (y - self.origin[1]) * self.slope[1]) / PER_METRE)
-        size = (across * camera.width, across * camera.height)
         # Blurred to the picture's grain first: dots that a camera does not resolve.
         grain = PER_METRE * pose.translation[2] / camera.fx / across
         fine = cv2.GaussianBlur(self.paper * fall, (0, 0), max(0.45 * grain, 0.3))
-        linear = cv2.warpPerspective(fine, seen, size, flags=cv2.INTER_LINEAR, borderValue=0.05)
+        places = places.astype(np.float32)
+        linear = cv2.remap(fine, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderValue=0.05)
         linear = cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA) * light / WHITE
         codes = 255 * encode(linear)[..., None] + self.rng.normal(0, noise, (camera.height, camera.width, 3))
         return np.clip(np.rint(codes), 0, 255).astype(np.uint8)

@@ -34,7 +34,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 
-PATIENCE = 60.0  # seconds that anything may take on a busy machine
+PATIENCE = 180.0  # seconds that anything may take on a busy machine
 FRAMES = 48
 BITS, CELL = 8, 12  # the time code: squares along the picture's bottom edge, black or white
 # Half way between black and white, which JPEG moves by a few levels.
@@ -555,7 +555,6 @@ def test_a_desk_is_set_up_by_keyboard_alone(open_tab: Callable[..., Tab], artefa
     tab.until("document.getElementById('guide').hidden")
 
     # All is looked at, and said.
-    tab.until("warpAr.view.stats.shown > 40")
     reach("#check")
     page.keyboard.press("Enter")
     tab.until(

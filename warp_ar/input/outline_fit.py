@@ -30,6 +30,8 @@ _Places: TypeAlias = list[tuple[int, int, float]]
 
 REACHES: Final = (16.0, 9.0, 5.0)
 """Pixels to either side of an edge in which its step is looked for, round after round: a hand points as well."""
+MODELLED: Final = 30.0
+"""The same at first for shapes that are modelled already: a ruler and a guess are worse than a hand."""
 ROUNDS: Final = 6
 """Steps of Gauss-Newton with each reach."""
 SPACING: Final = 4.0
@@ -99,6 +101,65 @@ def fit_outline(
     fitted = met >= ENOUGH and bool(moved_by <= FARTHEST)
     shape = shape if fitted else start
     return OutlineFit(_proxy(kind, shape), met, fitted)
+
+
+@dataclasses.dataclass(frozen=True)
+class OutlineRefit:
+    """A modelled shape against the picture's edges."""
+
+    proxy: Proxy
+    """Where the edges have it."""
+    met: float
+    """Share of its visible outline that lies on edges there."""
+    met_before: float
+    """The same where it is modelled."""
+    moved: float
+    """Pixels by which its corners are off at most."""
+
+
+def refit_outline(image: NDArray[np.uint8], camera: Camera, pose: Pose, proxy: Proxy) -> OutlineRefit | None:
+    """A modelled box on the desk or wall, moved and turned to fit the picture's edges; its sizes stay.
+
+    None where it is neither, or not whole in the picture.
+
+    Args:
+        image: RGB, of the camera's size.
+        camera: The camera.
+        pose: ``camera_from_world``.
+        proxy: The shape.
+    """
+    kind, shape = _shape_of(proxy)
+    view = _View(camera, pose)
+    if kind is None or view.eye[2] <= 0:
+        return None
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
+    seen = view.pixels(_corners(kind, shape))
+    size = (gray.shape[1], gray.shape[0])
+    if not np.isfinite(seen).all() or not ((seen > 2) & (seen < (size[0] - 3, size[1] - 3))).all():
+        return None  # of an outline that is cut off, what is left fits anywhere
+    start, before = shape, _met(kind, shape, view, gray)
+    anchors = (list(range(len(seen))), seen)
+    for reach in (MODELLED, *REACHES):
+        for _ in range(ROUNDS):
+            moved = _improve(kind, shape, view, gray, reach, anchors, free=3)
+            if moved is None:
+                break
+            shape = moved
+    if not _is_sound(kind, shape):
+        shape = start
+    off = float(np.linalg.norm(view.pixels(_corners(kind, shape)) - seen, axis=1).max())
+    return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, gray), before, off)
+
+
+def _shape_of(proxy: Proxy) -> tuple[str | None, Array]:
+    """Kind and numbers of a proxy that could have been pointed out, but for planes: they need no edges."""
+    turn = math.radians(proxy.rotate[2])
+    x, y, z = proxy.at
+    if proxy.shape == "box" and proxy.rotate[:2] == (0.0, 0.0) and abs(z - proxy.size[2] / 2) < 0.1 * proxy.size[2]:
+        return "box", np.array([x, y, turn, *proxy.size])
+    if proxy.shape == "plane" and proxy.rotate[:2] == (90.0, 0.0) and abs(z - proxy.size[1] / 2) < 0.1 * proxy.size[1]:
+        return "wall", np.array([x, y, turn, *proxy.size])
+    return None, np.zeros(0)
 
 
 class _View:
@@ -296,8 +357,9 @@ def _improve(
     gray: NDArray[np.float32],
     reach: float,
     anchors: tuple[list[int], Array],
+    free: int | None = None,
 ) -> Array | None:
-    """One step of Gauss-Newton; None where there is nothing to go by."""
+    """One step of Gauss-Newton for the first ``free`` numbers; None where there is nothing to go by."""
     size = (gray.shape[1], gray.shape[0])
     places, at, normals = _samples(kind, shape, view, size)
     if len(places) < 8:
@@ -314,14 +376,14 @@ def _improve(
 
     now = seen(shape)
     delta = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4])[: len(shape)]
-    jacobian = np.column_stack(
-        [(seen(shape + step) - now) / size_ for step, size_ in zip(np.diag(delta), delta, strict=True)]
-    )
+    steps = np.diag(delta)[:free]
+    jacobian = np.column_stack([(seen(shape + one) - now) / one.max() for one in steps])
     target = np.concatenate([offsets, np.zeros(2 * len(chosen))]) - now
     root = np.sqrt(np.concatenate([weight, np.ones(2 * len(chosen))]))
     good = np.isfinite(jacobian).all(1) & np.isfinite(target)
     step, *_ = np.linalg.lstsq(jacobian[good] * root[good, None], target[good] * root[good], rcond=None)
-    moved = shape + step
+    moved = shape.copy()
+    moved[:free] += step
     return moved if _is_sound(kind, moved) else None
 
 

@@ -57,6 +57,12 @@ class SetupChecks:
         self._of: object = None
         self._busy: Future[None] | None = None
         self._step: str | None = None
+        self._waits = False
+        self._work: dict[str, Callable[[Scene, Look], None]] = {
+            "check": self._check,
+            "ball": self._ball,
+            "response": self._response,
+        }
         self._seen = self._looked = 0.0
         self._findings: list[Finding] | None = None
         self._measured: dict[str, str] = {}
@@ -80,6 +86,7 @@ class SetupChecks:
             self._seen, self.missing = now, None
         if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
             self._frames.append((image, now))
+        self._begin()
         if state in (None, TrackState.TRACKED):
             self._seen, self.missing = now, None
         elif now - self._seen > LOST_SECONDS and now - self._looked > AGAIN_SECONDS and not self._is_busy:
@@ -105,25 +112,23 @@ class SetupChecks:
             self.missing = None  # the source has changed meanwhile
 
     def step(self, name: str) -> None:
-        """Begin to look at the frames, or to measure by them.
+        """Begin to look at the frames, or to measure by them, as soon as there are enough.
 
         Raises:
-            UsageError: It is at that already, or there are too few frames yet.
+            UsageError: It is at that already.
         """
-        work: dict[str, Callable[[Scene, Look], None]] = {
-            "check": self._check,
-            "ball": self._ball,
-            "response": self._response,
-        }
         if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
-        if name not in work:
-            raise UsageError(f"no step {name!r}; expected {', '.join(work)}")
-        if len(self._frames) < FEWEST:
-            raise UsageError("too few frames have been seen yet: wait some seconds")
-        self._step = name
+        if name not in self._work:
+            raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
+        self._step, self._waits = name, True
         self._notify(self.message())
-        self._busy = self._helper.submit(self._run, work[name])
+
+    def _begin(self) -> None:
+        """Do what was asked for, if there are enough frames."""
+        if self._waits and self._step is not None and len(self._frames) >= FEWEST:
+            self._waits = False
+            self._busy = self._helper.submit(self._run, self._work[self._step])
 
     def _run(self, work: Callable[[Scene, Look], None]) -> None:
         self._failed = None
