@@ -101,7 +101,7 @@ class Session:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
             loop: Start a clip again when it ends.
             refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
                 was found is in ``ball_fits``.
@@ -214,7 +214,7 @@ class Session:
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
-        kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
+        kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)

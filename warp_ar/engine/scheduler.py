@@ -96,7 +96,7 @@ class Scheduler:
         """Seconds by which stages are timed on the host."""
         self._build()
         self._culling = culling
-        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
         self._unneeded: Mapping[str, str] = {}
         """Why stages can change no pixel of this frame."""
         self._passes = {stage.name: passes for stage, passes in self._stages}
