@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from warp_ar.errors import UsageError
+from warp_ar.input.check_print import card_scale
 from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import (
     Camera,
@@ -123,14 +124,8 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
 
 def card_ruler(scene: Scene) -> float | None:
     """What the rulers of the scene's printed card measure, metres; None where its marker is another one."""
-    board, made = scene.marker.board, SHEET.board
-    assert isinstance(made, CharucoBoard)
-    if not isinstance(board, CharucoBoard) or scene.marker.dictionary != SHEET.dictionary:
-        return None
-    if (board.columns, board.rows) != (made.columns, made.rows):
-        return None
-    scale = board.square_length / made.square_length
-    return RULER * scale if abs(board.marker_length / made.marker_length / scale - 1.0) < 1e-3 else None
+    scale = card_scale(scene.marker)
+    return None if scale is None else RULER * scale
 
 
 def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scene:
