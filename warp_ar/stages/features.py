@@ -102,7 +102,8 @@ def find_features(request: Request) -> Features:
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
     lit_by_both = bool(environment and scene.lights and scene.proxies)
-    emitters = recovered and quality.method("recover") == "shading"
+    placed = recovered or (environment and not observed and request.emitters)
+    emitters = placed and quality.method("recover") == "shading"
     by_series = quality.method("irradiance") == "sh2"
     return Features(
         request=request,
