@@ -8,6 +8,12 @@ times solid angle; within a texel directions are uniform. Radiance is looked up 
 texel reaches into those around it: what is summed is brightness after a tent of three texels, and a hundredth of the
 mean everywhere, which leaves no direction that has light without samples.
 
+Near emitters. Texels that show an emitter at a known distance D from where it is mirrored are taken out of the
+distant environment, less what surrounds them, and lie on a sphere of that radius. Seen from a point at distance d a
+texel has D^2 cos / d^2 of its solid angle, cos that between the ray and the sphere's normal, and is 1 / cos as bright:
+emitters shine evenly to all sides, as ``emitters`` has it. They hide nothing. One direction in so many is drawn toward
+them, by their light.
+
 Surfaces. A lobe is chosen in proportion to its reflectance, a cosine for the diffuse part, visible half vectors for
 GGX, the lobe itself for Phong. What a surface reflects is that of ``materials``, to which all of this only adds
 densities. A mirror has no density: its direction counts in full.
@@ -24,12 +30,12 @@ References:
 from __future__ import annotations
 
 import math
-from typing import Any
-
 import numpy as np
 import warp as wp
 
 from warp_ar.kernels.color import brightness
+from warp_ar.kernels.emitters import MAX_DISTANCE
+from warp_ar.kernels.environment_samples import EMITTER_COSINE, MIN_EMITTER_DISTANCE
 from warp_ar.kernels.guards import MAX_RADIANCE
 from warp_ar.kernels.latlong import latlong_from_direction, sample_latlong
 from warp_ar.kernels.materials import MIN_ALPHA, Surface, make_reflect_direct, reflect
@@ -45,7 +51,8 @@ from warp_ar.kernels.sampling import (
     uniform_from_bits,
 )
 from warp_ar.kernels.shadow import LightSample, has_penumbra, sample_light
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Light
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Emitter, Light
+from warp_ar.kernels.visibility import FAR
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,6 +69,9 @@ STREAMS = wp.constant(16)
 """Triples of random numbers that a vertex of a path may ask for."""
 SEED_STEP = wp.constant(wp.uint32(0x9E3779B9))
 
+LEAST_COSINE = wp.constant(wp.float32(0.1))
+"""Between a ray and the sphere that an emitter lies on: one that is seen from the side is not thin."""
+
 reflect_direct = make_reflect_direct(ALL_MODELS)
 
 
@@ -73,6 +83,25 @@ class Sky:
     density: wp.array2d[wp.float32]  # per steradian, of ``draw_sky``, constant within a texel
     rows: wp.array[wp.float32]  # (H + 1) cumulative, from 0 to 1
     columns: wp.array2d[wp.float32]  # (H, W + 1) cumulative along each row, from 0 to 1
+
+
+    emitters: wp.array[Emitter]  # near ones
+    near_share: wp.float32  # chance of ``draw_sky`` to draw a direction toward them
+    near_radiance: wp.array2d[wp.vec3]  # of the texels that show one, as seen from where they were mirrored
+    near_density: wp.array2d[wp.float32]  # per steradian from there, of the texels that are drawn
+    near_owner: wp.array2d[wp.int32]  # the emitter that a texel shows, or -1
+    near_texels: wp.array[wp.int32]  # those that show one
+    near_steps: wp.array[wp.float32]  # (n + 1) cumulative over these, from 0 to 1
+
+
+@wp.struct
+class SkyLight:
+    """Light that was drawn from the environment."""
+
+    direction: wp.vec3  # unit
+    distance: wp.float32  # of what sends it; FAR for the distant environment
+    radiance: wp.vec3
+    density: wp.float32  # per steradian
 
 
 @wp.struct
@@ -124,43 +153,101 @@ def find_step(cumulative: wp.array[wp.float32], u: wp.float32) -> wp.int32:
 
 
 @wp.func
-def draw_sky(sky: Sky, u: wp.vec2) -> Drawn:
-    """Direction toward the environment; its weight is left out."""
-    height = sky.radiance.shape[0]
-    width = sky.radiance.shape[1]
-    row = find_step(sky.rows, u[0])
-    line = sky.columns[row]
-    column = find_step(line, u[1])
-    down = wp.clamp((u[0] - sky.rows[row]) / wp.max(sky.rows[row + 1] - sky.rows[row], 1.0e-30), 0.0, 1.0)
-    along = wp.clamp((u[1] - line[column]) / wp.max(line[column + 1] - line[column], 1.0e-30), 0.0, 1.0)
-    # Uniform in solid angle: in sin^2 of half the polar angle, which keeps its digits at the pole.
+def direction_in_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int32, u: wp.vec2) -> wp.vec3:
+    """Direction uniform in a texel's solid angle: in sin^2 of half the polar angle, which keeps its digits."""
     step = 0.5 * PI / wp.float32(height)
     top = wp.sin(step * wp.float32(row))
     bottom = wp.sin(step * wp.float32(row + 1))
-    half = top * top + down * (bottom * bottom - top * top)
+    half = top * top + u[0] * (bottom * bottom - top * top)
     sine = 2.0 * wp.sqrt(wp.max(half * (1.0 - half), 0.0))
-    phi = (2.0 * (wp.float32(column) + along) / wp.float32(width) - 1.0) * PI
-    drawn = Drawn()
-    drawn.direction = wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - 2.0 * half)
-    drawn.density = sky.density[row, column]
-    return drawn
+    phi = (2.0 * (wp.float32(column) + u[1]) / wp.float32(width) - 1.0) * PI
+    return wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - 2.0 * half)
 
 
 @wp.func
-def sky_density(sky: Sky, direction: wp.vec3) -> wp.float32:
-    """Density with which ``draw_sky`` gives a direction."""
+def within_step(cumulative: wp.array[wp.float32], step: wp.int32, u: wp.float32) -> wp.float32:
+    """Where in a step of ``find_step`` a number lies, 0 to 1."""
+    low = cumulative[step]
+    return wp.clamp((u - low) / wp.max(cumulative[step + 1] - low, 1.0e-30), 0.0, 1.0)
+
+
+@wp.func
+def texel_of(direction: wp.vec3, height: wp.int32, width: wp.int32) -> wp.vec2i:
+    """Row and column of the texel in which a direction lies."""
+    at = latlong_from_direction(direction, height, width)
+    return wp.vec2i(wp.clamp(wp.int32(at[0]), 0, height - 1), wp.clamp(wp.int32(at[1]), 0, width - 1))
+
+
+@wp.func
+def draw_sky(sky: Sky, origin: wp.vec3, u: wp.vec2, v: wp.float32) -> SkyLight:
+    """Light of the environment that arrives at ``origin`` if nothing is in the way; ``v`` picks a near emitter."""
     height = sky.radiance.shape[0]
     width = sky.radiance.shape[1]
-    at = latlong_from_direction(direction, height, width)
-    row = wp.clamp(wp.int32(at[0]), 0, height - 1)
-    column = wp.clamp(wp.int32(at[1]), 0, width - 1)
-    return sky.density[row, column]
+    light = SkyLight()
+    if v < sky.near_share:
+        step = find_step(sky.near_steps, u[0])
+        texel = sky.near_texels[step]
+        row = texel / width
+        column = texel % width
+        # The number that picked the texel among those of its row is used up: what is left of it says where within.
+        within = wp.vec2(within_step(sky.near_steps, step, u[0]), u[1])
+        normal = direction_in_texel(row, column, height, width, within)
+        emitter = sky.emitters[sky.near_owner[row, column]]
+        away = emitter.origin + emitter.distance * normal - origin
+        distance = wp.max(wp.length(away), 1.0e-6)
+        light.direction = away / distance
+        light.distance = distance
+        cosine = wp.max(wp.abs(wp.dot(light.direction, normal)), LEAST_COSINE)
+        light.radiance = sky.near_radiance[row, column] / cosine
+        spread = distance * distance / (emitter.distance * emitter.distance * cosine)
+        light.density = sky.near_share * sky.near_density[row, column] * spread
+        return light
+    row = find_step(sky.rows, u[0])
+    line = sky.columns[row]
+    column = find_step(line, u[1])
+    within = wp.vec2(within_step(sky.rows, row, u[0]), within_step(line, column, u[1]))
+    light.direction = direction_in_texel(row, column, height, width, within)
+    light.distance = FAR
+    light.radiance = sample_latlong(sky.radiance, light.direction)
+    light.density = (1.0 - sky.near_share) * sky.density[row, column]
+    return light
 
 
 @wp.func
-def sky_radiance(sky: Sky, direction: wp.vec3) -> wp.vec3:
-    """Radiance of the environment."""
-    return sample_latlong(sky.radiance, direction)
+def sky_radiance(sky: Sky, direction: wp.vec3, density: wp.float32) -> wp.vec3:
+    """Radiance of the distant environment, by its share for a ray that was drawn with ``density``."""
+    texel = texel_of(direction, sky.radiance.shape[0], sky.radiance.shape[1])
+    other = (1.0 - sky.near_share) * sky.density[texel[0], texel[1]]
+    return balance(density, other) * sample_latlong(sky.radiance, direction)
+
+
+@wp.func
+def near_radiance(
+    sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32
+) -> wp.vec3:
+    """Radiance of near emitters that a ray passes before ``t_max``, by its share as ``sky_radiance``."""
+    radiance = wp.vec3(0.0, 0.0, 0.0)
+    height = sky.radiance.shape[0]
+    width = sky.radiance.shape[1]
+    for k in range(sky.emitters.shape[0]):
+        emitter = sky.emitters[k]
+        from_center = origin - emitter.origin
+        half = wp.dot(from_center, direction)
+        nearest = from_center - half * direction
+        reach = emitter.distance * emitter.distance - wp.dot(nearest, nearest)
+        if reach > 0.0:
+            root = wp.sqrt(reach)
+            for side in range(2):
+                t = wp.where(side == 0, -half - root, -half + root)
+                if t > 0.0 and t < t_max:
+                    normal = (from_center + t * direction) / emitter.distance
+                    texel = texel_of(normal, height, width)
+                    if sky.near_owner[texel[0], texel[1]] == k:
+                        cosine = wp.max(wp.abs(wp.dot(direction, normal)), LEAST_COSINE)
+                        spread = t * t / (emitter.distance * emitter.distance * cosine)
+                        other = sky.near_share * sky.near_density[texel[0], texel[1]] * spread
+                        radiance += balance(density, other) / cosine * sky.near_radiance[texel[0], texel[1]]
+    return radiance
 
 
 @wp.func
@@ -272,8 +359,19 @@ def lights_in_the_way(
     return radiance
 
 
-def sky_tables(radiance: np.ndarray) -> dict[str, Any]:
-    """The cumulative sums and densities of ``Sky``, computed in float64.
+def _cumulative(weight: np.ndarray) -> np.ndarray:
+    """Sums of weights along the last axis, from 0 to 1, one longer than these."""
+    sums = np.cumsum(weight, axis=-1)
+    return np.concatenate([np.zeros((*weight.shape[:-1], 1)), sums / sums[..., -1:]], axis=-1)
+
+
+def _solid_angles(height: int, width: int) -> np.ndarray:
+    edges = np.cos(np.linspace(0.0, np.pi, height + 1))
+    return np.repeat(((edges[:-1] - edges[1:]) * 2.0 * np.pi / width)[:, None], width, axis=1)
+
+
+def sky_tables(radiance: np.ndarray) -> dict[str, np.ndarray]:
+    """The cumulative sums and densities of ``Sky`` without near emitters, computed in float64.
 
     Args:
         radiance: Latlong (H, W, 3), linear; negative values and NaN count as 0.
@@ -288,25 +386,80 @@ def sky_tables(radiance: np.ndarray) -> dict[str, Any]:
     tall = np.concatenate([beyond[:1], bright, beyond[-1:]])
     tall = 0.25 * tall[:-2] + 0.5 * tall[1:-1] + 0.25 * tall[2:]
     tent = 0.25 * np.roll(tall, 1, axis=1) + 0.5 * tall + 0.25 * np.roll(tall, -1, axis=1)
-    edges = np.cos(np.linspace(0.0, np.pi, height + 1))
-    angle = np.repeat(((edges[:-1] - edges[1:]) * 2.0 * np.pi / width)[:, None], width, axis=1)
+    angle = _solid_angles(height, width)
     mean = float((tent * angle).sum()) / (4.0 * np.pi)
     weight = (tent + max(EVEN_SHARE * mean, 1e-30)) * angle
     weight /= weight.sum()
-    along = np.cumsum(weight, axis=1)
-    columns = np.concatenate([np.zeros((height, 1)), along / along[:, -1:]], axis=1)
-    down = np.cumsum(along[:, -1])
-    rows = np.concatenate([[0.0], down / down[-1]])
-    tables = {"radiance": clean, "density": weight / angle, "rows": rows, "columns": columns}
+    tables = {
+        "radiance": clean,
+        "density": weight / angle,
+        "rows": _cumulative(weight.sum(axis=1)),
+        "columns": _cumulative(weight),
+    }
     return {name: np.ascontiguousarray(table, np.float32) for name, table in tables.items()}
 
 
-def make_sky(radiance: np.ndarray, device: wp.DeviceLike) -> Sky:
-    """The environment with its tables on a device; ``radiance`` as for ``sky_tables``."""
-    tables = sky_tables(radiance)
+def split_emitters(radiance: np.ndarray, emitters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Take what near emitters send out of an environment.
+
+    A texel shows the emitter that it is nearest to, if it is as bright as clipping and within ``EMITTER_COSINE`` of its
+    direction, as for ``environment_samples``. What surrounds them stays: the mean of the other texels in that cone.
+
+    Args:
+        radiance: Latlong (H, W, 3), clean.
+        emitters: Records of ``structs.Emitter``, near ones.
+
+    Returns:
+        The distant environment and the near part, (H, W, 3) each, and (H, W) which emitter a texel shows, or -1.
+    """
+    height, width = radiance.shape[:2]
+    theta = (np.arange(height) + 0.5)[:, None] * np.pi / height
+    phi = (2.0 * (np.arange(width) + 0.5)[None, :] / width - 1.0) * np.pi
+    parts = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi
+    cosines = np.stack(parts, axis=-1) @ emitters["direction"].reshape(-1, 3).T.astype(np.float64)
+    near = (cosines.max(axis=2) > float(EMITTER_COSINE)) & (radiance.max(axis=2) >= 1.0)
+    owner = np.where(near, cosines.argmax(axis=2), -1).astype(np.int32)
+    sent = np.zeros_like(radiance)
+    for k in range(len(emitters)):
+        around = (cosines[..., k] > float(EMITTER_COSINE)) & ~near
+        kept = radiance[around].mean(axis=0) if around.any() else np.zeros(3, np.float32)
+        sent[owner == k] = np.maximum(radiance[owner == k] - kept, 0.0)
+    return radiance - sent, sent, owner
+
+
+def _are_near(emitters: np.ndarray) -> np.ndarray:
+    return (emitters["distance"] > 0.0) & (emitters["distance"] < float(MAX_DISTANCE))
+
+
+def make_sky(radiance: np.ndarray, device: wp.DeviceLike, emitters: np.ndarray | None = None) -> Sky:
+    """The environment with its tables on a device.
+
+    Args:
+        radiance: As for ``sky_tables``.
+        device: Where to.
+        emitters: Records of ``structs.Emitter``; those that are not near stay part of the environment.
+    """
     sky = Sky()
-    sky.radiance = wp.array(tables["radiance"], dtype=wp.vec3, device=device)
-    sky.density = wp.array(tables["density"], dtype=wp.float32, device=device)
-    sky.rows = wp.array(tables["rows"], dtype=wp.float32, device=device)
-    sky.columns = wp.array(tables["columns"], dtype=wp.float32, device=device)
+    clean = sky_tables(radiance)["radiance"]
+    near = np.zeros(0) if emitters is None else emitters[_are_near(emitters)].copy()
+    if len(near):
+        near["distance"] = np.maximum(near["distance"], float(MIN_EMITTER_DISTANCE))
+        distant, sent, owner = split_emitters(clean, near)
+        angle = _solid_angles(*clean.shape[:2])
+        power = np.where(owner >= 0, sent.astype(np.float64).mean(axis=2), 0.0) * angle
+        if power.sum() > 0.0:
+            clean = distant
+            sky.emitters = wp.array(near, dtype=Emitter, device=device)
+            share = power.sum() / (power.sum() + float((distant.mean(axis=2) * angle).sum()))
+            sky.near_share = float(np.clip(share, LEAST_CHANCE, 1.0 - LEAST_CHANCE))
+            texels = np.flatnonzero(power)
+            sky.near_radiance = wp.array(sent, dtype=wp.vec3, device=device)
+            density = (power / power.sum() / angle).astype(np.float32)
+            sky.near_density = wp.array(density, dtype=wp.float32, device=device)
+            sky.near_owner = wp.array(owner, dtype=wp.int32, device=device)
+            sky.near_texels = wp.array(texels.astype(np.int32), dtype=wp.int32, device=device)
+            steps = _cumulative(power.ravel()[texels]).astype(np.float32)
+            sky.near_steps = wp.array(steps, dtype=wp.float32, device=device)
+    for name, table in sky_tables(clean).items():
+        setattr(sky, name, wp.array(table, dtype=wp.vec3 if name == "radiance" else wp.float32, device=device))
     return sky

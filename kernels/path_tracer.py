@@ -48,6 +48,7 @@ from warp_ar.kernels.materials import Surface, make_surface
 from warp_ar.kernels.mirror_ball import nearest_ball
 from warp_ar.kernels.path_sampling import (
     ALL_MODELS,
+    NO_DENSITY,
     STREAMS,
     PathKey,
     Sky,
@@ -56,9 +57,9 @@ from warp_ar.kernels.path_sampling import (
     draw_reflected,
     draw_sky,
     lights_in_the_way,
+    near_radiance,
     random_triple,
     reflect_direct,
-    sky_density,
     sky_radiance,
     surface_density,
 )
@@ -327,9 +328,11 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
         k = first + 1
         while k < MOST_VERTICES:
             vertex = find_vertex(scene, at, toward, False)
+            light = near_radiance(scene.sky, at, toward, vertex.hit.t, drawn_with)
             if vertex.kind == NOTHING:
-                share = balance(drawn_with, sky_density(scene.sky, toward))
-                return radiance + share * wp.cw_mul(weight, sky_radiance(scene.sky, toward))
+                light += sky_radiance(scene.sky, toward, drawn_with)
+                return radiance + wp.cw_mul(weight, light)
+            radiance += wp.cw_mul(weight, light)
             wo = -toward
             reflectance = wp.vec3(0.0, 0.0, 0.0)
             if vertex.kind == PROXY:
@@ -342,15 +345,14 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
             surface = look_up_material(scene, vertex, wo, reflectance)
             if vertex.kind == PROXY:
                 u = random_triple(key, k, SKY)
-                sky = draw_sky(scene.sky, wp.vec2(u[0], u[1]))
+                sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
                 reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
                 if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
                     start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
-                    if not hidden_by_physical(scene, start, sky.direction, FAR):
+                    if not hidden_by_physical(scene, start, sky.direction, sky.distance):
                         other = surface_density(surface, hit.normal, wo, sky.direction)
                         share = balance(sky.density, other) / sky.density
-                        light = wp.cw_mul(reflected, sky_radiance(scene.sky, sky.direction))
-                        radiance += share * wp.cw_mul(weight, light)
+                        radiance += share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
             u = random_triple(key, k, SCATTER)
             pick = random_triple(key, k, PICK)
             drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
@@ -453,19 +455,18 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             surface = look_up_material(scene, vertex, wo, reflectance)
             if surface.model != wp.static(int(MIRROR)):
                 u = random_triple(key, k, SKY)
-                sky = draw_sky(scene.sky, wp.vec2(u[0], u[1]))
+                sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
                 reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
                 if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
                     start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
-                    if not hidden_by_physical(scene, start, sky.direction, FAR):
+                    if not hidden_by_physical(scene, start, sky.direction, sky.distance):
                         other = surface_density(surface, hit.normal, wo, sky.direction)
                         share = balance(sky.density, other) / sky.density
-                        light = wp.cw_mul(reflected, sky_radiance(scene.sky, sky.direction))
-                        light = share * wp.cw_mul(weight, light)
+                        light = share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
                         if is_white:
                             carried.light += light
                         if not only_light:
-                            if occluded_by_objects(scene.rays, start, sky.direction, FAR):
+                            if occluded_by_objects(scene.rays, start, sky.direction, sky.distance):
                                 if changes_only:
                                     carried.radiance -= light
                             elif not changes_only:
@@ -492,16 +493,18 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             vertex = find_vertex(scene, origin, drawn.direction, True)
             disks = lights_in_the_way(scene.lights, hit.point, drawn.direction, vertex.hit.t, drawn.density)
             carried.radiance += wp.cw_mul(weight, disks)
-            if vertex.kind == NOTHING:
-                if not changes_only:
-                    share = balance(drawn.density, sky_density(scene.sky, drawn.direction))
-                    carried.radiance += share * wp.cw_mul(weight, sky_radiance(scene.sky, drawn.direction))
-                return carried
             if changes_only and vertex.kind == OBJECT:
                 if not is_white:
                     physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
                 carried.radiance -= wp.cw_mul(weight, physical)
                 changes_only = False
+            if not changes_only:
+                light = near_radiance(scene.sky, origin, drawn.direction, vertex.hit.t, drawn.density)
+                if vertex.kind == NOTHING:
+                    light += sky_radiance(scene.sky, drawn.direction, drawn.density)
+                carried.radiance += wp.cw_mul(weight, light)
+            if vertex.kind == NOTHING:
+                return carried
             wo = -drawn.direction
             k += 1
         return carried
@@ -579,7 +582,7 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
             shows = float(0.0)
             if whole:
                 if vertex.kind == NOTHING:
-                    z = sky_radiance(scene.sky, direction)
+                    z = sky_radiance(scene.sky, direction, NO_DENSITY)
                 else:
                     z = follow_path(params[0], scene, vertex, direction, False, False, False, key).radiance
             elif vertex.kind == OBJECT:

@@ -106,7 +106,7 @@ class PathTracer:
         Args:
             scene: What there is.
             light: The environment, in the world's axes: latlong radiance (h, 2 h, 3) in camera values, or a captured
-                light.
+                light, whose emitters of known distance are then where they are.
             frame: What the camera saw, (H, W, 3): encoded (uint8) or linear (float32). None: nothing is known of the
                 physical surfaces but ``reflectances``, and the picture is that of the whole scene, physical surfaces
                 and environment included.
@@ -135,7 +135,7 @@ class PathTracer:
             self._trace = self._trace.general()
         with translating(self.device), wp.ScopedDevice(self.device):
             self._host = HostScene(self.scene, self.device)
-            self._local = self._make_local(_environment(light), seconds)
+            self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
             shape = (self.camera.height, self.camera.width)
@@ -145,7 +145,7 @@ class PathTracer:
             self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
             self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
 
-    def _make_local(self, radiance: FloatImage, seconds: float) -> Any:
+    def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
         """The scene as paths meet it."""
         local = path_tracer.LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
@@ -160,7 +160,7 @@ class PathTracer:
         for ball, probe in zip(balls, self.scene.probes, strict=True):
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
         local.probes = wp.array(balls, dtype=structs.Probe, device=device)
-        local.sky = make_sky(radiance, device)
+        local.sky = make_sky(radiance, device, emitters)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
         integrate_dfg(local.dfg)
         rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
@@ -290,6 +290,16 @@ def _environment(light: Light | FloatImage) -> FloatImage:
     if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape[:2]) < 2:
         raise UsageError(f"light has the shape {radiance.shape}: expected latlong radiance (h, 2 h, 3)")
     return radiance
+
+
+def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
+    """Records of the emitters whose distances are known."""
+    near = [e for e in light.emitters if e.distance is not None] if isinstance(light, Light) else []
+    records = np.zeros(len(near), np.dtype(structs.Emitter.numpy_dtype()))
+    for record, emitter in zip(records, near, strict=True):
+        record["origin"], record["direction"] = emitter.origin, emitter.direction
+        record["distance"], record["power"] = emitter.distance, emitter.power
+    return records
 
 
 def _linear_frame(frame: Image | FloatImage, camera: Any) -> FloatImage:
