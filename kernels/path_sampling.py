@@ -419,12 +419,12 @@ def split_emitters(radiance: np.ndarray, emitters: np.ndarray) -> tuple[np.ndarr
     cosines = np.stack(parts, axis=-1) @ emitters["direction"].reshape(-1, 3).T.astype(np.float64)
     near = (cosines.max(axis=2) > float(EMITTER_COSINE)) & (radiance.max(axis=2) >= 1.0)
     owner = np.where(near, cosines.argmax(axis=2), -1).astype(np.int32)
-    sent = np.zeros_like(radiance)
+    distant = radiance.copy()
     for k in range(len(emitters)):
         around = (cosines[..., k] > float(EMITTER_COSINE)) & ~near
         kept = radiance[around].mean(axis=0) if around.any() else np.zeros(3, np.float32)
-        sent[owner == k] = np.maximum(radiance[owner == k] - kept, 0.0)
-    return radiance - sent, sent, owner
+        distant[owner == k] = np.minimum(radiance[owner == k], kept)
+    return distant, radiance - distant, owner
 
 
 def _are_near(emitters: np.ndarray) -> np.ndarray:
