@@ -30,6 +30,7 @@ References:
 from __future__ import annotations
 
 import math
+
 import numpy as np
 import warp as wp
 
@@ -83,7 +84,6 @@ class Sky:
     density: wp.array2d[wp.float32]  # per steradian, of ``draw_sky``, constant within a texel
     rows: wp.array[wp.float32]  # (H + 1) cumulative, from 0 to 1
     columns: wp.array2d[wp.float32]  # (H, W + 1) cumulative along each row, from 0 to 1
-
 
     emitters: wp.array[Emitter]  # near ones
     near_share: wp.float32  # chance of ``draw_sky`` to draw a direction toward them
@@ -222,9 +222,7 @@ def sky_radiance(sky: Sky, direction: wp.vec3, density: wp.float32) -> wp.vec3:
 
 
 @wp.func
-def near_radiance(
-    sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32
-) -> wp.vec3:
+def near_radiance(sky: Sky, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, density: wp.float32) -> wp.vec3:
     """Radiance of near emitters that a ray passes before ``t_max``, by its share as ``sky_radiance``."""
     radiance = wp.vec3(0.0, 0.0, 0.0)
     height = sky.radiance.shape[0]

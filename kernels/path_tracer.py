@@ -176,7 +176,7 @@ def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
 
 @functools.cache
 def make_find_vertex(trace: TraceConfig) -> wp.Function:
-    """``find_vertex(scene, origin, direction, objects) -> Vertex``: the first surface; ``objects``: virtual ones too."""
+    """``find_vertex(scene, origin, direction, objects) -> Vertex``: the first; if ``objects``, of virtual ones too."""
     functions = make_trace(trace)
     closest_object, closest_proxy = functions.closest_object, functions.closest_proxy
 
@@ -513,9 +513,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
 
 
 @wp.func
-def sum_product(
-    i: wp.int32, j: wp.int32, before: wp.vec3, after: wp.vec3, sums: wp.array2d[wp.vec3]
-):
+def sum_product(i: wp.int32, j: wp.int32, before: wp.vec3, after: wp.vec3, sums: wp.array2d[wp.vec3]):
     """Add the product of one quantity's deviation from its old mean and another's from its new one [Welford]."""
     sums[i, j] = sums[i, j] + wp.cw_mul(before, after)
 
@@ -704,8 +702,11 @@ def finish_picture_kernel(
             if rho[c] < 1.0 and e[c] > 0.0:
                 slope = rho[c] * g[c] / e[c]
             picture[c] = z[c] + rho[c] * g[c]
-            variance[c] = zz[c] + rho[c] * rho[c] * gg[c] + slope * slope * ee[c] + 2.0 * (
-                rho[c] * zg[c] - slope * ze[c] - rho[c] * slope * ge[c]
+            variance[c] = (
+                zz[c]
+                + rho[c] * rho[c] * gg[c]
+                + slope * slope * ee[c]
+                + 2.0 * (rho[c] * zg[c] - slope * ze[c] - rho[c] * slope * ge[c])
             )
     radiance_out[i, j] = wp.max(picture, wp.vec3(0.0, 0.0, 0.0))
     error = wp.vec3(0.0, 0.0, 0.0)

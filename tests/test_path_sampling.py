@@ -89,7 +89,11 @@ def emitter_kernel(emitters: wp.array[Emitter], point: wp.vec3, normal: wp.vec3,
 
 @wp.kernel(enable_backward=False)
 def surface_kernel(
-    scene: RayScene, dfg: wp.array2d[wp.vec2], wo: wp.vec3, estimates: wp.array2d[wp.float32], missing: wp.array[wp.int32]
+    scene: RayScene,
+    dfg: wp.array2d[wp.vec2],
+    wo: wp.vec3,
+    estimates: wp.array2d[wp.float32],
+    missing: wp.array[wp.int32],
 ):
     """Albedo by the surface's draws and by uniform ones, and the integral of the density."""
     i = wp.tid()
@@ -124,7 +128,8 @@ def test_densities_of_the_sky_integrate_to_one() -> None:
     radiance = sunny()
     radiance[3, 3] = (np.nan, -1.0, np.inf)
     tables = sky_tables(radiance)
-    assert (tables["density"].astype(np.float64) * solid_angles(HEIGHT)).sum() == pytest.approx(1.0, abs=TABLE_TOLERANCE)
+    total = (tables["density"].astype(np.float64) * solid_angles(HEIGHT)).sum()
+    assert total == pytest.approx(1.0, abs=TABLE_TOLERANCE)
     assert (np.diff(tables["rows"]) > 0).all()
     assert (np.diff(tables["columns"], axis=1) > 0).all(), "a direction is never drawn"
     assert np.isfinite(tables["radiance"]).all()

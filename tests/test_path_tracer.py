@@ -67,7 +67,8 @@ def check(picture: TracedPicture, expected: Any, where: Any = ..., tolerance: fl
     error = picture.error[where].astype(np.float64)
     mean = math.sqrt((error**2).sum()) / error.size
     assert abs(off.mean()) <= ERRORS * mean + tolerance, (off.mean(), mean)
-    assert (np.abs(off) <= 6.0 * error + np.maximum(tolerance, 0.25 * np.abs(picture.radiance[where]) * (error > 0))).all()
+    rare = 0.25 * np.abs(picture.radiance[where]) * (error > 0)  # bright paths that few samples have seen
+    assert (np.abs(off) <= 6.0 * error + np.maximum(tolerance, rare)).all()
 
 
 def ball(material: Any, radius: float = 0.3) -> Scene:
@@ -130,9 +131,8 @@ def test_light_in_a_closed_sphere(device: str) -> None:
 def test_a_light_inside_an_object_stays_there(device: str) -> None:
     """Hard case: nothing of it gets out, whether it is a point or has a disk."""
     for radius in (0.0, 0.02):
-        scene = dataclasses.replace(
-            ball(LambertMaterial((0.5, 0.5, 0.5))), lights=(VirtualLight("point", 100.0, at=(0, 0, 0.1), radius=radius),)
-        )
+        light = VirtualLight("point", 100.0, at=(0, 0, 0.1), radius=radius)
+        scene = dataclasses.replace(ball(LambertMaterial((0.5, 0.5, 0.5))), lights=(light,))
         assert not trace(scene, 0.0 * WHITE, look((1.0, 0.3, 0.4)), device).radiance.any()
 
 

@@ -144,8 +144,9 @@ def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
     difference = known.lit.astype(np.float64) - picture.image
     rms = float(np.sqrt((difference**2).mean()))
     return (
-        f"{known.scene.name}: {width}x{height}, {picture.samples} samples a pixel on {device} in {picture.seconds:.1f} s; "
-        f"relative standard error {picture.relative_error:.2%}; the pipeline's picture differs by {rms:.2f} codes rms"
+        f"{known.scene.name}: {width}x{height}, {picture.samples} samples a pixel on {device} in "
+        f"{picture.seconds:.1f} s; relative standard error {picture.relative_error:.2%}; "
+        f"the pipeline's picture differs by {rms:.2f} codes rms"
     )
 
 

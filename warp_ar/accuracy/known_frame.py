@@ -37,9 +37,7 @@ class KnownFrame:
     milliseconds: float
     """That its stages took."""
 
-    def tracer(
-        self, *, device: str = "auto", size: tuple[int, int] | None = None, seed: int = 0
-    ) -> PathTracer:
+    def tracer(self, *, device: str = "auto", size: tuple[int, int] | None = None, seed: int = 0) -> PathTracer:
         """A path tracer of this frame; arguments as those of ``PathTracer``."""
         return PathTracer(
             self.scene, self.light, self.image, self.pose, device=device, size=size, seconds=self.seconds, seed=seed
@@ -120,9 +118,7 @@ def light_up_to(
                 raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
             milliseconds = sum(timing.milliseconds for timing in result.stages.values())
             light = light_of(pipeline)
-            return KnownFrame(
-                pipeline.scene, image, result.image, result.pose, light, frame.time - first, milliseconds
-            )
+            return KnownFrame(pipeline.scene, image, result.image, result.pose, light, frame.time - first, milliseconds)
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
 
 
@@ -147,8 +143,13 @@ def light_of(pipeline: Pipeline) -> Light:
     return Light(radiance, np.ones(radiance.shape[:2], np.float32), tuple(emitters))
 
 
+def _triple(values: npt.NDArray[np.float32]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
 def _emitter(record: np.void, distance: float | None, height: int) -> CapturedEmitter:
     """An emitter that the pipeline found; it is taken to fill one texel."""
-    direction, origin, power = (tuple(map(float, record[name])) for name in ("direction", "origin", "power"))
+    direction, origin, power = (_triple(record[name]) for name in ("direction", "origin", "power"))
     size = float(texel_solid_angles(height)[height // 2, 0])
     return CapturedEmitter(direction, size, power, power, None, distance, origin)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -180,10 +180,10 @@ class PathTracer:
         params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
         return params
 
-    def _set_reflectances(self, reflectances: tuple[tuple[float, float, float], ...] | None) -> None:
+    def _set_reflectances(self, reflectances: Sequence[Any] | None) -> None:
         count = len(self.scene.proxies)
         if reflectances is None:
-            reflectances = ((UNKNOWN_REFLECTANCE,) * 3,) * count
+            reflectances = [(UNKNOWN_REFLECTANCE,) * 3] * count
         if len(reflectances) != count:
             raise UsageError(f"{len(reflectances)} reflectances for {count} proxies: expected one for each")
         values = np.asarray(reflectances, np.float32).reshape(count, 3)
@@ -199,11 +199,13 @@ class PathTracer:
             )  # fmt: skip
 
         if not self.device.is_cpu:
-            trace(None)
+            with translating(self.device), wp.ScopedDevice(self.device):
+                trace(None)
             return
         height = self.camera.height
         bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
-        trace(bands[0])  # compiles, before threads would each do so
+        with translating(self.device):
+            trace(bands[0])  # compiles, before threads would each do so
         with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
             list(pool.map(trace, bands[1:]))
 
@@ -214,19 +216,23 @@ class PathTracer:
         self._prepared = True
         with translating(self.device), wp.ScopedDevice(self.device):
             path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
-            shown = self._local.shown.numpy()
-            done = 0
-            for count in (FIRST_LIGHT_SAMPLES, LIGHT_SAMPLES - FIRST_LIGHT_SAMPLES):
-                self._add(path_tracer.IRRADIANCE, 0, count, done)
-                done += count
-                path_tracer.map_reflectance(self._local, self._moments, self._local.reflectance)
-                found = self._local.reflectance.numpy()
-                means = [
-                    found[shown == k].mean(axis=0) if (shown == k).any() else np.full(3, UNKNOWN_REFLECTANCE)
-                    for k in range(len(self.scene.proxies))
-                ]
-                self._set_reflectances(tuple(means))
-                self._moments = path_tracer.make_moments(shown.shape, self.device)
+        done = 0
+        for count in (FIRST_LIGHT_SAMPLES, LIGHT_SAMPLES - FIRST_LIGHT_SAMPLES):
+            self._add(path_tracer.IRRADIANCE, 0, count, done)
+            done += count
+            with translating(self.device), wp.ScopedDevice(self.device):
+                self._map_reflectance()
+
+    def _map_reflectance(self) -> None:
+        """Reflectance by the light that the moments hold, which then begin anew."""
+        path_tracer.map_reflectance(self._local, self._moments, self._local.reflectance)
+        found, shown = self._local.reflectance.numpy(), self._local.shown.numpy()
+        means = [
+            found[shown == k].mean(axis=0) if (shown == k).any() else np.full(3, UNKNOWN_REFLECTANCE)
+            for k in range(len(self.scene.proxies))
+        ]
+        self._set_reflectances(means)
+        self._moments = path_tracer.make_moments(shown.shape, self.device)
 
     def sample(self, count: int) -> None:
         """Add ``count`` samples to every pixel.
@@ -239,8 +245,8 @@ class PathTracer:
         self.prepare()
         start = time.perf_counter()
         asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        with translating(self.device), wp.ScopedDevice(self.device):
-            self._add(asked, self.samples, count, LIGHT_SAMPLES + self.samples)
+        self._add(asked, self.samples, count, LIGHT_SAMPLES + self.samples)
+        with exclusive(self.device):
             wp.synchronize_device(self.device)
         self.samples += count
         self._seconds += time.perf_counter() - start
