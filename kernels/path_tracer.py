@@ -129,6 +129,7 @@ class Moments:
     fixed_change: wp.array2d[wp.vec3]
     fixed_light: wp.array2d[wp.vec3]
     change_light: wp.array2d[wp.vec3]
+    rays: wp.array2d[wp.int32]  # traced so far
 
 
 @wp.struct
@@ -147,6 +148,7 @@ class Seen:
     known: wp.bool
     radiance: wp.vec3
     reflectance: wp.vec3
+    rays: wp.int32  # that were traced to find out
 
 
 @wp.struct
@@ -155,6 +157,7 @@ class Carried:
 
     radiance: wp.vec3  # or the difference that virtual things make
     light: wp.vec3  # what a white first surface would send without virtual things
+    rays: wp.int32  # that were traced for it
 
 
 @wp.func
@@ -235,6 +238,7 @@ def make_see_in_frame(trace: TraceConfig) -> wp.Function:
         seen = Seen()
         if scene.radiance.shape[0] == 0:
             return seen
+        seen.rays = 1
         at = find_in_frame(params, scene.picture, scene.rays, scene.probes, hit)
         if at[0] < 0.0:
             return seen
@@ -302,7 +306,7 @@ def survival(weight: wp.vec3, vertices: wp.int32) -> wp.float32:
 
 @functools.cache
 def make_physical_radiance(trace: TraceConfig) -> wp.Function:
-    """``physical_radiance(params, scene, origin, direction, density, key, first) -> vec3``: without virtual things.
+    """``physical_radiance(params, scene, origin, direction, density, key, first) -> Carried``: without virtual things.
 
     What a ray brings that was drawn with ``density`` at vertex ``first`` of a path; of the environment the share that
     balances with drawing it by its light.
@@ -319,8 +323,8 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
         density: wp.float32,
         key: PathKey,
         first: wp.int32,
-    ) -> wp.vec3:
-        radiance = wp.vec3(0.0, 0.0, 0.0)
+    ) -> Carried:
+        carried = Carried()
         weight = wp.vec3(1.0, 1.0, 1.0)
         at = origin
         toward = direction
@@ -328,17 +332,21 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
         k = first + 1
         while k < MOST_VERTICES:
             vertex = find_vertex(scene, at, toward, False)
+            carried.rays += 1
             light = near_radiance(scene.sky, at, toward, vertex.hit.t, drawn_with)
             if vertex.kind == NOTHING:
                 light += sky_radiance(scene.sky, toward, drawn_with)
-                return radiance + wp.cw_mul(weight, light)
-            radiance += wp.cw_mul(weight, light)
+            carried.radiance += wp.cw_mul(weight, light)
+            if vertex.kind == NOTHING:
+                return carried
             wo = -toward
             reflectance = wp.vec3(0.0, 0.0, 0.0)
             if vertex.kind == PROXY:
                 seen = see_in_frame(params, scene, vertex.hit)
+                carried.rays += seen.rays
                 if seen.known:
-                    return radiance + wp.cw_mul(weight, seen.radiance)
+                    carried.radiance += wp.cw_mul(weight, seen.radiance)
+                    return carried
                 reflectance = scene.proxy_reflectance[vertex.hit.shape]
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
@@ -349,40 +357,41 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
                 reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
                 if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
                     start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
+                    carried.rays += 1
                     if not hidden_by_physical(scene, start, sky.direction, sky.distance):
                         other = surface_density(surface, hit.normal, wo, sky.direction)
                         share = balance(sky.density, other) / sky.density
-                        radiance += share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
+                        carried.radiance += share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
             u = random_triple(key, k, SCATTER)
             pick = random_triple(key, k, PICK)
             drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
             weight = wp.cw_mul(weight, drawn.weight)
             if wp.max(weight) <= 0.0:
-                return radiance
+                return carried
             chance = survival(weight, k)
             if pick[1] >= chance:
-                return radiance
+                return carried
             weight = weight / chance
             at = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
             toward = drawn.direction
             drawn_with = drawn.density
             k += 1
-        return radiance
+        return carried
 
     return physical_radiance
 
 
 @functools.cache
 def make_virtual_light(trace: TraceConfig) -> wp.Function:
-    """``virtual_light(scene, vertex, surface, wo, key, k) -> vec3``: reflected radiance of all virtual lights."""
+    """``virtual_light(scene, vertex, surface, wo, key, k) -> Carried``: reflected radiance of all virtual lights."""
     hidden_by_physical = make_hidden_by_physical(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
     def virtual_light(
         scene: LocalScene, vertex: Vertex, surface: Surface, wo: wp.vec3, key: PathKey, k: wp.int32
-    ) -> wp.vec3:
-        radiance = wp.vec3(0.0, 0.0, 0.0)
+    ) -> Carried:
+        carried = Carried()
         hit = vertex.hit
         for index in range(scene.lights.shape[0]):
             light = sample_light(scene.lights[index], hit.point)
@@ -395,6 +404,7 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
                     start = offset_origin(hit.point, hit.geometric_normal, wi, hit.error)
                     # Short of the light, so that a light on a surface is not hidden by that surface.
                     reach = away[3] - 2.0 * hit.error
+                    carried.rays += 1
                     if not hidden_by_physical(scene, start, wi, reach):
                         if not occluded_by_objects(scene.rays, start, wi, reach):
                             share = float(1.0)
@@ -403,8 +413,8 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
                                 radius = scene.lights[index].radius
                                 own = away[3] * away[3] / (wp.pi * radius * radius * cosine)
                                 share = balance(own, surface_density(surface, hit.normal, wo, wi))
-                            radiance += share * wp.cw_mul(reflected, light.irradiance_normal)
-        return radiance
+                            carried.radiance += share * wp.cw_mul(reflected, light.irradiance_normal)
+        return carried
 
     return virtual_light
 
@@ -444,6 +454,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             reflectance = wp.vec3(1.0, 1.0, 1.0)
             if vertex.kind == PROXY and not is_white:
                 seen = see_in_frame(params, scene, vertex.hit)
+                carried.rays += seen.rays
                 reflectance = scene.proxy_reflectance[vertex.hit.shape]
                 if seen.known:
                     reflectance = seen.reflectance
@@ -459,6 +470,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                 reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
                 if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
                     start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
+                    carried.rays += 1
                     if not hidden_by_physical(scene, start, sky.direction, sky.distance):
                         other = surface_density(surface, hit.normal, wo, sky.direction)
                         share = balance(sky.density, other) / sky.density
@@ -472,7 +484,9 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                             elif not changes_only:
                                 carried.radiance += light
                 if not only_light:
-                    carried.radiance += wp.cw_mul(weight, virtual_light(scene, vertex, surface, wo, key, k))
+                    lit = virtual_light(scene, vertex, surface, wo, key, k)
+                    carried.radiance += wp.cw_mul(weight, lit.radiance)
+                    carried.rays += lit.rays
             u = random_triple(key, k, SCATTER)
             pick = random_triple(key, k, PICK)
             drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
@@ -480,10 +494,11 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             if wp.max(weight) <= 0.0:
                 return carried
             origin = offset_origin(hit.point, hit.geometric_normal, drawn.direction, hit.error)
-            physical = wp.vec3(0.0, 0.0, 0.0)
+            physical = Carried()
             if is_white:
                 physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
-                carried.light += wp.cw_mul(weight, physical)
+                carried.light += wp.cw_mul(weight, physical.radiance)
+                carried.rays += physical.rays
                 if only_light:
                     return carried
             chance = survival(weight, k)
@@ -491,12 +506,14 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                 return carried
             weight = weight / chance
             vertex = find_vertex(scene, origin, drawn.direction, True)
+            carried.rays += 1
             disks = lights_in_the_way(scene.lights, hit.point, drawn.direction, vertex.hit.t, drawn.density)
             carried.radiance += wp.cw_mul(weight, disks)
             if changes_only and vertex.kind == OBJECT:
                 if not is_white:
                     physical = physical_radiance(params, scene, origin, drawn.direction, drawn.density, key, k)
-                carried.radiance -= wp.cw_mul(weight, physical)
+                    carried.rays += physical.rays
+                carried.radiance -= wp.cw_mul(weight, physical.radiance)
                 changes_only = False
             if not changes_only:
                 light = near_radiance(scene.sky, origin, drawn.direction, vertex.hit.t, drawn.density)
@@ -578,14 +595,17 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
             g = wp.vec3(0.0, 0.0, 0.0)
             e = wp.vec3(0.0, 0.0, 0.0)
             shows = float(0.0)
+            carried = Carried()
             if whole:
                 if vertex.kind == NOTHING:
                     z = sky_radiance(scene.sky, direction, NO_DENSITY)
                 else:
-                    z = follow_path(params[0], scene, vertex, direction, False, False, False, key).radiance
+                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, key)
+                    z = carried.radiance
             elif vertex.kind == OBJECT:
                 if asked == wp.static(DIFFERENCE):
-                    z = follow_path(params[0], scene, vertex, direction, False, False, False, key).radiance
+                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, key)
+                    z = carried.radiance
             else:
                 z = scene.radiance[i, j]
                 # A face that is seen from behind is not the surface that the camera sees.
@@ -596,7 +616,9 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
                     e = carried.light
                     shows = 1.0
                 elif vertex.kind == BALL and asked == wp.static(DIFFERENCE):
-                    z += follow_path(params[0], scene, vertex, direction, True, False, False, key).radiance
+                    carried = follow_path(params[0], scene, vertex, direction, True, False, False, key)
+                    z += carried.radiance
+            moments_out.rays[i, j] = moments_out.rays[i, j] + carried.rays + 1
             add_sample(i, j, wp.float32(done + k + 1), z, g, e, shows, moments_out)
 
     return trace_paths_kernel
@@ -724,7 +746,7 @@ def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
     """Moments of no samples."""
     moments = Moments()
     for name in Moments.vars:
-        dtype = wp.float32 if name == "proxies" else wp.vec3
+        dtype = {"proxies": wp.float32, "rays": wp.int32}.get(name, wp.vec3)
         setattr(moments, name, wp.zeros(shape, dtype=dtype, device=device))
     return moments
 

@@ -10,11 +10,12 @@ import argparse
 import dataclasses
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import OpenEXR
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -83,10 +84,8 @@ def trace(options: argparse.Namespace) -> int:
     check_places({"the scene": _read_by(scene, options)}, writes)
     replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
     console = Console(stderr=True)
-    known = light_up_to(
-        scene, options.frame, quality=options.quality, device=options.device, source=options.source, size=size
-    )
-    tracer = known.tracer(device=options.device, seed=options.seed)
+    known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
+    tracer = known.tracer(device=options.device, size=size, seed=options.seed)
     picture = render(tracer, options.samples, options.error, console)
     if options.output is not None:
         write_picture(options.output, picture)
@@ -140,8 +139,8 @@ def render(tracer: PathTracer, samples: int, error: float | None, console: Conso
 
 def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
     """What was done, in one line."""
-    width, height = known.scene.camera.width, known.scene.camera.height
-    difference = known.lit.astype(np.float64) - picture.image
+    height, width = picture.image.shape[:2]
+    difference = _lit_at(known, picture) - picture.image
     rms = float(np.sqrt((difference**2).mean()))
     return (
         f"{known.scene.name}: {width}x{height}, {picture.samples} samples a pixel on {device} in "
@@ -150,10 +149,17 @@ def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
     )
 
 
-def side_by_side(known: KnownFrame, picture: TracedPicture) -> np.ndarray:
+def side_by_side(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.uint8]:
     """The pipeline's picture, the reference, and grey plus their difference, magnified, (H, 3 W, 3)."""
-    difference = 127.5 + MAGNIFIED * (known.lit.astype(np.float64) - picture.image)
-    return np.concatenate([known.lit, picture.image, np.clip(np.round(difference), 0, 255).astype(np.uint8)], axis=1)
+    lit = _lit_at(known, picture)
+    parts = lit, picture.image.astype(np.float64), 127.5 + MAGNIFIED * (lit - picture.image)
+    return np.clip(np.round(np.concatenate(parts, axis=1)), 0, 255).astype(np.uint8)
+
+
+def _lit_at(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.float64]:
+    """The pipeline's picture at the size of the reference."""
+    size = picture.image.shape[1::-1]
+    return np.asarray(cv2.resize(known.lit.astype(np.float64), size, interpolation=cv2.INTER_AREA))
 
 
 def write_picture(path: Path, picture: TracedPicture) -> None:
@@ -177,7 +183,7 @@ def write_picture(path: Path, picture: TracedPicture) -> None:
     _write(path, lambda part: image.write(str(part)))
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
+def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
     """Write an RGB picture as PNG.
 
     Raises:
@@ -189,10 +195,10 @@ def write_png(path: Path, image: np.ndarray) -> None:
     _write(path, sign_png(data.tobytes()))
 
 
-def _write(path: Path, data: object) -> None:
+def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, data)  # type: ignore[arg-type]
+        write_whole(path, data)
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 

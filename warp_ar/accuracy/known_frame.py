@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.accuracy.path_tracer import Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import Frame, Source, open_source
+from warp_ar.input.sources import Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import Quality
@@ -71,7 +70,6 @@ def light_up_to(
     quality: str | Quality,
     device: str = "auto",
     source: str | int | Path | None = None,
-    size: tuple[int, int] | None = None,
 ) -> KnownFrame:
     """Run a scene's frames through a pipeline up to one of them.
 
@@ -81,7 +79,6 @@ def light_up_to(
         quality: Of the pipeline, and so of the light that it finds.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         source: Frames instead of the scene's own.
-        size: Width and height to which frames are averaged down first; None leaves them.
 
     Raises:
         SceneError: The scene cannot be used.
@@ -97,7 +94,7 @@ def light_up_to(
             scene,
             device=device,
             quality=quality,
-            size=frames.size if size is None else size,
+            size=frames.size,
             outputs=("image", "environment", "pose"),
             exposures=frames.exposures,
             shown=shown,
@@ -107,8 +104,7 @@ def light_up_to(
         first: float | None = None
         for frame in frames:
             first = frame.time if first is None else first
-            image = _sized(frame, pipeline.size)
-            result = pipeline(image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+            result = pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
             if frame.index < number:
                 continue
             where = f"frame {number} of {frames.description}"
@@ -117,15 +113,11 @@ def light_up_to(
             if result.pose is None:
                 raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
             milliseconds = sum(timing.milliseconds for timing in result.stages.values())
-            light = light_of(pipeline)
-            return KnownFrame(pipeline.scene, image, result.image, result.pose, light, frame.time - first, milliseconds)
+            light, seconds = light_of(pipeline), frame.time - first
+            return KnownFrame(
+                pipeline.scene, frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
+            )
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
-
-
-def _sized(frame: Frame, size: tuple[int, int]) -> Image:
-    if frame.image.shape[1::-1] == size:
-        return frame.image.copy()
-    return np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def light_of(pipeline: Pipeline) -> Light:

@@ -267,6 +267,11 @@ class PathTracer:
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
 
+    def rays(self) -> int:
+        """Rays that were traced for the samples so far."""
+        with exclusive(self.device):
+            return int(self._moments.rays.numpy().astype(np.int64).sum())
+
     def render(
         self,
         samples: int = DEFAULT_SAMPLES,
