@@ -23,6 +23,7 @@ from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
+from warp_ar.engine.layers import LayerArrays, check_outputs, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
@@ -72,6 +73,21 @@ def _check_exposure(scene: Scene) -> None:
         raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
 
 
+def _read_scene(scene: object) -> Scene:
+    """What was given as a scene, checked.
+
+    Raises:
+        SceneError: It cannot be read.
+        UsageError: It is none.
+    """
+    if isinstance(scene, str | os.PathLike):
+        scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
+    if not isinstance(scene, Scene):
+        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
+    _check_exposure(scene)
+    return scene
+
+
 class Pipeline:
     """Lights frames: call it with one frame after another of one camera.
 
@@ -100,7 +116,8 @@ class Pipeline:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, and layers by the names of
+                ``warp_ar.LAYERS``, such as ``depth``; what none of them needs does not run.
             exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
                 the others tell what clips in it, and what is too dark.
             shown: Which: seconds; None means the longest.
@@ -114,13 +131,10 @@ class Pipeline:
             UsageError: An argument that cannot be used.
             SceneError: The scene cannot be used, or its camera does not fit ``size``.
         """
-        if isinstance(scene, str | os.PathLike):
-            scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
-        elif not isinstance(scene, Scene):
-            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
+        scene = _read_scene(scene)
         for exposure in exposures:
             _check_number("exposures", exposure, above=0.0)
-        _check_exposure(scene)
+        check_outputs(outputs)
         self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
@@ -355,6 +369,8 @@ class Pipeline:
     def _keep(self, rendered: Rendered) -> Rendered:
         """Have the picture outlast the next frame."""
         lit, light = rendered.image_array, rendered.environment_array
+        if rendered.layers is not None:
+            rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
         if not isinstance(lit, wp.array):
             return dataclasses.replace(rendered, image=lit)
         if self.inputs.transfers is not None:
@@ -400,7 +416,17 @@ class Pipeline:
             self._light.known = True
         # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
-        return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3)
+        layers = self._layers_of(frame.image if frame.lost else None)
+        return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3, layers)
+
+    def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
+        """The layers that were asked for; those of a frame that passes as it came are neutral."""
+        request = self.plan.request
+        if not request.asks_for_layers:
+            return None
+        if unlit is not None:
+            return neutral_layers(request, unlit, self.inputs.decode)
+        return layer_arrays(request, self._arrays)
 
     def _take_short(
         self, image: Any, host_image: Image | None, exposure: int | None, now: float, pose: Pose | None
@@ -420,5 +446,6 @@ class Pipeline:
             timings["unwrap"] = StageTiming((time.perf_counter() - start) * 1e3, False)
         self._last_time = now
         shown = bright if self._shown is None else self._shown
-        rendered = self._keep(Rendered(shown, self._light.environment, timings))
+        layers = self._layers_of(bright if self._shown is None else None)
+        rendered = self._keep(Rendered(shown, self._light.environment, timings, layers=layers))
         return Result(pose, state, rendered.at_once(), shown=False)
