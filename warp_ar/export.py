@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -110,7 +111,7 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
     if all(pose is None for pose in poses):
         raise SourceError("no frame shows the marker, so the camera has no way; see python -m warp_ar.doctor")
     path = options.source if options.source is not None else lit.source.path if lit.source is not None else None
-    plate = None if path is None else Path(path).resolve()
+    plate = None if path is None else Path(os.path.relpath(path, options.output.parent))
     return Shot(lit, fps, tuple(poses), plate), radiance
 
 

@@ -86,7 +86,7 @@ class _Builder:
     def __init__(self, shot: Shot) -> None:
         self._shot = shot
         self._bytes = bytearray()
-        extras = {"plate": None if shot.plate is None else str(shot.plate), "fps": shot.fps}
+        extras = {"plate": None if shot.plate is None else shot.plate.as_posix(), "fps": shot.fps}
         if shot.environment is not None:
             extras["environment"] = shot.environment.name
         self._tree: dict[str, Any] = {

@@ -80,7 +80,7 @@ class Shot:
     poses: tuple[Pose | None, ...]
     """``camera_from_world`` of every frame; None where the marker was lost."""
     plate: Path | None = None
-    """The frames: a video, or a folder of pictures."""
+    """The frames, relative to the file's folder: a video, or a folder of pictures."""
     environment: Path | None = None
     """Latlong OpenEXR in the axes ``y-up``."""
 
@@ -157,8 +157,8 @@ def mesh_of(item: Object | Proxy) -> Mesh:
 def look_of(item: Object, mesh: Mesh) -> Look:
     """What exchange formats can say of an object's material.
 
-    A Phong lobe of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the reflectance
-    straight on; a mirror becomes a metal without roughness.
+    A Phong lobe of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the
+    reflectance straight on; a mirror becomes a metal without roughness.
     """
     material = item.material
     if isinstance(material, PhongMaterial):
@@ -200,7 +200,7 @@ def to_linear(codes: npt.NDArray[np.uint8]) -> Matrix:
 
 
 def to_srgb(values: Matrix) -> npt.NDArray[np.uint8]:
-    """SRGB codes of linear values."""
+    """Codes of linear values, sRGB-encoded."""
     x = np.clip(values, 0.0, 1.0)
     encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
     return np.rint(255.0 * encoded).astype(np.uint8)

@@ -70,7 +70,7 @@ def write_usd(path: Path, shot: Shot) -> list[Path]:
     stage.SetEndTimeCode(max(0, len(shot.poses) - 1))
     root = pxr.UsdGeom.Xform.Define(stage, "/shot")
     stage.SetDefaultPrim(root.GetPrim())
-    plate = {} if shot.plate is None else {"plate": str(shot.plate)}
+    plate = {} if shot.plate is None else {"plate": shot.plate.as_posix()}
     stage.GetRootLayer().customLayerData = {"program": PROGRAM, **plate}
     written = [path]
     _write_camera(pxr, stage, shot)
@@ -131,7 +131,7 @@ def _write_camera(pxr: Any, stage: Any, shot: Shot) -> None:
     own.CreateAttribute("warp_ar:intrinsics", sdf.Double4).Set(pxr.Gf.Vec4d(camera.fx, camera.fy, camera.cx, camera.cy))
     own.CreateAttribute("warp_ar:distortion", sdf.DoubleArray).Set(pxr.Vt.DoubleArray(list(camera.distortion)))
     if shot.plate is not None:
-        own.CreateAttribute("warp_ar:plate", sdf.Asset).Set(pxr.Sdf.AssetPath(str(shot.plate)))
+        own.CreateAttribute("warp_ar:plate", sdf.Asset).Set(pxr.Sdf.AssetPath(shot.plate.as_posix()))
     placements = shot.camera_placements()
     if placements:
         _place(pxr, prim, placements)
