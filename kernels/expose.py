@@ -135,8 +135,8 @@ def surrounding_mean(
     reach = 0.5 * (1.0 - scale) * wp.float32(max_box - 1)
     inner = wp.int32(reach)
     fraction = reach - wp.float32(inner)
-    near = box_mean(table, row, col, 2 * inner + 1)
-    return near + fraction * (box_mean(table, row, col, 2 * inner + 3) - near)
+    smaller = box_mean(table, row, col, 2 * inner + 1)
+    return smaller + fraction * (box_mean(table, row, col, 2 * inner + 3) - smaller)
 
 
 @wp.func

@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import faulthandler
+import functools
 import gc
 import itertools
 import json
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
     from warp_ar.output.report import RunLog
     from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
+    from warp_ar.viewer.server import Address
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -102,6 +104,20 @@ def make_parser() -> argparse.ArgumentParser:
         help=f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})",
     )
     add("--frames", type=int, metavar="N", help="stop after N frames")
+    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
+    add(
+        "--refine-ball",
+        action="store_true",
+        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
+    )
+    _add_file_options(parser.add_argument_group("files"))
+    _add_page_options(parser.add_argument_group("the page"))
+    return parser
+
+
+def _add_file_options(group: argparse._ArgumentGroup) -> None:
+    """What is written instead of the page."""
+    add = group.add_argument
     add(
         "--output",
         type=Path,
@@ -127,34 +143,27 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--layer-pictures", action="store_true", help="with --save-layers: those that PNG can hold, as PNG besides")
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
+
+
+def _add_page_options(group: argparse._ArgumentGroup) -> None:
+    """Where the page is served, and to whom."""
+    add = group.add_argument
+    add("--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)")
     add(
-        "--refine-ball",
-        action="store_true",
-        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
-    )
-    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
-    page = parser.add_argument_group("the page")
-    page.add_argument(
-        "--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)"
-    )
-    page.add_argument(
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
         help="address to serve at (default: 127.0.0.1); one that others reach, such as 0.0.0.0, asks for a token",
     )
-    page.add_argument(
-        "--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)"
-    )
-    page.add_argument(
+    add("--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)")
+    add(
         "--tls",
         nargs="?",
         const=True,
         metavar="FILE.pem",
         help="serve over TLS, without which browsers keep their camera from other machines; makes its own certificate",
     )
-    page.add_argument("--no-browser", action="store_true", help="only print the page's address")
-    return parser
+    add("--no-browser", action="store_true", help="only print the page's address")
 
 
 class _Stop:
@@ -279,12 +288,13 @@ def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
         )
 
 
-def serve_page(options: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
-    # Here, for what only writes files should not wait for a web server to load.
+def _page_scene(options: argparse.Namespace) -> Scene:
+    """The scene of a page.
+
+    Raises:
+        UsageError: An option is for files only, or has an impossible value.
+    """
     from warp_ar.session import calibrated, with_light
-    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
-    from warp_ar.viewer.tls import load_context, make_context
 
     for name in ("save_environment", "save_layers", "report"):
         if getattr(options, name) is not None:
@@ -293,55 +303,69 @@ def serve_page(options: argparse.Namespace) -> int:
         raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
     if options.port is not None and not 0 <= options.port <= 65535:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
+    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
+        raise UsageError("--token: expected letters and digits, for it stands in an address")
     scene = load_scene(options.scene)
     if options.calibration is not None:
         scene = calibrated(scene, options.calibration, options.source)
-    if options.light is not None:
-        scene = with_light(scene, options.light)
-    local = options.host in LOOPBACK
-    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
-        raise UsageError("--token: expected letters and digits, for it stands in an address")
-    token = options.token if options.token is not None or local else secrets.token_hex(16)
-    tls = (
-        None
-        if options.tls is None
-        else make_context((options.host in EVERYWHERE and own_address()) or options.host)
-        if options.tls is True
-        else load_context(Path(options.tls))
-    )
+    return scene if options.light is None else with_light(scene, options.light)
+
+
+def _page_address(options: argparse.Namespace) -> Address:
+    """Where the page is served, and with which token and certificate."""
+    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.tls import load_context, make_context
+
+    known = options.token is not None or options.host in LOOPBACK
+    tls = None
+    if options.tls is True:
+        tls = make_context((options.host in EVERYWHERE and own_address()) or options.host)
+    elif options.tls is not None:
+        tls = load_context(Path(options.tls))
     port = DEFAULT_PORT if options.port is None else options.port
+    return Address(options.host, port, options.token if known else secrets.token_hex(16), tls)
+
+
+def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
+    """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
+    from warp_ar.device import bound_arenas
+    from warp_ar.viewer.host import Host
+
+    bound_arenas()
+    # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+    gc.collect()
+    gc.freeze()
+    return Host(
+        scene,
+        source=options.source,
+        device=options.device,
+        quality=options.quality,
+        budget_ms=options.budget_ms,
+        frames=options.frames,
+        **callbacks,
+    )
+
+
+def serve_page(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
+    # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.viewer.server import LOOPBACK, Server
+
+    scene = _page_scene(options)
+    address = _page_address(options)
     # Beside the page, which does not wait for it.
     threading.Thread(target=_quick_check, args=(options, scene), daemon=True).start()
-
-    def make_host(**callbacks: Any) -> Any:
-        # On the page's own thread, when it is served already: it loads Warp and all that uses it.
-        from warp_ar.device import bound_arenas
-        from warp_ar.viewer.host import Host
-
-        bound_arenas()
-        # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
-        gc.collect()
-        gc.freeze()
-        return Host(
-            scene,
-            source=options.source,
-            device=options.device,
-            quality=options.quality,
-            budget_ms=options.budget_ms,
-            frames=options.frames,
-            **callbacks,
-        )
 
     def ready(address: Address) -> None:
         print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
-        if not options.no_browser and local and _has_display():
+        if not options.no_browser and options.host in LOOPBACK and _has_display():
             webbrowser.open(address.url)
 
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    server = Server(make_host, Address(options.host, port, token, tls))
+    server = Server(functools.partial(_make_page_host, options, scene), address)
     code = EXIT_DONE
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))

@@ -169,7 +169,7 @@ class FrameInputs:
             yield "objects"
 
     def _move(self, pose: Pose) -> bool:
-        """Put the camera at ``pose`` and find what of the screen virtual things can reach; whether it moved."""
+        """Put the camera at ``pose``, find what virtual objects and lights can reach; whether it moved."""
         params = self._params
         position, rotation = params["camera_position"], params["world_from_camera"]
         before = position.tobytes(), rotation.tobytes()
@@ -200,7 +200,7 @@ class FrameInputs:
         return self.rects[name][:2]
 
     def reach(self) -> Reach:
-        """What of this frame virtual things can reach."""
+        """What of this frame virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         shines = bool(self.block.host("lights")["intensity"].any())

@@ -73,6 +73,21 @@ def _check_exposure(scene: Scene) -> None:
         raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
 
 
+def _read_scene(scene: object) -> Scene:
+    """What was given as a scene, checked.
+
+    Raises:
+        SceneError: It cannot be read.
+        UsageError: It is none.
+    """
+    if isinstance(scene, str | os.PathLike):
+        scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
+    if not isinstance(scene, Scene):
+        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
+    _check_exposure(scene)
+    return scene
+
+
 class Pipeline:
     """Lights frames: call it with one frame after another of one camera.
 
@@ -116,13 +131,9 @@ class Pipeline:
             UsageError: An argument that cannot be used.
             SceneError: The scene cannot be used, or its camera does not fit ``size``.
         """
-        if isinstance(scene, str | os.PathLike):
-            scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
-        elif not isinstance(scene, Scene):
-            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
+        scene = _read_scene(scene)
         for exposure in exposures:
             _check_number("exposures", exposure, above=0.0)
-        _check_exposure(scene)
         check_outputs(outputs)
         self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)

@@ -9,7 +9,7 @@ from typing import Any, Final
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.input.ball_solve import find_outlines
 from warp_ar.input.check_ball import LOST, check_balls
-from warp_ar.input.check_pictures import check_pictures, take_look
+from warp_ar.input.check_pictures import Look, check_pictures, take_look
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.finding import Finding, worst_first
 from warp_ar.input.sources import open_source
@@ -58,6 +58,22 @@ def _check_source(
         return [Finding("source.unreadable", str(error), "check [source], or give --source")]
     except SceneError as error:
         return [Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")]
+    return _check_look(scene, look, views, before)
+
+
+def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
+    """What is wrong with a set-up whose frames were looked at already, the worst first.
+
+    Args:
+        scene: The scene.
+        look: What its frames show.
+        views: In how many frames the ball is looked for, each about half a second.
+    """
+    found = check_scene(scene)
+    return worst_first([*found, *_check_look(scene, look, views, found)])
+
+
+def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
     found = check_pictures(scene, look)
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
     if any(finding.name.startswith("units.") for finding in before):

@@ -26,6 +26,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.light.captured import REC_709
 from warp_ar.output.cryptomatte import matte_channels, matte_header
@@ -102,13 +103,9 @@ def write_layers(path: pathlib.Path, frame: LayerFrame) -> None:
         else:
             parts.append(_part(name, _channels(name, values), frame))
     try:
-        write_whole(path, functools.partial(_write, OpenEXR.File(parts)))
+        write_whole(path, functools.partial(write_exr, image=OpenEXR.File(parts)))
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-
-
-def _write(image: OpenEXR.File, path: pathlib.Path) -> None:
-    image.write(str(path))
 
 
 def _half(values: npt.NDArray[Any]) -> npt.NDArray[np.float16]:

@@ -22,7 +22,7 @@ TURNED = 1e-3
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
     """Rotation matrix, 9 numbers row by row, of a quaternion of any length, w first as COLMAP has it."""
-    n = math.sqrt(w * w + x * x + y * y + z * z)
+    n = math.hypot(w, x, y, z)  # squares of tiny numbers would be 0
     w, x, y, z = w / n, x / n, y / n, z / n
     return (
         *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -80,7 +80,7 @@ def _json_pose(label: str, entry: Any) -> RawPose:
     try:
         rotation = np.array(entry["R"], float).reshape(-1)
         translation = np.array(entry["t"], float).reshape(-1)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rotation = translation = np.zeros(0)
     finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
     if len(rotation) != 9 or len(translation) != 3 or not finite or not check_rotation(rotation.tolist()):
@@ -99,7 +99,8 @@ def _read_colmap(path: Path, text: str) -> tuple[RawPose, ...]:
         words = line.split(maxsplit=9)
         try:
             w, x, y, z, *shift = map(float, words[1:8])
-            if len(words) < 10 or not all(map(math.isfinite, (w, x, y, z, *shift))) or w == x == y == z == 0.0:
+            length = math.hypot(w, x, y, z)
+            if len(words) < 10 or not 0.0 < length < math.inf or not all(map(math.isfinite, shift)):
                 raise ValueError
         except ValueError:
             raise SceneError(

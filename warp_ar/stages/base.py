@@ -49,7 +49,7 @@ class ArraySpec:
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What of a frame virtual things can reach, known on the host before any stage runs."""
+    """What of a frame virtual objects and lights can reach, known on the host before any stage runs."""
 
     objects: bool = True
     """A virtual object may be in the picture."""

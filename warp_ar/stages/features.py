@@ -43,7 +43,7 @@ class Features:
     recovered: bool
     """Light that clips in the ball is put back."""
     emitters: bool
-    """Emitters of the environment are known by their places: there is a resource ``lamps``."""
+    """Emitters of the environment are known by their places: there is a resource ``emitters``."""
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
