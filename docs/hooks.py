@@ -12,7 +12,7 @@ import pathlib
 import re
 from typing import Any
 
-COMMANDS = ("init", "live", "doctor", "calibrate", "capture", "environment", "explain", "tradeoff", "paper")
+COMMANDS = ("init", "live", "doctor", "calibrate", "capture", "environment", "export", "explain", "tradeoff", "paper")
 """Commands whose options are listed, in the order of the page."""
 
 

@@ -19,17 +19,18 @@ from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.shot import Shot
 from warp_ar.output.sink import make_folder
 from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
+from warp_ar.output.track_file import TRACK_SUFFIX, write_track
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
 from warp_ar.scene import load_scene
 
-SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX)
+SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = Parser(
         prog="python -m warp_ar.export",
-        description="Write a scene and the way of its camera for other programs: USD or glTF.",
+        description="Write a scene and the way of its camera for other programs: USD, glTF, or OpenTrackIO (.jsonl).",
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="a scene file, a folder with one, or a bundled scene's name")
@@ -62,7 +63,7 @@ def export(options: argparse.Namespace) -> int:
         load_usd()
     scene = load_scene(options.scene)
     beside = {name: output.with_name(f"{output.stem}_{name}.exr") for name in ("environment", "undistort", "distort")}
-    if options.no_environment:
+    if options.no_environment or output.suffix.lower() == TRACK_SUFFIX:
         del beside["environment"]
     if not options.stmaps:
         del beside["undistort"], beside["distort"]
@@ -82,7 +83,8 @@ def export(options: argparse.Namespace) -> int:
     for name, make in (("undistort", undistort_map), ("distort", distort_map)):
         if name in beside:
             write_stmap(beside[name], make(shot.camera))
-    written = (write_glb if output.suffix.lower() == GLTF_SUFFIX else write_usd)(output, shot)
+    write = {GLTF_SUFFIX: write_glb, TRACK_SUFFIX: write_track}.get(output.suffix.lower(), write_usd)
+    written = write(output, shot)
     lost = sum(pose is None for pose in shot.poses)
     print(f"{len(shot.poses)} frames" + (f", {lost} without a pose" if lost else ""))
     for path in (*written, *beside.values()):
@@ -95,6 +97,7 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
     from warp_ar.session import Session  # loads Warp
 
     light = not options.no_environment and bool(scene.probes or scene.captured)
+    light = light and options.output.suffix.lower() != TRACK_SUFFIX
     outputs = ("pose", "environment") if light else ("pose",)
     poses, radiance = [], None
     with Session(

@@ -215,7 +215,7 @@ class _Builder:
         }
         if mesh.uvs is not None:
             # v runs down the picture.
-            attributes["TEXCOORD_0"] = self._accessor(mesh.uvs * np.float32([1, -1]) + np.float32([0, 1]))
+            attributes["TEXCOORD_0"] = self._accessor(mesh.uvs * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
         primitive = {
             "attributes": attributes,
             "indices": self._accessor(mesh.faces.reshape(-1), indices=True),
