@@ -481,7 +481,7 @@ def _read_pose(table: _Table) -> PoseSpec:
         if key != way and key not in others:
             table.fail(key, f"not used with {way}; {_POSES}")
     if way == "file":
-        path = table.file("file", "poses: COLMAP's images.txt, or JSON")
+        path = table.file("file", "poses: COLMAP's images, OpenTrackIO, USD, or JSON")
         return PoseSpec(load_poses(path), path)
     if way == "position":
         rotate = table.vec3("rotate", (0.0, 0.0, 0.0), unit="degrees")
