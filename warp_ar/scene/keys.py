@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Final
 
 from warp_ar.scene.description import (
+    FileMaterial,
     LambertMaterial,
     Material,
     MetallicRoughnessMaterial,
@@ -31,6 +32,7 @@ MATERIALS: Final[dict[str, type[Material]]] = {
     "metallic_roughness": MetallicRoughnessMaterial,
     "lambert": LambertMaterial,
     "mirror": MirrorMaterial,
+    "file": FileMaterial,
 }
 
 

@@ -33,6 +33,7 @@ from warp_ar.scene.description import (
     CharucoBoard,
     Color,
     Exposure,
+    FileMaterial,
     GridBoard,
     LambertMaterial,
     Light,
@@ -384,6 +385,8 @@ def _read_material(parent: _Table) -> Material:
     model = table.choice("model", MATERIALS)
     kind = MATERIALS[model]
     table.only("model", keys_of(kind), known[1:])
+    if kind is FileMaterial:
+        return FileMaterial()
     if kind is PhongMaterial:
         return PhongMaterial(
             diffuse=table.reflectance("diffuse", PhongMaterial.diffuse),
@@ -622,7 +625,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
         marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
-        objects=many("object", keys_of(Object), _read_object),
+        objects=many("object", [key for key in keys_of(Object) if key != "mesh"], _read_object),
         lights=many("light", keys_of(Light), _read_light),
         captured=_read_captured(_Table(label, folder, *captured[0], keys_of(CapturedLight))) if captured else None,
         pose=one("pose", _POSE_KEYS, _read_pose),

@@ -53,7 +53,7 @@ function color(label, value, change) {
   return el("div", { class: "row" }, el("span", {}, label), input);
 }
 
-const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror" };
+const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", file: "The file's own" };
 const EFFECTS = {
   objects: ["Virtual objects", ""],
   lights: ["Virtual lights", ""],
