@@ -199,7 +199,7 @@ def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.f
 
     1 where nothing is hidden and, for a mirror, where it is seen from ahead.
     """
-    power = wp.exp2(-16.0 * roughness - 1.0)
+    power = wp.pow(2.0, -16.0 * roughness - 1.0)
     return wp.clamp(wp.pow(wp.max(cos_o + occlusion, 0.0), power) - 1.0 + occlusion, 0.0, 1.0)
 
 

@@ -237,7 +237,8 @@ def is_there(
         alpha *= sample_texture(scene, material.base_texture, point)[3]
     if material.alpha_mode == BLENDED:
         place = origin + contact.t * direction
-        cells = wp.exp2(-wp.ceil(wp.log2(wp.max(width / shape.scale, 1.0e-6 * wp.length(shape.extent) + 1.0e-30))))
+        finest = 1.0e-6 * wp.length(shape.extent) + 1.0e-30
+        cells = wp.pow(2.0, -wp.ceil(wp.log2(wp.max(width / shape.scale, finest))))
         cell = place * cells
         bits = pcg3d_hash(
             wp.uint32(wp.int32(wp.floor(cell[0]))),

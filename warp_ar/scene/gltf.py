@@ -135,7 +135,9 @@ class _Reader:
             if index in found:
                 fail(self._path, f"node {index} is reached twice: nodes form no tree")
             node = self._nodes[index]
-            found[index] = parent @ self._local(node, index)
+            local = self._local(node, index)
+            with np.errstate(invalid="ignore", over="ignore"):
+                found[index] = parent @ local
             if not (np.abs(found[index]) < LARGEST).all():
                 fail(self._path, f"node {index} has a transform that is not finite, or above {LARGEST:g}")
             children_of = self._indices(node.get("children"), f"children of node {index}", len(self._nodes))
