@@ -84,21 +84,27 @@ def sample_level(scene: RayScene, texture: Texture, uv: wp.vec2, level: wp.int32
         height = wp.max(height / 2, 1)
     x = uv[0] * wp.float32(width)
     y = (1.0 - uv[1]) * wp.float32(height)
+    taps = wp.int32(4)  # variables: the loop stays one, and kernels small
+    fx = float(0.0)
+    fy = float(0.0)
     if nearest:
-        column = wrap_texel(wp.int32(wp.floor(x)), width, texture.wrap_u)
-        row = wrap_texel(wp.int32(wp.floor(y)), height, texture.wrap_v)
-        return fetch_texel(scene, texture, offset + row * width + column)
-    x -= 0.5
-    y -= 0.5
-    fx = x - wp.floor(x)
-    fy = y - wp.floor(y)
-    left = wrap_texel(wp.int32(wp.floor(x)), width, texture.wrap_u)
-    right = wrap_texel(wp.int32(wp.floor(x)) + 1, width, texture.wrap_u)
-    upper = offset + wrap_texel(wp.int32(wp.floor(y)), height, texture.wrap_v) * width
-    lower = offset + wrap_texel(wp.int32(wp.floor(y)) + 1, height, texture.wrap_v) * width
-    above = fetch_texel(scene, texture, upper + left) * (1.0 - fx) + fetch_texel(scene, texture, upper + right) * fx
-    below = fetch_texel(scene, texture, lower + left) * (1.0 - fx) + fetch_texel(scene, texture, lower + right) * fx
-    return above * (1.0 - fy) + below * fy
+        taps = 1
+    else:
+        x -= 0.5
+        y -= 0.5
+        fx = x - wp.floor(x)
+        fy = y - wp.floor(y)
+    left = wp.int32(wp.floor(x))
+    top = wp.int32(wp.floor(y))
+    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for tap in range(taps):
+        right = tap % 2
+        lower = tap / 2
+        column = wrap_texel(left + right, width, texture.wrap_u)
+        row = wrap_texel(top + lower, height, texture.wrap_v)
+        weight = wp.where(right == 0, 1.0 - fx, fx) * wp.where(lower == 0, 1.0 - fy, fy)
+        total += weight * fetch_texel(scene, texture, offset + row * width + column)
+    return total
 
 
 @wp.func
@@ -120,10 +126,12 @@ def sample_texture(scene: RayScene, index: wp.int32, point: SurfacePoint) -> wp.
     if texels > 1.0:
         level = wp.min(wp.log2(texels), wp.float32(texture.levels - 1))
     lower = wp.int32(level)
-    result = sample_level(scene, texture, uv, lower, texture.nearest != 0 and level == 0.0)
     share = level - wp.float32(lower)
-    if share > 0.0:
-        result = result * (1.0 - share) + sample_level(scene, texture, uv, lower + 1, False) * share
+    count = wp.where(share > 0.0, 2, 1)
+    result = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for k in range(count):
+        weight = wp.where(k == 0, 1.0 - share, share)
+        result += weight * sample_level(scene, texture, uv, lower + k, texture.nearest != 0 and level == 0.0)
     return result
 
 
