@@ -21,6 +21,8 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import (
     RGB,
     Color,
+    FileMaterial,
+    LambertMaterial,
     Light,
     MetallicRoughnessMaterial,
     MirrorMaterial,
@@ -161,6 +163,9 @@ def look_of(item: Object, mesh: Mesh) -> Look:
     reflectance straight on; a mirror becomes a metal without roughness.
     """
     material = item.material
+    if isinstance(material, FileMaterial):
+        material = mesh.materials[0].surface if mesh.materials else LambertMaterial((1.0, 1.0, 1.0))
+    assert not isinstance(material, FileMaterial)
     if isinstance(material, PhongMaterial):
         alpha = math.sqrt(2.0 / (material.shininess + 2.0))
         factor, texture = _colored(material.diffuse, mesh)
