@@ -64,6 +64,7 @@ class FrameInputs:
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
         self.host_scene = HostScene(scene, device)
+        self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
         self.block = FrameBlock(device, len(scene.lights), len(scene.objects))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)

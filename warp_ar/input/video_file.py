@@ -123,9 +123,7 @@ class VideoFile(RecordedSource):
                 previous = seconds
                 yield Frame(index, seconds, image)
 
-    def _pictures(
-        self, container: Any, first: int | None = None
-    ) -> Generator[tuple[Image, float | None], None, None]:
+    def _pictures(self, container: Any, first: int | None = None) -> Generator[tuple[Image, float | None], None, None]:
         """Every picture with its time stamp in seconds; whatever precedes damage comes before the error.
 
         Args:
