@@ -15,7 +15,7 @@ from typing import Any
 
 from warp_ar.errors import reason
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
-from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, record_at
+from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
 from warp_ar.farm.records import Outcome
 from warp_ar.files import write_whole
@@ -324,6 +324,8 @@ class Driver:
         try:
             write_whole(self._folder / PROGRESS, json.dumps(told).encode())
         except OSError as error:
+            if is_no_space(error):
+                return  # a job or the manifest says so
             self._say(f"{self._folder / PROGRESS} cannot be written: {reason(error)}")
 
     def _seconds_left(self, open_jobs: int, now: float) -> float | None:
