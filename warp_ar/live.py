@@ -204,7 +204,7 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
         reads["--calibration"] = [Path(options.calibration)]
     if options.light is not None:
         reads["--light"] = [Path(options.light)]
-    if source is not None:
+    if source is not None and "://" not in str(source):
         reads["the source"] = [Path(source)]
     names = {
         "output": "--output",
