@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import av
 import cv2
@@ -16,11 +18,12 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.input.sources import open_source
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.layer_file import LayerFrame, LayerSink
-from warp_ar.output.sink import FRAMES_WAITING
+from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
 from warp_ar.output.sinks import (
     EnvironmentSink,
     NullSink,
@@ -660,3 +663,46 @@ def test_shared_environments_load(shared: pathlib.Path) -> None:
     paths = sorted((shared / "hdri").glob("*.exr"))
     assert paths
     assert read_environment(paths[0]).shape == (512, 1024, 3)
+
+
+# -------------------------------------------------------------------------------------------------------------- signals
+
+
+@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
+def test_a_signal_on_the_way_into_close_loses_nothing(tmp_path: pathlib.Path, name: str, monkeypatch) -> None:
+    """The exception may come up before the first line of ``close``, where that cannot catch it, or anywhere in it."""
+
+    def run(place: pathlib.Path, interrupted: str) -> None:
+        owner = ThreadPoolExecutor if interrupted in ("submit", "shutdown") else ThreadedSink
+        plain = getattr(owner, interrupted)
+
+        def interrupt(self: Any, *arguments: Any, **options: Any) -> Any:
+            if (interrupted == "close" or sink._closed) and not told:
+                told.append(True)
+                if interrupted == "submit":
+                    plain(self, *arguments, **options)  # the job is taken, and its ticket lost
+                raise Terminated
+            return plain(self, *arguments, **options)
+
+        def fill() -> None:
+            with sink:
+                for level in range(10):
+                    image = flat(20 * level)
+                    sink.write(image.astype(np.float32) if name == "light" else image)
+                patch.setattr(owner, interrupted, interrupt)
+
+        told: list[bool] = []
+        sink = EnvironmentSink(place) if name == "light" else open_sink(place, fps=24)
+        with monkeypatch.context() as patch, pytest.raises(Terminated), ended_by_signals():
+            fill()
+        assert told
+        assert sink.written == 10
+
+    for interrupted in ("close", "submit", "_settle", "_wait_out", "shutdown"):
+        place = tmp_path / interrupted / name
+        run(place, interrupted)
+        if name == "light":
+            assert len([read_environment(path) for path in place.iterdir()]) == 10
+        else:
+            assert levels(place) == pytest.approx([20 * level for level in range(10)], abs=VIDEO_LEVELS)
+        assert not list(place.parent.rglob(".*"))
