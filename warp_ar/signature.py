@@ -1,7 +1,8 @@
 """How this program signs the files that it writes, and knows them again.
 
 A PNG says it in its text, an OpenEXR and an HDR in their headers, a WebP in its EXIF, a video in its comment, a report
-or a calibration in its first key, a page, a chart or a text in a comment at its start, a response in its first line.
+or a calibration in its first key, a page, a chart or a text in a comment at its start, a response in its first line, a
+glTF as its generator, a USD in text among its own data.
 """
 
 from __future__ import annotations
@@ -75,6 +76,10 @@ def is_signed(path: str | os.PathLike[str]) -> bool:
         return _is_signed_webp(path)
     if head.startswith(b"%PDF-"):
         return head.split(b"\n", 3)[2:3] == [b"% " + name]
+    if head.startswith(b"#usda "):
+        return b'string program = "' + name + b'"' in head
+    if head.startswith(b"glTF"):
+        return b'"generator":"' + name + b'"' in head
     if head.startswith(b"#?RADIANCE\n"):
         return head.split(b"\n", 2)[1:2] == [b"SOFTWARE=" + name]
     if head.startswith(b"\x76\x2f\x31\x01"):

@@ -28,7 +28,7 @@ from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.recorder import Recorder
-from warp_ar.viewer.setup import SetupChecks
+from warp_ar.viewer.setup import RESPONSE, SetupChecks
 
 
 class Host:
@@ -81,7 +81,7 @@ class Host:
         self._camera = BrowserCamera(self._controls, notify)
         self._looker = ThreadPoolExecutor(1, "warp-ar-board")
         self._calibration = CalibrationSession(self._looker, notify, self._use_calibrated)
-        self._setup = SetupChecks(self._controls, self._looker, notify)
+        self._setup = SetupChecks(self._controls, self._looker, notify, Path(self._folder.name))
         helpers = Helpers(self._lighting, self._budget, self._camera, self._calibration, self._recorder, self._setup)
         self._loop = FrameLoop(self._controls, helpers, frames=frames, publish=publish, notify=notify)
         self.run = self._loop.run
@@ -244,6 +244,14 @@ class Host:
         """The card to print, a PDF of a paper that ``input.card`` knows."""
         return calibration.card_pdf(paper)
 
+    def response_file(self) -> bytes:
+        """The response that was measured by the card's greys, as text.
+
+        Raises:
+            UsageError: None was measured.
+        """
+        return self._setup.response_file()
+
     def recording(self) -> bytes:
         """The finished recording, an MP4.
 
@@ -283,6 +291,9 @@ class Host:
             full_paths: Write the paths of files in full; else relative to the scene's folder where they lie in it.
         """
         scene = make_target(self._controls.wanted, self._controls.feed).scene
+        if isinstance(scene.camera.transfer, Path) and scene.camera.transfer.parent == Path(self._folder.name):
+            # What was measured here is saved beside the scene.
+            scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, transfer=Path(RESPONSE)))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 
