@@ -183,11 +183,14 @@ class Session:
             quality: A preset's name or a value; None leaves it.
 
         Raises:
-            UsageError: The session keeps to a budget, or the quality is none or cannot run here.
-            SceneError: The scene's camera does not fit the source.
+            UsageError: The session keeps to a budget, ``scene`` is no scene, or the quality is none or cannot run
+                here. What is refused changes nothing: frames go on as they were.
+            SceneError: The scene's camera does not fit the source, or a file that it names cannot be used.
         """
         if self._switcher is None:
             raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
+        if scene is not None and not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
         target = dataclasses.replace(
             self._target,
             scene=self._target.scene if scene is None else scene,

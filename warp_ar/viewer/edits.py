@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from warp_ar.scene import (
     Camera,
     CharucoBoard,
     Exposure,
+    FileMaterial,
     LambertMaterial,
     Light,
     Material,
@@ -30,7 +30,7 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.object_materials import mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.viewer import protocol
@@ -59,6 +59,7 @@ _MODELS: Final[Mapping[str, type[Material]]] = {
     "phong": PhongMaterial,
     "metallic_roughness": MetallicRoughnessMaterial,
     "mirror": MirrorMaterial,
+    "file": FileMaterial,
 }
 _PLANE, _BOX = Proxy("plane", size=(0.2, 0.15)), Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06))
 _NEW: Final[Mapping[str, Object | Light]] = {
@@ -153,7 +154,7 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         raise UsageError(f"{part} {index}: the scene has {len(items)}")
     item = items[index]
     if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
-        items[index] = dataclasses.replace(item, material=_material(item.material, key, value))
+        items[index] = dataclasses.replace(item, material=_material(_shown_material(item), key, value))
     else:
         changes = {_key(part, key): value}
         if part == "light" and key in ("target", "direction"):
@@ -173,12 +174,21 @@ def _key(part: str, key: str) -> str:
     return key
 
 
+def _shown_material(item: Object) -> Material:
+    """An object's material; what has no file is chalk where no material is given."""
+    return LambertMaterial() if isinstance(item.material, FileMaterial) and item.shape != "mesh" else item.material
+
+
 def _material(material: Material, key: str, value: Any) -> Material:
     if key == "model":
         if value not in _MODELS:
             raise UsageError(f"material: model {value!r}; expected {', '.join(_MODELS)}")
-        color: Any = next(iter(vars(material).values()))  # the first field of every model is its colour
-        return _MODELS[value](color)
+        if value == "file":
+            return FileMaterial()
+        first = iter(vars(material).values())  # of every model but the file's own its colour
+        color: Any = next(first, LambertMaterial.base_color)
+        made: Any = _MODELS[value]
+        return cast(Material, made(color))
     if key not in vars(material):
         raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
     color_like = isinstance(vars(material)[key], tuple | Path)
@@ -343,8 +353,9 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         record = {**plain(item), "visible": (kind, index) not in wanted.hidden}
         record["animated"] = not isinstance(item, Proxy) and item.animate is not None
         if isinstance(item, Object):
-            model = next(name for name, made in _MODELS.items() if isinstance(item.material, made))
-            record["material"] = {"model": model, **plain(item.material)}
+            material = _shown_material(item)
+            model = next(name for name, made in _MODELS.items() if isinstance(material, made))
+            record["material"] = {"model": model, **plain(material)}
             record["reach"] = _reach(item)
         return record
 
@@ -372,13 +383,9 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 def _reach(item: Object) -> float:
     """Radius in metres of a circle on the ground around an object, about its size."""
     if item.shape == "mesh":
-        assert item.file is not None
-        return item.scale * _mesh_reach(item.file)
+        mesh = mesh_of(item)
+        assert mesh is not None
+        return item.scale * float(np.abs(mesh.bounds)[:, :2].mean())
     if item.shape == "box":
         return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
     return item.scale * (item.radius + item.major_radius + item.minor_radius)
-
-
-@functools.lru_cache(maxsize=32)
-def _mesh_reach(file: Path) -> float:
-    return float(np.abs(load_mesh(file).bounds)[:, :2].mean())
