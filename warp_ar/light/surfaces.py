@@ -86,6 +86,8 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
         return found.result()
     margin = 0.3 * float((high - low).max())
     for number, proxy in enumerate(scene.proxies):
+        if proxy.marker is not None:
+            continue  # it moves: a point of it is another one in the next frame
         rotation, at = rotation_matrix(proxy.rotate), np.array(proxy.at)
         if proxy.shape == "plane":
             half = 0.5 * np.array(proxy.size)
@@ -122,7 +124,7 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), bool)
     for proxy in scene.proxies:
-        if proxy.shape == "box":
+        if proxy.shape == "box" and proxy.marker is None:
             local = (points - np.array(proxy.at)) @ rotation_matrix(proxy.rotate)
             inside |= (np.abs(local) < 0.5 * np.array(proxy.size) + 0.005).all(axis=1)
     return inside
