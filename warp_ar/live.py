@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import contextlib
 import faulthandler
+import functools
 import gc
 import itertools
 import json
@@ -38,15 +39,18 @@ from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
+from warp_ar.output.sinks import NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
+from warp_ar.stages.request import LAYERS
 
 if TYPE_CHECKING:
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog
+    from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
+    from warp_ar.viewer.server import Address
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -100,6 +104,20 @@ def make_parser() -> argparse.ArgumentParser:
         help=f"milliseconds per frame for --quality {AUTO} (default: {DEFAULT_BUDGET_MS:g})",
     )
     add("--frames", type=int, metavar="N", help="stop after N frames")
+    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
+    add(
+        "--refine-ball",
+        action="store_true",
+        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
+    )
+    _add_file_options(parser.add_argument_group("files"))
+    _add_page_options(parser.add_argument_group("the page"))
+    return parser
+
+
+def _add_file_options(group: argparse._ArgumentGroup) -> None:
+    """What is written instead of the page."""
+    add = group.add_argument
     add(
         "--output",
         type=Path,
@@ -117,35 +135,35 @@ def make_parser() -> argparse.ArgumentParser:
         help="replace files that this program did not write; those that it wrote are replaced anyway",
     )
     add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
-    add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
+    add("--save-layers", type=Path, metavar="DIR", help="write the layers of every frame as NNNN.exr of several parts")
     add(
-        "--refine-ball",
-        action="store_true",
-        help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
+        "--layers",
+        metavar="NAMES|all",
+        help=f"with --save-layers: which, separated by commas (default: all): {', '.join(LAYERS)}",
     )
-    add("--loop", action="store_true", help="start the clip again when it ends; on the page it always does")
-    page = parser.add_argument_group("the page")
-    page.add_argument(
-        "--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)"
-    )
-    page.add_argument(
+    add("--layer-pictures", action="store_true", help="with --save-layers: those that PNG can hold, as PNG besides")
+    add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
+
+
+def _add_page_options(group: argparse._ArgumentGroup) -> None:
+    """Where the page is served, and to whom."""
+    add = group.add_argument
+    add("--port", type=int, metavar="N", help=f"port to serve at (default: {DEFAULT_PORT}, or the next free one)")
+    add(
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
         help="address to serve at (default: 127.0.0.1); one that others reach, such as 0.0.0.0, asks for a token",
     )
-    page.add_argument(
-        "--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)"
-    )
-    page.add_argument(
+    add("--token", metavar="SECRET", help="ask for this token (default: a new one where other machines reach the page)")
+    add(
         "--tls",
         nargs="?",
         const=True,
         metavar="FILE.pem",
         help="serve over TLS, without which browsers keep their camera from other machines; makes its own certificate",
     )
-    page.add_argument("--no-browser", action="store_true", help="only print the page's address")
-    return parser
+    add("--no-browser", action="store_true", help="only print the page's address")
 
 
 class _Stop:
@@ -181,7 +199,12 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
         reads["--light"] = [Path(options.light)]
     if source is not None:
         reads["the source"] = [Path(source)]
-    names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
+    names = {
+        "output": "--output",
+        "report": "--report",
+        "save_environment": "--save-environment",
+        "save_layers": "--save-layers",
+    }
     writes = {option: Path(path) for name, option in names.items() if (path := getattr(options, name)) is not None}
     check_places(reads, writes)
 
@@ -265,69 +288,84 @@ def _check_run(log: RunLog, session: Session, evidence: _Evidence) -> None:
         )
 
 
-def serve_page(options: argparse.Namespace) -> int:
-    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
-    # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.session import calibrated, with_light
-    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, Server, own_address
-    from warp_ar.viewer.tls import load_context, make_context
+def _page_scene(options: argparse.Namespace) -> Scene:
+    """The scene of a page.
 
-    for name in ("save_environment", "report"):
+    Raises:
+        UsageError: An option is for files only, or has an impossible value.
+    """
+    from warp_ar.session import calibrated, with_light
+
+    for name in ("save_environment", "save_layers", "report"):
         if getattr(options, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
     if options.refine_ball:
         raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
     if options.port is not None and not 0 <= options.port <= 65535:
         raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
+    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
+        raise UsageError("--token: expected letters and digits, for it stands in an address")
     scene = load_scene(options.scene)
     if options.calibration is not None:
         scene = calibrated(scene, options.calibration, options.source)
-    if options.light is not None:
-        scene = with_light(scene, options.light)
-    local = options.host in LOOPBACK
-    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
-        raise UsageError("--token: expected letters and digits, for it stands in an address")
-    token = options.token if options.token is not None or local else secrets.token_hex(16)
-    tls = (
-        None
-        if options.tls is None
-        else make_context((options.host in EVERYWHERE and own_address()) or options.host)
-        if options.tls is True
-        else load_context(Path(options.tls))
-    )
+    return scene if options.light is None else with_light(scene, options.light)
+
+
+def _page_address(options: argparse.Namespace) -> Address:
+    """Where the page is served, and with which token and certificate."""
+    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.tls import load_context, make_context
+
+    known = options.token is not None or options.host in LOOPBACK
+    tls = None
+    if options.tls is True:
+        tls = make_context((options.host in EVERYWHERE and own_address()) or options.host)
+    elif options.tls is not None:
+        tls = load_context(Path(options.tls))
     port = DEFAULT_PORT if options.port is None else options.port
+    return Address(options.host, port, options.token if known else secrets.token_hex(16), tls)
+
+
+def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
+    """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
+    from warp_ar.device import bound_arenas
+    from warp_ar.viewer.host import Host
+
+    bound_arenas()
+    # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+    gc.collect()
+    gc.freeze()
+    return Host(
+        scene,
+        source=options.source,
+        device=options.device,
+        quality=options.quality,
+        budget_ms=options.budget_ms,
+        frames=options.frames,
+        **callbacks,
+    )
+
+
+def serve_page(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
+    # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.viewer.server import LOOPBACK, Server
+
+    scene = _page_scene(options)
+    address = _page_address(options)
     # Beside the page, which does not wait for it.
     threading.Thread(target=_quick_check, args=(options, scene), daemon=True).start()
-
-    def make_host(**callbacks: Any) -> Any:
-        # On the page's own thread, when it is served already: it loads Warp and all that uses it.
-        from warp_ar.device import bound_arenas
-        from warp_ar.viewer.host import Host
-
-        bound_arenas()
-        # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
-        gc.collect()
-        gc.freeze()
-        return Host(
-            scene,
-            source=options.source,
-            device=options.device,
-            quality=options.quality,
-            budget_ms=options.budget_ms,
-            frames=options.frames,
-            **callbacks,
-        )
 
     def ready(address: Address) -> None:
         print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
         if (outside := address.outside_url) is not None:
             print(f"warp_ar: from other machines, {outside}", flush=True)
-        if not options.no_browser and local and _has_display():
+        if not options.no_browser and options.host in LOOPBACK and _has_display():
             webbrowser.open(address.url)
 
     # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    server = Server(make_host, Address(options.host, port, token, tls))
+    server = Server(functools.partial(_make_page_host, options, scene), address)
     code = EXIT_DONE
     try:
         asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
@@ -423,22 +461,29 @@ def light_clip(options: argparse.Namespace) -> int:
     # Here, for they load Warp: the page is to be there before.
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog, print_plan
+    from warp_ar.output.side_files import SideFiles, parse_layers
+
+    if options.save_layers is None and (options.layers is not None or options.layer_pictures):
+        which = "--layer-pictures" if options.layers is None else f"--layers {options.layers}"
+        raise UsageError(f"{which} needs --save-layers DIR, the folder to write them to")
 
     scene = load_scene(options.scene)
     _check_places(options, scene)
-    outputs, replaced = ["image"], []
-    lights: EnvironmentSink | None = None
-    if options.save_environment is not None:
-        lights = EnvironmentSink(options.save_environment, overwrite=options.overwrite)
-        outputs.append("environment")
+    side = SideFiles(
+        environment=options.save_environment,
+        layers=options.save_layers,
+        names=parse_layers(options.layers),
+        pictures=options.layer_pictures,
+        overwrite=options.overwrite,
+    )
+    outputs, replaced = ["image", *side.outputs], list(side.replaced)
     if options.report is not None:
         replaced.append(_prepare_file(options.report, overwrite=options.overwrite))
         outputs.append("pose")
 
     stop = _Stop()
     with contextlib.ExitStack() as stack:
-        if lights is not None:
-            stack.enter_context(lights)
+        stack.enter_context(side)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
         _quick_check(options, session.scene)
@@ -448,24 +493,24 @@ def light_clip(options: argparse.Namespace) -> int:
         if options.output is not None:
             size = session.pipeline.size
             sink = open_sink(options.output, fps=source.fps, size=size, overwrite=options.overwrite)
-        for words in (*replaced, sink.replaced, "" if lights is None else lights.replaced):
+        for words in (*replaced, sink.replaced):
             if words:
                 say(words)
         log, evidence = RunLog(session.pipeline), _Evidence()
         try:
-            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
-                _light_frames(options, session, log, sink, lights, stop, evidence)
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink:
+                _light_frames(options, session, log, sink, side, stop, evidence)
             if stop.code is None:
                 _check_run(log, session, evidence)
         except WarpArError as error:
             problem = _write_report(options.report, log, balls)
             also = f"; and {problem}" if problem else ""
-            raise RunError(f"{error} ({_count(log, sink, lights)}){also}") from error
+            raise RunError(f"{error} ({_count(log, sink, side)}){also}") from error
         except BaseException:
             _write_report(options.report, log, balls)
             raise
         if problem := _write_report(options.report, log, balls):
-            raise RunError(f"{problem} ({_count(log, sink, lights)})")
+            raise RunError(f"{problem} ({_count(log, sink, side)})")
     if not options.headless:
         print_plan(session.pipeline.plan, log)
         if isinstance(session.pipeline, AutoPipeline):
@@ -499,7 +544,7 @@ def _light_frames(
     session: Session,
     log: RunLog,
     sink: Sink,
-    lights: EnvironmentSink | None,
+    side: SideFiles,
     stop: _Stop,
     evidence: _Evidence,
 ) -> None:
@@ -524,8 +569,7 @@ def _light_frames(
             start = time.perf_counter()
             sink.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3
-            if lights is not None and result.environment is not None:
-                lights.write(result.environment)
+            side.write(frame.image, result, session.scene)
             log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
             progress.update(bar, advance=1, fps=log.fps)
             if log.count == MARKER_PATIENCE:
@@ -534,10 +578,10 @@ def _light_frames(
                 return
 
 
-def _count(log: RunLog, sink: Sink, lights: EnvironmentSink | None) -> str:
+def _count(log: RunLog, sink: Sink, side: SideFiles) -> str:
     """What there is of a run that failed."""
     frames = f"{log.count} frames were lit" if isinstance(sink, NullSink) else f"{sink.written} frames were written"
-    return frames if lights is None else f"{frames}, and {lights.written} environments"
+    return frames + side.written
 
 
 def _write_report(path: Path | None, log: RunLog, balls: dict[str, Any]) -> str:

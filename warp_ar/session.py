@@ -28,6 +28,20 @@ def _where(spec: SourceSpec) -> str | int | Path:
     return spec.camera if spec.camera is not None else f"synthetic:{spec.synthetic}"
 
 
+def _open_source(scene: Scene, chosen: str | int | Path | None, loop: bool) -> Source:
+    """Open the source that is chosen, or else the scene's own, with what the scene says of it.
+
+    Raises:
+        SourceError: It cannot be opened.
+        UsageError: There is none.
+    """
+    if chosen is not None:
+        return open_source(chosen, fps=None, loop=loop, exposures=())
+    if (spec := scene.source) is None:
+        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
+    return open_source(_where(spec), fps=spec.fps, loop=loop, exposures=spec.exposures or ())
+
+
 def calibrated(scene: Scene, calibration: str | Path, source: str | int | Path | None = None) -> Scene:
     """The scene with its camera by a calibration file or, for ``exif``, by the EXIF of the source's first picture.
 
@@ -87,7 +101,7 @@ class Session:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
             loop: Start a clip again when it ends.
             refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
                 was found is in ``ball_fits``.
@@ -104,33 +118,27 @@ class Session:
             self.scene = with_light(self.scene, light)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
-        chosen = source
-        if chosen is None:
-            spec = self.scene.source
-            if spec is None:
-                raise UsageError(f"scene {self.scene.name!r} names no source; give one with --source")
-            chosen = _where(spec)
-        own = self.scene.source if source is None else None
-        fps, exposures = (own.fps, own.exposures or ()) if own is not None else (None, ())
-        shown = own.shown if own is not None else None
-        self.source: Source = open_source(chosen, fps=fps, loop=loop, exposures=exposures)
+        self.source: Source = _open_source(self.scene, source, loop)
         self.decode_ms = 0.0
         """Milliseconds that the source took for its last frame."""
         self.ball_fits: tuple[BallFit | None, ...] = ()
+        self.pipeline: Pipeline | AutoPipeline
+        self._switcher: PipelineSwitcher | None = None
+        own = self.scene.source if source is None else None
+        shown = own.shown if own is not None else None
         try:
             if refine_ball:
                 self.scene, self.ball_fits = refine_balls(self.scene, self.source)
-            self.pipeline: Pipeline | AutoPipeline
-            self._switcher: PipelineSwitcher | None = None
+            size, exposures = self.source.size, self.source.exposures
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
                 self.pipeline = AutoPipeline(
                     self.scene,
                     budget_ms=budget,
                     device=device,
-                    size=self.source.size,
+                    size=size,
                     outputs=outputs,
-                    exposures=self.source.exposures,
+                    exposures=exposures,
                     shown=shown,
                 )
             else:
@@ -138,9 +146,7 @@ class Session:
                 self._switcher = PipelineSwitcher(
                     device=device, keep=1, profile=False, synchronous=not self.source.live
                 )
-                self._target = Target(
-                    self.scene, resolve_quality(quality), self.source.size, outputs, self.source.exposures, shown
-                )
+                self._target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
                 self.pipeline = self._switcher.open(self._target)
         except BaseException:
             self.source.close()
@@ -173,11 +179,14 @@ class Session:
             quality: A preset's name or a value; None leaves it.
 
         Raises:
-            UsageError: The session keeps to a budget, or the quality is none or cannot run here.
-            SceneError: The scene's camera does not fit the source.
+            UsageError: The session keeps to a budget, ``scene`` is no scene, or the quality is none or cannot run
+                here. What is refused changes nothing: frames go on as they were.
+            SceneError: The scene's camera does not fit the source, or a file that it names cannot be used.
         """
         if self._switcher is None:
             raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
+        if scene is not None and not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
         target = dataclasses.replace(
             self._target,
             scene=self._target.scene if scene is None else scene,
@@ -208,7 +217,7 @@ class Session:
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
-        kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
+        kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)

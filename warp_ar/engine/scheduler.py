@@ -94,17 +94,9 @@ class Scheduler:
         self._marks: dict[tuple[int, ...], tuple[Any, Any]] | None = {} if profile and device.is_cuda else None
         self.clock = time.perf_counter
         """Seconds by which stages are timed on the host."""
-        with wp.ScopedDevice(device), translating(device):
-            for kind, wiring in plan.stages:
-                stage = kind(plan.features, wiring)
-                for name, spec in stage.arrays().items():
-                    arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=device))
-                    self._fills[name] = spec.fill
-                with noting() as notes:
-                    self._stages.append((stage, stage.build(arrays, device)))
-                self._first_launches += notes
+        self._build()
         self._culling = culling
-        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
         self._unneeded: Mapping[str, str] = {}
         """Why stages can change no pixel of this frame."""
         self._passes = {stage.name: passes for stage, passes in self._stages}
@@ -112,6 +104,18 @@ class Scheduler:
         self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
+
+    def _build(self) -> None:
+        """Allocate the arrays of the plan's stages, and build their passes."""
+        with wp.ScopedDevice(self.device), translating(self.device):
+            for kind, wiring in self.plan.stages:
+                stage = kind(self.plan.features, wiring)
+                for name, spec in stage.arrays().items():
+                    self.arrays.add(name, wp.full(spec.shape, spec.fill, dtype=spec.dtype, device=self.device))
+                    self._fills[name] = spec.fill
+                with noting() as notes:
+                    self._stages.append((stage, stage.build(self.arrays, self.device)))
+                self._first_launches += notes
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -126,9 +130,22 @@ class Scheduler:
         """The native threads that it has; None until it is prepared, and on CUDA."""
         return self._crew
 
+    def stage(self, name: str) -> Stage | None:
+        """The stage of that name, where it is part of the plan."""
+        return next((stage for stage, _ in self._stages if stage.name == name), None)
+
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
         self._seen.clear()
+
+    def restart(self) -> None:
+        """Make every stage run again in the next frame, from what it remembers at first: nothing."""
+        self.forget()
+        with wp.ScopedDevice(self.device), exclusive(self.device):
+            for stage, _ in self._stages:
+                for name in self._remembered(stage):
+                    self.arrays[name].fill_(self._fills[name])
+                    self.arrays.touch(name)
 
     def continue_from(self, other: Scheduler) -> None:
         """Let stages go on from what the same stages of another plan remember, where it fits."""

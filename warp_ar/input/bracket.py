@@ -313,6 +313,23 @@ def _number(value: float) -> str:
     return f"{value:.3g}"
 
 
+def _believed(steps: dict[str, tuple[float, ...]], seen: Sequence[float], figures: str) -> tuple[str, list[str]]:
+    """Which of the claims holds, by its name, and what is to be said of it.
+
+    Raises:
+        UsageError: EXIF and names contradict each other, and the pixels bear out neither.
+    """
+    if len(steps) < 2 or _off(steps["EXIF"], steps["names"]) <= HOLDS:
+        return next(iter(steps)), []
+    best = min(steps, key=lambda name: _off(steps[name], seen))
+    if _off(steps[best], seen) > 2.0 * HOLDS:
+        raise UsageError(
+            f"exposures contradict each other: from the longest to the shortest {figures} times; "
+            "give the true ones with --exposures, or leave out pictures with automatic ISO"
+        )
+    return best, [f"{best} and pixels agree on the exposures, which the others contradict: {figures} times"]
+
+
 def agree_exposures(
     patches: Sequence[Image],
     transfer: str,
@@ -350,16 +367,7 @@ def agree_exposures(
             raise UsageError("neither EXIF nor names tell the exposures, and too few pixels do; give --exposures")
         note = f"exposures are from the pixels alone, with the response {transfer}: {figures} times"
         return Exposures(tuple(np.cumprod([1.0, *seen.steps]).tolist()), None, (note,))
-    best = min(steps, key=lambda name: _off(steps[name], seen.steps))
-    if len(steps) > 1 and _off(steps["EXIF"], steps["names"]) > HOLDS:
-        if _off(steps[best], seen.steps) > 2.0 * HOLDS:
-            raise UsageError(
-                f"exposures contradict each other: from the longest to the shortest {figures} times; "
-                "give the true ones with --exposures, or leave out pictures with automatic ISO"
-            )
-        notes = [f"{best} and pixels agree on the exposures, which the others contradict: {figures} times"]
-    else:
-        best, notes = next(iter(steps)), []
+    best, notes = _believed(steps, seen.steps, figures)
     claim = steps[best]
     ratios = tuple(np.cumprod([1.0, *claim]).tolist())
     off = _off(claim, seen.steps)

@@ -30,7 +30,7 @@ class Pattern:
     """Unit direction of the border at each point, (m, 3)."""
     normals: Array
     """Unit direction toward white, (m, 3)."""
-    environments: Array
+    clearances: Array
     """Distance to the nearest parallel border, (m,) metres."""
     cells: Array
     """Centres of cells, (c, 3)."""
@@ -39,17 +39,33 @@ class Pattern:
 
 
 def _cell_edges(
-    cells: NDArray[np.bool_], left: float, top: float, size: float, environment: float
+    cells: NDArray[np.bool_], left: float, top: float, size: float, clearance: float
 ) -> list[tuple[float, ...]]:
-    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length, space."""
+    """Borders between cells that differ: rows of middle (x, y), tangent, normal toward white, length, clearance."""
     edges: list[tuple[float, ...]] = []
     for row, column in np.argwhere(cells[:, 1:] != cells[:, :-1]):
         sign = 1.0 if cells[row, column + 1] else -1.0
-        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, environment))
+        edges.append((left + (column + 1) * size, top - (row + 0.5) * size, 0, 1, sign, 0, size, clearance))
     for row, column in np.argwhere(cells[1:] != cells[:-1]):
         sign = -1.0 if cells[row + 1, column] else 1.0
-        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, environment))
+        edges.append((left + (column + 0.5) * size, top - (row + 1) * size, 1, 0, 0, sign, size, clearance))
     return edges
+
+
+def _edge_points(edges: Array) -> tuple[Array, Array, Array, Array]:
+    """Points on edges with their tangents and normals, (m, 3) each, and clearances, (m,).
+
+    Args:
+        edges: Rows as ``_cell_edges`` gives them, (n, 8).
+    """
+    # Inner points of an edge only: its ends are corners, where another edge's blur is near.
+    count = int(np.clip(240 // len(edges), 1, 4))
+    along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
+    edges = np.repeat(edges[:: -(-len(edges) // 300)], count, axis=0)
+    shift = np.tile(along, len(edges) // count) * edges[:, 6]
+    flat = np.zeros((len(edges), 1))
+    tangents, normals = np.hstack([edges[:, 2:4], flat]), np.hstack([edges[:, 4:6], flat])
+    return np.hstack([edges[:, :2], flat]) + tangents * shift[:, None], tangents, normals, edges[:, 7]
 
 
 @functools.cache
@@ -101,22 +117,15 @@ def make_pattern(dictionary: str, id: int, size: float, board: CharucoBoard | Gr
             np.stack([left + (columns_ + 0.5) * cell, top - (rows_ + 0.5) * cell, 0.0 * rows_], -1).reshape(-1, 3)
         )
         white.append(pattern[1:-1, 1:-1].ravel())
-    table = np.array(edges, float)
-    # Inner points of an edge only: its ends are corners, where another edge's blur is near.
-    count = int(np.clip(240 // len(table), 1, 4))
-    along = np.linspace(-0.3, 0.3, count) if count > 1 else np.zeros(1)
-    table = np.repeat(table[:: -(-len(table) // 300)], count, axis=0)
-    shift = np.tile(along, len(table) // count) * table[:, 6]
-    flat = np.zeros((len(table), 1))
-    tangents, normals = np.hstack([table[:, 2:4], flat]), np.hstack([table[:, 4:6], flat])
+    points, tangents, normals, clearances = _edge_points(np.array(edges, float))
     corners = {n: _square(x + size / 2, y - size / 2, size, size) for n, (x, y) in places.items()}
     return Pattern(
         markers=corners,
         outline=_square(0.0, 0.0, width, height),
-        points=np.hstack([table[:, :2], flat]) + tangents * shift[:, None],
+        points=points,
         tangents=tangents,
         normals=normals,
-        environments=table[:, 7],
+        clearances=clearances,
         cells=np.concatenate(centres),
         white=np.concatenate(white).astype(float),
     )

@@ -407,7 +407,7 @@ class Tracker:
             )
             width = (normal * across).sum(1)
             normal *= np.sign(width)[:, None]
-            half = np.minimum(0.45 * np.abs(width) * pattern.environments, reach)
+            half = np.minimum(0.45 * np.abs(width) * pattern.clearances, reach)
             at = (pixels - origin)[:, None, :] + (half[:, None] * taps)[..., None] * normal[:, None, :]
             h, w = gray.shape
             ends = at[:, [0, -1]]

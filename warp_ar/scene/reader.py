@@ -518,7 +518,7 @@ def _read_pose(table: _Table) -> PoseSpec:
         if key != way and key not in others:
             table.fail(key, f"not used with {way}; {_POSES}")
     if way == "file":
-        path = table.file("file", "poses: COLMAP's images.txt, or JSON")
+        path = table.file("file", "poses: COLMAP's images, OpenTrackIO, USD, or JSON")
         return PoseSpec(load_poses(path), path)
     if way == "position":
         rotate = table.vec3("rotate", (0.0, 0.0, 0.0), unit="degrees")
@@ -594,6 +594,40 @@ def _check_dots(text: str, label: str) -> None:
         raise SceneError(f"{label}: line {line}: a key of more than {_MOST_DOTS} parts; the longest here has 3")
 
 
+def _parse(text: str, label: str) -> dict[str, Any]:
+    check_depth(bracket_depth(text), label, SceneError)
+    _check_dots(text, label)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # ValueError: TOMLDecodeError, and integers of too many digits
+        raise SceneError(f"{label}: not valid TOML: {' '.join(str(error).split())}") from error
+
+
+def _check_top(top: _Table, data: dict[str, Any], label: str) -> None:
+    """What every scene file must have."""
+    if "schema" not in top:
+        top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
+    if top.data["schema"] is True or top.data["schema"] != SCHEMA:
+        top.fail("schema", f"this program reads schema {SCHEMA}")
+    if "camera" not in data:
+        names = ", ".join(INTRINSICS[:6])
+        raise SceneError(f"{label}: [camera] is missing: give {names}, calibration or field_of_view")
+
+
+def _split_lights(lights: Any, label: str) -> tuple[Any, tuple[str, Any] | None]:
+    """Virtual lights, and the captured one with its name in messages, which share a section."""
+    captured: list[tuple[str, Any]] = []
+    if isinstance(lights, dict) and "file" in lights:
+        lights, captured = [], [("light", lights)]
+    elif isinstance(lights, list):
+        named = [(f"light[{i}]", item) for i, item in enumerate(lights) if isinstance(item, dict) and "file" in item]
+        captured = [(name, item) for name, item in named if "kind" not in item]
+        lights = [item for item in lights if all(item is not other for _, other in captured)]
+    if len(captured) > 1:
+        raise SceneError(f"{label}: {captured[1][0]}.file: a scene has one captured light; {captured[0][0]} is one too")
+    return lights, captured[0] if captured else None
+
+
 def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     """Read a scene from text.
 
@@ -608,21 +642,9 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     path = None if path is None else Path(path)
     label = "scene" if path is None else str(path)
     folder = Path.cwd() if path is None else path.parent.resolve()
-    check_depth(bracket_depth(text), label, SceneError)
-    _check_dots(text, label)
-    try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: TOMLDecodeError, and integers of too many digits
-        raise SceneError(f"{label}: not valid TOML: {' '.join(str(error).split())}") from error
-
+    data = _parse(text, label)
     top = _Table(label, folder, "", {key: data[key] for key in data if key not in _SECTIONS}, (*_TOP_KEYS, *_SECTIONS))
-    if "schema" not in top:
-        top.fail("schema", f"expected schema = {SCHEMA} at the top of the file")
-    if top.data["schema"] is True or top.data["schema"] != SCHEMA:
-        top.fail("schema", f"this program reads schema {SCHEMA}")
-    if "camera" not in data:
-        names = ", ".join(INTRINSICS[:6])
-        raise SceneError(f"{label}: [camera] is missing: give {names}, calibration or field_of_view")
+    _check_top(top, data, label)
 
     def in_world(table: _Table) -> _Table:
         table.world = marker
@@ -641,18 +663,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
             read(in_world(_Table(label, folder, f"{section}[{i}]", item, keys))) for i, item in enumerate(value)
         )
 
-    lights = data.get("light", [])
-    captured: list[tuple[str, Any]] = []
-    if isinstance(lights, dict) and "file" in lights:
-        lights, captured = [], [("light", lights)]
-    elif isinstance(lights, list):
-        named = [(f"light[{i}]", item) for i, item in enumerate(lights) if isinstance(item, dict) and "file" in item]
-        captured = [(name, item) for name, item in named if "kind" not in item]
-        lights = [item for item in lights if all(item is not other for _, other in captured)]
-    if len(captured) > 1:
-        raise SceneError(f"{label}: {captured[1][0]}.file: a scene has one captured light; {captured[0][0]} is one too")
+    lights, captured = _split_lights(data.get("light", []), label)
     data = {**data, "light": lights}
-
     marker = one("marker", keys_of(Marker), _read_marker)
     scene = Scene(
         schema=SCHEMA,
@@ -668,7 +680,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
         objects=many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], _read_object),
         lights=many("light", keys_of(Light), _read_light),
-        captured=_read_captured(_Table(label, folder, *captured[0], keys_of(CapturedLight))) if captured else None,
+        captured=None if captured is None else _read_captured(_Table(label, folder, *captured, keys_of(CapturedLight))),
         pose=one("pose", _POSE_KEYS, _read_pose),
         has_marker="marker" in data or "pose" not in data,
         exposure=one("exposure", keys_of(Exposure), _read_exposure) or Exposure(),

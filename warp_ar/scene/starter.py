@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from warp_ar.scene.description import SCHEMA, Marker, Scene
 from warp_ar.scene.reference import keys
@@ -14,27 +15,15 @@ FIELD_OF_VIEW = 60.0
 _WIDTH = 110
 
 
-def starter_scene(
-    name: str,
-    source: str | int,
-    marker: Marker,
-    center: Sequence[float],
-    radius: float,
-    mesh: str,
-) -> str:
-    """Text of a scene file with comments.
+_Section: TypeAlias = tuple[str, str, list[tuple[str, str, str]]]
+"""Head, comment, and entries: section and key as the reference names them, and the value."""
 
-    Args:
-        name: Name to show.
-        source: A path, or a capture device's index.
-        marker: The board that is printed.
-        center: Where the ball stands, metres.
-        radius: Its radius, metres.
-        mesh: Path of the object's mesh, relative to the file.
-    """
+
+def _sections(source: str | int, marker: Marker, center: Sequence[float], radius: float, mesh: str) -> list[_Section]:
+    """What a new desk's file has."""
     board = "" if marker.board is None else str(marker.board)
     spot = ", ".join(repr(float(value)) for value in center)
-    parts: list[tuple[str, str, list[tuple[str, str, str]]]] = [
+    return [
         (
             "[camera]",
             "Guessed until it is measured: `python -m warp_ar.calibrate camera` replaces the guess by camera.yml.",
@@ -76,6 +65,27 @@ def starter_scene(
             ],
         ),
     ]
+
+
+def starter_scene(
+    name: str,
+    source: str | int,
+    marker: Marker,
+    center: Sequence[float],
+    radius: float,
+    mesh: str,
+) -> str:
+    """Text of a scene file with comments.
+
+    Args:
+        name: Name to show.
+        source: A path, or a capture device's index.
+        marker: The board that is printed.
+        center: Where the ball stands, metres.
+        radius: Its radius, metres.
+        mesh: Path of the object's mesh, relative to the file.
+    """
+    parts = _sections(source, marker, center, radius, mesh)
     known = {(key.section, key.name): key for key in keys()}
     lines = [
         "# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up."
@@ -84,13 +94,10 @@ def starter_scene(
     for head, comment, entries in parts:
         lines += ["", *(f"# {line}" for line in textwrap.wrap(comment, _WIDTH)), head]
         for section, key, value in entries:
-            known_key = known[section, key]
-            unit = (
-                ""
-                if known_key.unit.split()[0] in known_key.meaning.lower() or known_key.unit == "-"
-                else f" ({known_key.unit})"
-            )
-            lines += [f"# {line}" for line in textwrap.wrap(f"{known_key.meaning}{unit}", _WIDTH)]
+            explained = known[section, key]
+            said = explained.unit == "-" or explained.unit.split()[0] in explained.meaning.lower()
+            meaning = explained.meaning if said else f"{explained.meaning} ({explained.unit})"
+            lines += [f"# {line}" for line in textwrap.wrap(meaning, _WIDTH)]
             lines.append(f"{key} = {value}")
     return "\n".join(lines) + "\n"
 

@@ -37,17 +37,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     base = None if folder is None else Path(folder).resolve()
 
     def value(item: Any) -> str:
-        if isinstance(item, Path):
-            item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
-        if isinstance(item, str):
-            return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
-        if isinstance(item, Board):
-            return value(str(item))
-        if isinstance(item, Mapping):
-            return "{ " + ", ".join(f"{key} = {value(entry)}" for key, entry in item.items()) + " }"
-        if isinstance(item, tuple):
-            return "[" + ", ".join(map(value, item)) + "]"
-        return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
+        return _value(item, base)
 
     def table(item: Any, keys: Iterable[str]) -> list[str]:
         """Lines of the keys that have a value."""
@@ -101,6 +91,21 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         lines += ["", "[[light]]", *table(scene.captured, keys_of(CapturedLight))]
     lines += ["", "[exposure]", *table(scene.exposure, ("scale",))]
     return "\n".join(lines) + "\n"
+
+
+def _value(item: Any, base: Path | None) -> str:
+    """A value as TOML; paths inside ``base`` are relative to it."""
+    if isinstance(item, Path):
+        item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
+    if isinstance(item, str):
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
+    if isinstance(item, Board):
+        return _value(str(item), base)
+    if isinstance(item, Mapping):
+        return "{ " + ", ".join(f"{key} = {_value(entry, base)}" for key, entry in item.items()) + " }"
+    if isinstance(item, tuple):
+        return "[" + ", ".join(_value(entry, base) for entry in item) + "]"
+    return repr(float(item)) if isinstance(item, float) else repr(item)  # NumPy's say their type
 
 
 def _pose_lines(spec: PoseSpec, value: Callable[[Any], str]) -> list[str]:

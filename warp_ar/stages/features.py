@@ -36,7 +36,7 @@ class Features:
     recovered: bool
     """Light that clips in the ball is put back."""
     emitters: bool
-    """Emitters of the environment are known by their places: there is a resource ``lamps``."""
+    """Emitters of the environment are known by their places: there is a resource ``emitters``."""
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
@@ -95,7 +95,8 @@ def find_features(request: Request) -> Features:
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
     lit_by_both = bool(environment and scene.lights and scene.proxies)
-    emitters = recovered and quality.method("recover") == "shading"
+    placed = recovered or (environment and not observed and request.emitters)
+    emitters = placed and quality.method("recover") == "shading"
     by_series = quality.method("irradiance") == "sh2"
     return Features(
         request=request,

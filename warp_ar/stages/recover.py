@@ -126,8 +126,7 @@ class Recover(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Both sides of the equations on the device, their solution on the host beside it, its effect on the map."""
         scene = self.request.scene
-        height = self.request.quality.environment_height
-        proxies = self._proxies = trace_variant(trace_config(scene), device).proxies
+        self._proxies = trace_variant(trace_config(scene), device).proxies
         self._arrays, self._device = arrays, device
         arrays["recover_points"].assign(self._surfaces.points)
         ball = scene.probes[0]
@@ -137,7 +136,6 @@ class Recover(Stage):
         self._progress = _Progress(solver)
         self._asks = self._arrives = self._news = False
         self._worker: ThreadPoolExecutor | None = None
-        cells = arrays["recover_cells_now"]
         points = len(self._surfaces.points)
         arrays.add("recover_status", self.status)
         equations = ("recover_cells_now", "recover_transfer", "recover_mirrored", "recover_observations", "params")
@@ -150,77 +148,85 @@ class Recover(Stage):
         self._stream = None if device.is_cpu else wp.Stream(device)
         self._frames_stream = None if device.is_cpu else wp.get_stream(device)
 
-        def weigh(rows: Rows | None) -> None:
-            kernels.weigh_boundaries(
-                arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
-            )
-
-        def condense(rows: Rows | None) -> None:
-            kernels.condense_cells(
-                arrays["filled_radiance"],
-                arrays["environment_confidence"],
-                arrays["environment_clipped"],
-                arrays["recover_missing"],
-                arrays["probes"],
-                arrays["ray_scene"],
-                cells,
-                proxies=proxies,
-                rows=rows,
-            )
-
-        def observe(rows: Rows | None) -> None:
-            kernels.observe_surfaces(
-                arrays["frame"],
-                arrays["decode"],
-                arrays["params"],
-                arrays["probes"],
-                arrays["ray_scene"],
-                arrays["recover_points"],
-                arrays["recover_observations"],
-                proxies=proxies,
-                rows=rows,
-            )
-
-        def transfer(rows: Rows | None) -> None:
-            kernels.trace_transfer(
-                arrays["recover_points"],
-                arrays["recover_observations"],
-                cells,
-                arrays["probes"],
-                arrays["ray_scene"],
-                arrays["recover_traced"],
-                arrays["recover_transfer"],
-                arrays["recover_mirrored"],
-                proxies=proxies,
-                rows=rows,
-            )
-
-        def add(rows: Rows | None) -> None:
-            kernels.add_recovered(
-                arrays["filled_radiance"],
-                arrays["environment_confidence"],
-                arrays["recover_missing"],
-                arrays["recover_cells"],
-                arrays["recover_recovered"],
-                arrays["environment"],
-                rows=rows,
-            )
-
-        def measure(rows: Rows | None) -> None:
-            change.measure_difference(
-                arrays["environment"], arrays["recover_published"], arrays["recover_difference"], rows=rows
-            )
-
         passes = [
             Pass(self._take, on_host=True, enabled=lambda: self._arrives),
-            Pass(weigh, rows=height),
-            Pass(condense, rows=cells.shape[0], enabled=lambda: self._asks),
-            Pass(observe, rows=points, enabled=lambda: self._asks),
-            Pass(transfer, rows=points, enabled=lambda: self._asks),
+            Pass(self._weigh, rows=self.request.quality.environment_height),
+            Pass(self._condense, rows=arrays["recover_cells_now"].shape[0], enabled=lambda: self._asks),
+            Pass(self._observe, rows=points, enabled=lambda: self._asks),
+            Pass(self._transfer, rows=points, enabled=lambda: self._asks),
             Pass(self._ask, on_host=True, enabled=lambda: self._asks),
-            Pass(add, rows=cells.shape[0]),
+            Pass(self._add, rows=arrays["recover_cells"].shape[0]),
         ]
-        return [*passes, Pass(measure, rows=height)] if device.is_cpu else passes
+        if device.is_cpu:
+            passes.append(Pass(self._measure, rows=self.request.quality.environment_height))
+        return passes
+
+    def _weigh(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        kernels.weigh_boundaries(
+            arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
+        )
+
+    def _condense(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        kernels.condense_cells(
+            arrays["filled_radiance"],
+            arrays["environment_confidence"],
+            arrays["environment_clipped"],
+            arrays["recover_missing"],
+            arrays["probes"],
+            arrays["ray_scene"],
+            arrays["recover_cells_now"],
+            proxies=self._proxies,
+            rows=rows,
+        )
+
+    def _observe(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        kernels.observe_surfaces(
+            arrays["frame"],
+            arrays["decode"],
+            arrays["params"],
+            arrays["probes"],
+            arrays["ray_scene"],
+            arrays["recover_points"],
+            arrays["recover_observations"],
+            proxies=self._proxies,
+            rows=rows,
+        )
+
+    def _transfer(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        kernels.trace_transfer(
+            arrays["recover_points"],
+            arrays["recover_observations"],
+            arrays["recover_cells_now"],
+            arrays["probes"],
+            arrays["ray_scene"],
+            arrays["recover_traced"],
+            arrays["recover_transfer"],
+            arrays["recover_mirrored"],
+            proxies=self._proxies,
+            rows=rows,
+        )
+
+    def _add(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        kernels.add_recovered(
+            arrays["filled_radiance"],
+            arrays["environment_confidence"],
+            arrays["recover_missing"],
+            arrays["recover_cells"],
+            arrays["recover_recovered"],
+            arrays["environment"],
+            rows=rows,
+        )
+
+    def _measure(self, rows: Rows | None) -> None:
+        arrays = self._arrays
+        change.measure_difference(
+            arrays["environment"], arrays["recover_published"], arrays["recover_difference"], rows=rows
+        )
 
     def host_kernels(self) -> tuple[Any, ...]:
         """Of the solver: irradiance from emitters, at whatever places it tries."""

@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import cv2
 import numpy as np
@@ -37,6 +37,8 @@ from warp_ar.viewer.gate import BACKLOG, HEADER_SECONDS, Gate
 if TYPE_CHECKING:
     from warp_ar.viewer.frames import Lit
     from warp_ar.viewer.host import Host
+
+_T = TypeVar("_T")
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 EVERYWHERE: Final = ("0.0.0.0", "::", "")
@@ -186,6 +188,7 @@ class Server:
         self._encode_ms = 0.0
         self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
         self._hands = ThreadPoolExecutor(2, "warp-ar-page")
+        self._ending = False
         self.failed: BaseException | None = None
         """What ended the frames, if it was an error."""
         # Read once: no request's path ever becomes a file's.
@@ -264,14 +267,16 @@ class Server:
             "scene.toml": ("application/toml", lambda: host.scene_toml(full_paths=self.address.loopback).encode()),
             "recording.mp4": ("video/mp4", host.recording),
             "camera.yml": ("application/yaml", host.camera_file),
-            "board.png": ("image/png", host.board_picture),
+            "response.txt": ("text/plain", host.response_file),
+            "card-a4.pdf": ("application/pdf", lambda: host.card("a4")),
+            "card-letter.pdf": ("application/pdf", lambda: host.card("letter")),
         }
         name = request.match_info["name"]
         if name not in makers:
             raise web.HTTPNotFound(text="no such download\n")
         kind, make = makers[name]
         try:
-            body = await asyncio.get_running_loop().run_in_executor(self._hands, make)
+            body = await self._aside(make)
         except WarpArError as error:
             raise web.HTTPConflict(text=f"{error}\n") from error
         headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
@@ -313,7 +318,7 @@ class Server:
                 self._encode_ms = (time.perf_counter() - start) * 1e3
                 return data
 
-            self._jpegs[key] = asyncio.get_running_loop().run_in_executor(self._encoder, encode)
+            self._jpegs[key] = self._aside(encode, pool=self._encoder)
         return await asyncio.shield(self._jpegs[key])
 
     async def _message(self, lit: Lit) -> bytes:
@@ -379,7 +384,7 @@ class Server:
         if light is None:
             return protocol.pack({"type": "light", "known": False}, b"")
         if self._packed_light is None or self._packed_light[0] is not light:
-            packing = asyncio.get_running_loop().run_in_executor(self._encoder, encode_light, light)
+            packing = self._aside(encode_light, light, pool=self._encoder)
             self._packed_light = (light, packing)
         data = await asyncio.shield(self._packed_light[1])
         return protocol.pack({"type": "light", "known": True}, data)
@@ -402,7 +407,7 @@ class Server:
         try:
             viewer.tell(json.dumps(self._hello()))
             # Not here: to tell how large a mesh is, its file is read.
-            for message in await asyncio.get_running_loop().run_in_executor(self._hands, host.greetings):
+            for message in await self._aside(host.greetings):
                 viewer.tell(json.dumps(message))
             viewer.tell(await self._light_message(host.light()))
             await self._receive(viewer)
@@ -414,8 +419,22 @@ class Server:
                 await sender
             if viewer.picture is not None:
                 viewer.picture.cancel()
-            await asyncio.get_running_loop().run_in_executor(self._hands, host.leave_camera, viewer)
+            if not self._ending:  # else the host gives up its camera by itself
+                await self._aside(host.leave_camera, viewer)
         return socket
+
+    def _aside(
+        self, function: Callable[..., _T], *arguments: Any, pool: ThreadPoolExecutor | None = None
+    ) -> asyncio.Future[_T]:
+        """Begin what may take long beside the loop.
+
+        Raises:
+            asyncio.CancelledError: The server is ending, and its threads take nothing more.
+        """
+        if self._ending:
+            raise asyncio.CancelledError
+        loop = asyncio.get_running_loop()
+        return loop.run_in_executor(pool or self._hands, functools.partial(function, *arguments))
 
     async def _may_come(self, address: str) -> bool:
         """Let an address connect now and then: whoever is dropped and comes back at once takes the frames' time."""
@@ -473,7 +492,7 @@ class Server:
                 viewer.tell(json.dumps({"type": "pong", "sent": sent, "clock": time.monotonic() * 1e3}))
             case _:
                 try:
-                    await asyncio.get_running_loop().run_in_executor(self._hands, self.host.edit, command, viewer)
+                    await self._aside(self.host.edit, command, viewer)
                 except WarpArError as error:
                     viewer.tell(json.dumps({"type": "notice", "text": str(error), "bad": True}))
                     viewer.tell(json.dumps(self.host.scene_message()))
@@ -492,8 +511,7 @@ class Server:
 
     async def _push(self, viewer: _Viewer, picture: protocol.Picture) -> None:
         try:
-            loop = asyncio.get_running_loop()
-            await loop.run_in_executor(self._hands, self.host.push, picture, viewer)
+            await self._aside(self.host.push, picture, viewer)
         except protocol.ProtocolError as error:
             await self._drop(viewer, WSCloseCode.POLICY_VIOLATION, str(error))
         except WarpArError as error:
@@ -526,14 +544,14 @@ class Server:
             self.gate.start(runner.server, await self._listen(tries), self.address.tls)
             ready(self.address)
             # The page is there before kernels, and even their libraries, are loaded.
-            self._starting = self._loop.run_in_executor(
-                self._hands, functools.partial(self._make_host, publish=self._publish, notify=self._notify)
-            )
+            make_host = functools.partial(self._make_host, publish=self._publish, notify=self._notify)
+            self._starting = self._aside(make_host)
             self._host = await asyncio.shield(self._starting)
             ticker = asyncio.create_task(self._tick())
             running = self._run_frames(self._host)
             await asyncio.shield(running)
         finally:
+            self._ending = True
             if ticker is not None:
                 ticker.cancel()
             if self._host is not None:
