@@ -496,6 +496,8 @@ def light_clip(options: argparse.Namespace) -> int:
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
         _quick_check(options, session.scene)
+        for note in session.bracket_notes:
+            say(note)
         _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()
