@@ -62,14 +62,22 @@ size = [0.03, 0.03, 0.03]
 """
 
 
-@pytest.fixture
-def folder(tmp_path):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Recordings, one of them cut off, and job files."""
+    tmp_path = tmp_path_factory.mktemp("farm")
     write_recording(tmp_path / "good.mp4", 12, sound=True)
     data = (tmp_path / "good.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
     (tmp_path / "jobs.toml").write_text(RECORDINGS)
     (tmp_path / "data.toml").write_text(DATASET)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def finished(folder):
+    """A run of both recordings with two workers: its folder, and exit code, output and errors of the command."""
+    return folder / "run", *finish(farm("run", folder / "jobs.toml", "--output", folder / "run", "--workers", 2))
 
 
 def farm(*arguments, **options):
@@ -101,9 +109,8 @@ def digest(run):
     return {path.relative_to(run).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder):
-    run = folder / "run"
-    code, out, err = finish(farm("run", folder / "jobs.toml", "--output", run, "--workers", 2))
+def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished):
+    run, code, out, err = finished
     assert code == 1, err
     assert "1 jobs failed:" in out
     assert "cut/survey: " in out
@@ -186,18 +193,19 @@ def children(parent):
 
 
 def test_a_plan_runs_nothing_but_a_few_frames(folder, capsys):
+    before = sorted(folder.iterdir())
     assert main(["plan", str(folder / "data.toml"), "--device", "cpu", "--workers", "4"]) == 0
     out = capsys.readouterr().out
     assert "1 clips, 6 variations, 12 frames to light, 4 to survey" in out
     assert "4 workers: " in out
-    assert not (folder / "run").exists()
+    assert sorted(folder.iterdir()) == before
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["run", "jobs.toml", "--output", "run", "--workers", "0"], "--workers 0: expected a number from 1 to"),
-        (["run", "none.toml", "--output", "run"], "none.toml is not there"),
+        (["run", "jobs.toml", "--output", "new", "--workers", "0"], "--workers 0: expected a number from 1 to"),
+        (["run", "none.toml", "--output", "new"], "none.toml is not there"),
         (["resume", "nowhere"], "nowhere holds no run (run.json is missing); begin one with: farm run"),
         (["status", "nowhere"], "nowhere holds no run"),
         (["run", "jobs.toml", "--output", "."], ". is not empty"),
@@ -212,15 +220,15 @@ def test_wrong_usage_is_told_in_one_line(folder, monkeypatch, capsys, arguments,
     assert err.count("\n") == 1
 
 
-def test_a_run_of_another_program_is_not_gone_on_with(folder, capsys):
-    run = folder / "run"
+def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):
+    run = tmp_path / "run"
     run.mkdir()
     (run / "run.json").write_text(json.dumps({"version": "warp_ar 0.0", "jobs": {}}))
     assert main(["resume", str(run)]) == 2
     assert "was begun by warp_ar 0.0; this is warp_ar" in capsys.readouterr().err
 
 
-def test_the_same_on_a_local_ray_of_two_nodes(folder):
+def test_the_same_on_a_local_ray_of_two_nodes(folder, finished):
     """Needs the extra ``farm``."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'warp-ar[farm]'")
     code = (
@@ -243,15 +251,14 @@ def test_the_same_on_a_local_ray_of_two_nodes(folder):
         assert result == 1, err
         assert "cut/survey" in out
         assert set(done_lines(folder / "ray").values()) == {1}
-        result, _, err = finish(farm("run", folder / "jobs.toml", "--output", folder / "here", "--workers", 1))
-        assert (folder / "ray/good.mp4").read_bytes() == (folder / "here/good.mp4").read_bytes()
+        assert (folder / "ray/good.mp4").read_bytes() == (finished[0] / "good.mp4").read_bytes()
     finally:
         cluster.communicate("")
 
 
-def test_an_address_that_nothing_answers_at_is_told(folder, monkeypatch):
+def test_an_address_that_nothing_answers_at_is_told(folder):
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'warp-ar[farm]'")
-    code, _, err = finish(farm("run", folder / "jobs.toml", "--output", folder / "run", "--ray", "127.0.0.1:1"))
+    code, _, err = finish(farm("run", folder / "jobs.toml", "--output", folder / "no", "--ray", "127.0.0.1:1"))
     assert code == 2
     assert "--ray 127.0.0.1:1: " in err
     assert "start one with: ray start --head" in err

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import socket
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +21,9 @@ from warp_ar.farm.work import Context, Work
 
 CONNECT_SECONDS = 30.0
 """Within which a cluster must answer."""
+
+KNOCK_SECONDS = 5.0
+"""Within which its host must accept a connection."""
 
 
 class Member:
@@ -129,6 +133,18 @@ class RayPool:
         self._ray.shutdown()
 
 
+def _knock(address: str) -> None:
+    """Raise UsageError if nobody listens at ``HOST:PORT``: Ray itself takes half a minute to say so."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"--ray {address}: expected HOST:PORT, as `ray start --head` prints it")
+    try:
+        socket.create_connection((host, int(port)), KNOCK_SECONDS).close()
+    except OSError as error:
+        told = f"--ray {address}: no cluster answers ({reason(error)}); start one with: ray start --head"
+        raise UsageError(told) from error
+
+
 def _connect(ray: Any, address: str | None) -> None:
     """Connect to a cluster, in a time that is bounded."""
     failure: list[BaseException] = []
@@ -145,6 +161,7 @@ def _connect(ray: Any, address: str | None) -> None:
             return
         connect()
     else:
+        _knock(address)
         thread = threading.Thread(target=connect, name="warp_ar-ray", daemon=True)
         thread.start()
         thread.join(CONNECT_SECONDS)
