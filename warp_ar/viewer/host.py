@@ -28,6 +28,7 @@ from warp_ar.viewer.controls import Controls, Notify, open_feed
 from warp_ar.viewer.dropped import DroppedFiles
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
+from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
@@ -297,6 +298,10 @@ class Host:
                 "the environment is not captured: no stage of this scene reads it, or the marker was not seen"
             )
         return calibration.written("environment.exr", lambda path: write_environment(path, light))
+
+    def light_state(self) -> LightState | None:
+        """The environment with what is known of it; None while it is not captured."""
+        return self._loop.light_state
 
     def scene_toml(self, *, full_paths: bool) -> str:
         """The scene as it is shown, as a scene file.

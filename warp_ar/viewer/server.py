@@ -34,6 +34,7 @@ from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.gate import BACKLOG, HEADER_SECONDS, Gate
+from warp_ar.viewer.shared_light import SharedLight
 
 if TYPE_CHECKING:
     from warp_ar.viewer.frames import Lit
@@ -122,6 +123,8 @@ class Address:
     token: str | None = None
     """Secret that the page's address must hold; None asks for none."""
     tls: ssl.SSLContext | None = None
+    origins: tuple[str, ...] = ()
+    """Other sites' pages that may ask for the light."""
 
     @property
     def loopback(self) -> bool:
@@ -205,6 +208,7 @@ class Server:
         """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
         self.gate = Gate(own_headers(), header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
+        SharedLight(self)
         self.app.on_response_prepare.append(self._add_headers)
         self.app.add_routes(
             [
@@ -230,9 +234,14 @@ class Server:
         if self.address.loopback and self.address.token is None and name not in LOOPBACK:
             return self._refuse(f"this page is at {self.address.url}")
         origin = request.headers.get("Origin")
-        if origin is not None and origin != f"{request.scheme}://{request.host}":
+        welcome = origin in self.address.origins and request.path.startswith("/light")
+        if not welcome and origin is not None and origin != f"{request.scheme}://{request.host}":
             return self._refuse("requests from other sites are refused")
-        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and request.path != "/":
+        if (
+            not welcome
+            and request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+            and request.path != "/"
+        ):
             return self._refuse("requests from other sites are refused")
         given = request.query.get("token", "")
         public = request.path.startswith("/static/")
@@ -249,9 +258,12 @@ class Server:
         response.force_close()
         return response
 
-    @staticmethod
-    async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
+    async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
         response.headers.update(_HEADERS)
+        origin = request.headers.get("Origin")
+        if origin in self.address.origins and request.path.startswith("/light"):
+            allowed = {"Access-Control-Allow-Origin": str(origin), "Vary": "Origin"}
+            response.headers.update({**allowed, "Cross-Origin-Resource-Policy": "cross-origin"})
 
     # ------------------------------------------------------------------------------------------------------------ files
 
