@@ -139,7 +139,10 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
             if wp.static(config.shade is not None):
                 if item.shape >= 0:
-                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j))
+                    # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
+                    width = scene.pixel_spread * t / wp.max(-wp.dot(normal, wp.normalize(direction)), 0.1)
+                    spread = width / wp.max(item.t, 1.0e-6) + 2.0 * width / probe.radius
+                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
                     change += wp.cw_mul(rho, radiance) - shown
                     continue
             if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:

@@ -70,12 +70,16 @@ def make_physical_surface(config: TraceConfig) -> wp.Function:
                 surface.position = balls[k].center + balls[k].radius * surface.normal
         if wp.static(len(config.proxies) > 0):
             hit = closest_proxy(scene, origin, direction, nearest)
-            # From behind a proxy is not what the camera sees of it.
-            if hit.shape >= 0 and wp.dot(hit.geometric_normal, direction) < 0.0:
-                surface.index = objects + hit.shape
-                surface.depth = hit.t
-                surface.normal = hit.normal
-                surface.position = hit.point
+            if hit.shape >= 0:
+                surface = Surface()
+                surface.index = -1
+                surface.depth = wp.inf
+                # From behind a proxy hides what is beyond, and is not what the camera sees of it.
+                if wp.dot(hit.geometric_normal, direction) < 0.0:
+                    surface.index = objects + hit.shape
+                    surface.depth = hit.t
+                    surface.normal = hit.normal
+                    surface.position = hit.point
         return surface
 
     return physical_surface

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 
 import cv2
+import imageio.v3
 import numpy as np
 import pytest
 
-from warp_ar import doctor
+from warp_ar import doctor, live
 from warp_ar.errors import SceneError
+from warp_ar.input import checkup
 from warp_ar.input.check_ball import check_balls
 from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_print import check_print
+from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.checkup import check_up
 from warp_ar.input.finding import Finding, fault_errors, worst_first
 from warp_ar.input.sources import open_source
-from warp_ar.scene import Scene, load_scene, loads_scene
+from warp_ar.scene import Scene, SourceSpec, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 
 FRAMES = 96
@@ -141,6 +146,22 @@ def painted(color, share=1.0):
     return change
 
 
+def test_a_box_beside_its_edges_is_seen(looks):
+    scene = load_scene("desk")
+    look = looks["desk"]
+    few = look.views[::24]
+    assert check_proxies(scene, look.camera, few) == []
+    box = next(index for index, proxy in enumerate(scene.proxies) if proxy.shape == "box")
+    for off in ((0.015, 0.0, 0.0), (-0.01, 0.01, 0.0)):
+        at = tuple(a + b for a, b in zip(scene.proxies[box].at, off, strict=True))
+        proxies = list(scene.proxies)
+        proxies[box] = dataclasses.replace(proxies[box], at=at)
+        (found,) = check_proxies(dataclasses.replace(scene, proxies=tuple(proxies)), look.camera, few)
+        assert found.name == "proxy.edges"
+        right = [float(value) for value in found.remedy.split("[")[1].split("]")[0].split(",")]
+        assert right == pytest.approx(scene.proxies[box].at, abs=0.003)
+
+
 PICTURES = {
     "overexposed": ("card.clipped", gain(2.2)),
     "underexposed": ("card.dark", gain(0.2)),
@@ -217,6 +238,10 @@ def test_right_set_ups_raise_no_alarm(clip, change, looks):
     few = spoiled(few, RIGHT[change])
     scene = load_scene(clip)
     found = [*check_scene(scene), *check_pictures(scene, few), *check_balls(scene, few, 1)]
+    found += [
+        *check_proxies(scene, few.camera, few.views[::12]),
+        *check_print(scene.marker, few.camera, few.views[::12]),
+    ]
     assert [(finding.name, finding.text) for finding in found] == []
 
 
@@ -233,6 +258,25 @@ def test_command_says_it_and_ends_with_1(capsys, tmp_path):
     assert doctor.main(["nowhere"]) == 2
 
 
+def test_a_camera_that_may_not_be_opened_is_a_finding(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor, "DEVICES", tmp_path)
+    scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(camera=3))
+    (found,) = doctor.check_access(scene, None)
+    assert found.name == "source.absent"
+    assert "no capture device 3" in found.text
+    (tmp_path / "video0").touch()
+    (found,) = doctor.check_access(scene, None)
+    assert "there are 0" in found.remedy
+    device = tmp_path / "video3"
+    device.touch()
+    assert doctor.check_access(scene, None) == []
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    (found,) = doctor.check_access(scene, None)
+    assert found.name == "source.permission"
+    assert "group" in found.remedy
+    assert doctor.check_access(scene, tmp_path / "clip.mp4") == []
+
+
 def test_unreadable_source_is_a_finding(tmp_path):
     found = check_up(load_scene("desk"), tmp_path / "nothing.mp4")
     assert [finding.name for finding in found] == ["source.unreadable"]
@@ -244,6 +288,60 @@ def test_costs_are_measured_and_order_the_findings():
     findings = [Finding("ball.place", "", ""), Finding("marker.unseen", "", "")]
     assert [finding.name for finding in worst_first(findings)] == ["marker.unseen", "ball.place"]
     assert "FLIP" in findings[0].cost
+
+
+def lives_line(scene, monkeypatch, source=None):
+    """What ``live`` says first, and the names of all that its quick half finds, the worst first."""
+    said, names = [], []
+
+    def look(*arguments, **options):
+        found = check_up(*arguments, **options)
+        names.extend(finding.name for finding in found)
+        return found
+
+    monkeypatch.setattr(checkup, "check_up", look)
+    monkeypatch.setattr(live, "say", said.append)
+    live._quick_check(argparse.Namespace(scene="my_desk", source=source), scene)
+    return said, names
+
+
+@pytest.mark.parametrize("fault", NUMBERS)
+def test_lives_line_names_wrong_numbers(fault, monkeypatch):
+    name, change = NUMBERS[fault]
+    said, names = lives_line(dataclasses.replace(change(load_scene("desk")), source=None), monkeypatch)
+    assert name in names
+    texts = {f.name: f.text for f in check_scene(change(load_scene("desk")))}
+    assert said[0].startswith(texts[names[0]]), "it is not the worst that is said"
+    assert fault_errors()[names[0]]["error"] >= fault_errors()[name]["error"]
+    assert said[0].endswith("python -m warp_ar.doctor my_desk")
+
+
+SHOWN = {
+    "radius 10 % long": BALLS["radius 10 % long"],
+    "on the other side": BALLS["on the other side"],
+    "focal length of another size": SEEN["focal length of another size"],
+    "overexposed": PICTURES["overexposed"],
+    "underexposed": PICTURES["underexposed"],
+}
+
+
+@pytest.mark.parametrize("fault", SHOWN)
+def test_lives_line_names_what_frames_show(fault, monkeypatch, looks, tmp_path):
+    name, change = SHOWN[fault]
+    scene = load_scene("desk")
+    if fault in PICTURES:
+        for k, image in enumerate(looks["desk"].images[:12]):
+            imageio.v3.imwrite(tmp_path / f"{k:04d}.png", change(image, k))
+        said, names = lives_line(scene, monkeypatch, str(tmp_path))
+    else:
+        said, names = lives_line(change(scene), monkeypatch)
+    assert name in names
+    assert len(said) == 1
+    assert fault_errors()[names[0]]["error"] >= fault_errors()[name]["error"]
+
+
+def test_live_says_nothing_of_a_right_set_up(monkeypatch):
+    assert lives_line(load_scene("desk"), monkeypatch) == ([], [])
 
 
 def test_results_are_written_and_comments_stay(tmp_path):

@@ -42,7 +42,7 @@ def test_a_file_is_told_wherever_it_is_cut(tmp_path: pathlib.Path, parts: int) -
     if parts == 1:
         image = OpenEXR.File(header, {"Y": pixels})
     else:
-        image = OpenEXR.File([OpenEXR.Part(header, {"Y": k + pixels}, f"part {k}") for k in range(parts)])
+        image = OpenEXR.File([OpenEXR.Part(dict(header), {"Y": k + pixels}, f"part {k}") for k in range(parts)])
     write_exr(path, image)
     whole = path.read_bytes()
     for length in range(len(whole)):

@@ -69,7 +69,7 @@ def test_frames_that_cannot_be_judged_are_named(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640, 3), np.uint8))
     with pytest.raises(UsageError, match="--frame -1: expected 0 or more"):
         light_up_to(scene, -1, quality="low", device="cpu")
-    with pytest.raises(SourceError, match="frame 0 of .* shows no marker"):
+    with pytest.raises(SourceError, match=r"frame 0 of .* shows no marker"):
         light_up_to(scene, 0, quality="low", device="cpu", source=tmp_path)
     with pytest.raises(SourceError, match="has no frame 1; it ends before"):
         light_up_to(scene, 1, quality="low", device="cpu", source=tmp_path)

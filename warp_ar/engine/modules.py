@@ -7,6 +7,7 @@ here they are parsed once and kept beside the compiled kernels.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import os
@@ -61,11 +62,15 @@ def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None
 
     if progress is not None:
         progress(0, len(modules))
-    with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
-        for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
-            job.result()
-            if progress is not None:
-                progress(done, len(modules))
+    try:
+        with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
+            for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
+                job.result()
+                if progress is not None:
+                    progress(done, len(modules))
+    finally:
+        if headers is not None:
+            headers.close()
 
 
 def _load(module: Any, device: Any) -> None:
@@ -86,14 +91,15 @@ class _Headers:
     """
 
     def __init__(self) -> None:
-        runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
         self._folder_of_thread = (
-            getattr(runtime, "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
+            getattr(_runtime(), "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
         )
         builtin = Path(wp.__file__).parent / "native" / "builtin.h"
         self._lock = threading.Lock()
         self._first: int | None = None
-        self._parsed = threading.Event()
+        self._parsed, self._over = threading.Event(), threading.Event()
+        self._watcher: threading.Thread | None = None
+        self._threads: set[int] = set()
         if self._folder_of_thread is None or not builtin.is_file():
             self._folder_of_thread = None
             return
@@ -109,13 +115,14 @@ class _Headers:
             return
         own = Path(self._folder_of_thread())
         with self._lock:
+            self._threads.add(threading.get_ident())
             first = self._first is None and not _headers_in(own) and not _headers_in(self._store)
             if first:
                 self._first = threading.get_ident()
-                watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
-        if first:
-            watcher.start()
-        elif not _headers_in(own):
+                self._parsing = own
+                self._watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
+                self._watcher.start()
+        if not first and not _headers_in(own):
             if self._first is not None:
                 self._parsed.wait(_HEADER_WAIT)
             _copy_headers(self._store, own)
@@ -124,10 +131,48 @@ class _Headers:
     def _keep(self, own: Path) -> None:
         """Put what the first thread parses where others find it."""
         stop = time.monotonic() + _HEADER_WAIT
-        while time.monotonic() < stop and not _headers_in(own):
-            time.sleep(0.02)
+        while time.monotonic() < stop and not _headers_in(own) and not self._over.wait(0.02):
+            pass
         _copy_headers(own, self._store)
         self._parsed.set()
+
+    def close(self) -> None:
+        """When the threads are done: remove what Warp keeps for each of them."""
+        self._over.set()
+        if self._watcher is not None:
+            self._watcher.join()
+            _copy_headers(self._parsing, self._store)  # on a busy machine they come later than is waited for
+        # A thread of somebody else's may have got the identity of one that has ended.
+        alive = {thread.ident for thread in threading.enumerate()}
+        remove_header_folders(self._threads - alive)
+        # What other threads compile is left until the process ends; registered anew, this comes before Warp's own end.
+        atexit.unregister(remove_header_folders)
+        atexit.register(remove_header_folders)
+
+
+def remove_header_folders(threads: Iterable[int] | None = None) -> None:
+    """Remove the folders in which Warp keeps parsed headers, some megabytes for each thread that ever compiled.
+
+    Warp leaves them to the end of the process, where Python's development mode warns of them.
+
+    Args:
+        threads: Their identities; None means all.
+    """
+    runtime = _runtime()
+    folders, lock = getattr(runtime, "_pch_dirs", None), getattr(runtime, "_pch_dirs_lock", None)
+    if not isinstance(folders, dict) or lock is None:
+        return
+    with lock:
+        for thread in list(folders) if threads is None else threads:
+            folder = folders.pop(thread, None)
+            if folder is not None:
+                with contextlib.suppress(OSError):
+                    folder.cleanup()
+
+
+def _runtime() -> Any:
+    """What Warp keeps for the process; None before it is initialised, or where this Warp keeps it elsewhere."""
+    return getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
 
 
 def _headers_in(folder: Path) -> list[Path]:

@@ -31,10 +31,12 @@ from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
+from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
+from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Request
 
@@ -107,6 +109,7 @@ class Pipeline:
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        emitters: bool = False,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -125,6 +128,7 @@ class Pipeline:
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -144,9 +148,10 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._own_markers = OwnMarkers(self.scene, self.camera)
         self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -255,11 +260,75 @@ class Pipeline:
         self._shown = other._shown
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
+        if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):
+            self._own_markers = other._own_markers
         with exclusive(self.device):
             self._light.take_over(other._light)
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
+
+    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+
+        Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+
+        Args:
+            first: Number of the next frame in its clip.
+            saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
+                all frames to come.
+
+        Raises:
+            UsageError: The scene's light is that of a mirror ball in the frames.
+        """
+        self._check_usable()
+        self._finish()
+        if self.plan.features.observed:
+            raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
+        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._lit_time = math.inf  # no frame came before
+        self._shown = None
+        if self._tracker is not None:
+            self._tracker.reset()
+        if saturation is not None:
+            self.inputs.fix_saturation(saturation)
+        self._scheduler.restart()
+
+    def start_clock(self, seconds: float) -> None:
+        """Have animations begin at a time before the first frame; left out, they begin with it.
+
+        Args:
+            seconds: On the clock of ``time_seconds``.
+
+        Raises:
+            UsageError: A frame has been lit, the pipeline is closed, or the time is not finite.
+        """
+        self._check_usable()
+        _check_number("seconds", seconds)
+        if self._begun:
+            raise UsageError("start_clock comes before the first frame")
+        self._start_time = self._last_time = seconds
+        self._lit_time = math.inf  # no frame came before
+
+    def take_light(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
+        """Light the frames to come by another environment than the captured one that the scene names.
+
+        Args:
+            radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), of the quality's
+                ``environment_height``; it is kept, not copied.
+            emitters: Where its emitters are: the array ``emitters`` of a pipeline that found them, copied.
+
+        Raises:
+            UsageError: The scene names no captured light, or the map has another size.
+        """
+        self._check_usable()
+        self._finish()
+        stage = self._scheduler.stage("captured")
+        if not isinstance(stage, Captured):
+            raise UsageError("take_light needs a scene with a captured light that some stage reads")
+        stage.replace(radiance, emitters)
+        self._arrays.touch("captured_light")
 
     def __call__(
         self,
@@ -392,15 +461,29 @@ class Pipeline:
         timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
         return track.pose, track.state
 
+    def _find_own_markers(self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]) -> Places:
+        """Find the markers that something rides on."""
+        if not self._own_markers:
+            return {}
+        if isinstance(image, wp.array):
+            with exclusive(self.device):
+                image = image.numpy()
+        start = time.perf_counter()
+        places = self._own_markers.track(cast(Image, image), now, pose)
+        before = timings[TRACK].milliseconds if TRACK in timings else 0.0
+        timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
+        return places
+
     def _look(self, image: Any, now: float, pose: Pose | None) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, pose, timings)
         lost = self._tracker is not None and pose is None
+        places = self._find_own_markers(image, now, pose, timings)
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""

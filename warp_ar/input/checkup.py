@@ -10,6 +10,8 @@ from warp_ar.errors import SceneError, SourceError
 from warp_ar.input.ball_solve import find_outlines
 from warp_ar.input.check_ball import LOST, check_balls
 from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_print import check_print
+from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.finding import Finding, worst_first
 from warp_ar.input.sources import open_source
@@ -17,6 +19,8 @@ from warp_ar.scene import Camera, Pose, Scene
 
 FRAMES: Final = 120
 """Frames that are looked at."""
+FEW_VIEWS: Final = 5
+"""Views in which paper and modelled shapes are looked for."""
 QUICK_FRAMES: Final = 12
 """Frames that the quick half looks at."""
 
@@ -75,6 +79,8 @@ def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 
 def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
     found = check_pictures(scene, look)
+    few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
+    found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
     if any(finding.name.startswith("units.") for finding in before):
         return found

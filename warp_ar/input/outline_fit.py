@@ -30,13 +30,17 @@ _Places: TypeAlias = list[tuple[int, int, float]]
 
 REACHES: Final = (16.0, 9.0, 5.0)
 """Pixels to either side of an edge in which its step is looked for, round after round: a hand points as well."""
+MODELLED: Final = 30.0
+"""The same at first for shapes that are modelled already: a ruler and a guess are worse than a hand."""
 ROUNDS: Final = 6
 """Steps of Gauss-Newton with each reach."""
 SPACING: Final = 4.0
 """Pixels between samples of an edge."""
 STEP: Final = 6.0
 """Codes per pixel that a step must have: more than noise and wood have."""
-POINTED: Final = 10.0
+FARTHEST: Final = 20.0
+"""Pixels that a pointed corner may be moved."""
+POINTED: Final = 8.0
 """Pixels: standard deviation of a pointed corner, over that of an edge's step of one pixel."""
 MET: Final = 1.5
 """Pixels within which an edge has met its step."""
@@ -72,8 +76,8 @@ def fit_outline(
         camera: The camera.
         pose: ``camera_from_world``.
         kind: ``plane``: corners of a rectangle that lies on the desk, around it; ``wall``: the left and right end of
-            its foot, then its top right and top left corner; ``box``: three corners of its base, around it, then the
-            corner of its top above the first.
+            its foot, then its top right and top left corner; ``box``: the ends of an edge of its base, then the corner
+            of its top above the second, then the next corner of its top, behind: all four are seen.
         points: Pixels.
 
     Raises:
@@ -84,7 +88,7 @@ def fit_outline(
     _check(kind, start)
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
     shape = start
-    anchors = _anchors(kind, start, view)
+    anchors = _anchors(kind, start, view, np.asarray(points, float))
     for reach in REACHES:
         for _ in range(ROUNDS):
             moved = _improve(kind, shape, view, gray, reach, anchors)
@@ -92,9 +96,70 @@ def fit_outline(
                 break
             shape = moved
     met = _met(kind, shape, view, gray)
-    fitted = met >= ENOUGH and _is_sound(kind, shape)
+    # Edges that lie far from where somebody pointed are others.
+    moved_by = np.linalg.norm(view.pixels(_corners(kind, shape))[anchors[0]] - anchors[1], axis=1).max()
+    fitted = met >= ENOUGH and bool(moved_by <= FARTHEST)
     shape = shape if fitted else start
     return OutlineFit(_proxy(kind, shape), met, fitted)
+
+
+@dataclasses.dataclass(frozen=True)
+class OutlineRefit:
+    """A modelled shape against the picture's edges."""
+
+    proxy: Proxy
+    """Where the edges have it."""
+    met: float
+    """Share of its visible outline that lies on edges there."""
+    met_before: float
+    """The same where it is modelled."""
+    moved: float
+    """Pixels by which its corners are off at most."""
+
+
+def refit_outline(image: NDArray[np.uint8], camera: Camera, pose: Pose, proxy: Proxy) -> OutlineRefit | None:
+    """A modelled box on the desk or wall, moved and turned to fit the picture's edges; its sizes stay.
+
+    None where it is neither, or not whole in the picture.
+
+    Args:
+        image: RGB, of the camera's size.
+        camera: The camera.
+        pose: ``camera_from_world``.
+        proxy: The shape.
+    """
+    kind, shape = _shape_of(proxy)
+    view = _View(camera, pose)
+    if kind is None or view.eye[2] <= 0:
+        return None
+    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
+    seen = view.pixels(_corners(kind, shape))
+    size = (gray.shape[1], gray.shape[0])
+    if not np.isfinite(seen).all() or not ((seen > 2) & (seen < (size[0] - 3, size[1] - 3))).all():
+        return None  # of an outline that is cut off, what is left fits anywhere
+    start, before = shape, _met(kind, shape, view, gray)
+    anchors = (list(range(len(seen))), seen)
+    for reach in (MODELLED, *REACHES):
+        for _ in range(ROUNDS):
+            moved = _improve(kind, shape, view, gray, reach, anchors, free=3)
+            if moved is None:
+                break
+            shape = moved
+    if not _is_sound(kind, shape):
+        shape = start
+    off = float(np.linalg.norm(view.pixels(_corners(kind, shape)) - seen, axis=1).max())
+    return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, gray), before, off)
+
+
+def _shape_of(proxy: Proxy) -> tuple[str | None, Array]:
+    """Kind and numbers of a proxy that could have been pointed out, but for planes: they need no edges."""
+    turn = math.radians(proxy.rotate[2])
+    x, y, z = proxy.at
+    if proxy.shape == "box" and proxy.rotate[:2] == (0.0, 0.0) and abs(z - proxy.size[2] / 2) < 0.1 * proxy.size[2]:
+        return "box", np.array([x, y, turn, *proxy.size])
+    if proxy.shape == "plane" and proxy.rotate[:2] == (90.0, 0.0) and abs(z - proxy.size[1] / 2) < 0.1 * proxy.size[1]:
+        return "wall", np.array([x, y, turn, *proxy.size])
+    return None, np.zeros(0)
 
 
 class _View:
@@ -164,21 +229,23 @@ def _start_wall(view: _View, points: Array) -> Array:
 
 def _start_box(view: _View, points: Array) -> Array:
     """x, y, angle, width, depth, height."""
-    a, b, c = view.on_desk(points[:3])
-    along, across = b - a, c - b
+    a, b = view.on_desk(points[:2])
+    along = b - a
     width = float(np.linalg.norm(along))
     if width < SMALLEST:
-        raise UsageError("two corners of the box are at one place; point out three corners of its base")
-    angle = math.atan2(along[1], along[0])
+        raise UsageError("two corners of the box are at one place; point out both ends of an edge of its base")
     sideways = np.array([-along[1], along[0]]) / width
-    depth = float(across @ sideways)
-    # The top's corner stands above the base's: the height at which the ray passes that upright.
-    way = view.rays(points[3:])[0]
-    flat = way[:2]
-    far = float(flat @ (a - view.eye[:2])) / max(float(flat @ flat), 1e-12)
-    height = float(view.eye[2] + far * way[2])
+    above, behind = view.rays(points[2:])
+    # The height at which the ray of the third point passes the second's upright.
+    flat = above[:2]
+    far = float(flat @ (b - view.eye[:2])) / max(float(flat @ flat), 1e-12)
+    height = float(view.eye[2] + far * above[2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        last = view.eye + np.float64(height - view.eye[2]) / behind[2] * behind
+    depth = float((last[:2] - b) @ sideways)
     middle = a + along / 2 + sideways * depth / 2
-    return np.array([*middle, angle, width, abs(depth), height])
+    # Corners run around the base from the end that was pointed out first, or, behind it, from the other side.
+    return np.array([*middle, math.atan2(along[1], along[0]), width, abs(depth), height])
 
 
 def _is_sound(kind: str, shape: Array) -> bool:
@@ -196,7 +263,7 @@ def _check(kind: str, shape: Array) -> None:
     order = {
         "plane": "its four corners, around it",
         "wall": "the left and right end of its foot, then its top right and top left corner",
-        "box": "three corners of its base, around it, then the corner of its top above the first",
+        "box": "both ends of an edge of its base, the corner of its top above the second, and the next one behind it",
     }[kind]
     sizes = " x ".join(f"{1e3 * side:.0f}" for side in shape[3:])
     raise UsageError(f"the points make a {kind} of {sizes} mm; expected {order}")
@@ -276,10 +343,11 @@ def _steps(gray: NDArray[np.float32], at: Array, normals: Array, reach: float) -
     return middle[best] + 0.5 * np.clip(fine, -1, 1), b
 
 
-def _anchors(kind: str, shape: Array, view: _View) -> tuple[list[int], Array]:
-    """Corners that were pointed out, and where they were."""
-    chosen = [0, 1, 2, 4] if kind == "box" else [0, 1, 2, 3]
-    return chosen, view.pixels(_corners(kind, shape))[chosen]
+def _anchors(kind: str, shape: Array, view: _View, points: Array) -> tuple[list[int], Array]:
+    """Numbers of the shape's corners that were pointed out, and where they are at first."""
+    seen = view.pixels(_corners(kind, shape))
+    chosen = [int(np.linalg.norm(seen - point, axis=1).argmin()) for point in points]
+    return chosen, seen[chosen]
 
 
 def _improve(
@@ -289,8 +357,9 @@ def _improve(
     gray: NDArray[np.float32],
     reach: float,
     anchors: tuple[list[int], Array],
+    free: int | None = None,
 ) -> Array | None:
-    """One step of Gauss-Newton; None where there is nothing to go by."""
+    """One step of Gauss-Newton for the first ``free`` numbers; None where there is nothing to go by."""
     size = (gray.shape[1], gray.shape[0])
     places, at, normals = _samples(kind, shape, view, size)
     if len(places) < 8:
@@ -307,14 +376,14 @@ def _improve(
 
     now = seen(shape)
     delta = np.array([1e-4, 1e-4, 1e-3, 1e-4, 1e-4, 1e-4])[: len(shape)]
-    jacobian = np.column_stack(
-        [(seen(shape + step) - now) / size_ for step, size_ in zip(np.diag(delta), delta, strict=True)]
-    )
+    steps = np.diag(delta)[:free]
+    jacobian = np.column_stack([(seen(shape + one) - now) / one.max() for one in steps])
     target = np.concatenate([offsets, np.zeros(2 * len(chosen))]) - now
     root = np.sqrt(np.concatenate([weight, np.ones(2 * len(chosen))]))
     good = np.isfinite(jacobian).all(1) & np.isfinite(target)
     step, *_ = np.linalg.lstsq(jacobian[good] * root[good, None], target[good] * root[good], rcond=None)
-    moved = shape + step
+    moved = shape.copy()
+    moved[:free] += step
     return moved if _is_sound(kind, moved) else None
 
 

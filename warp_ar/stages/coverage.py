@@ -24,7 +24,7 @@ class Coverage(Stage):
         bound=0.0,
         cause="none: shares are multiples of 1/16; edges fall to either side",
         measured=0.0,
-        rows=(),
+        rows=(17,),
     )
 
     @classmethod

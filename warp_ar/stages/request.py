@@ -58,6 +58,8 @@ class Request:
     """Exposures between which frames alternate, longest first, over the one that is shown; empty: only one."""
     synchronous: bool = False
     """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
+    emitters: bool = False
+    """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
 
     @property
     def resources(self) -> tuple[str, ...]:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
 from warp_ar.errors import UsageError
+from warp_ar.input.check_print import card_scale
 from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import (
     Camera,
     CharucoBoard,
     Exposure,
+    FileMaterial,
     LambertMaterial,
     Light,
     Material,
@@ -29,7 +30,7 @@ from warp_ar.scene import (
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.object_materials import mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
 from warp_ar.viewer import protocol
@@ -58,6 +59,7 @@ _MODELS: Final[Mapping[str, type[Material]]] = {
     "phong": PhongMaterial,
     "metallic_roughness": MetallicRoughnessMaterial,
     "mirror": MirrorMaterial,
+    "file": FileMaterial,
 }
 _PLANE, _BOX = Proxy("plane", size=(0.2, 0.15)), Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06))
 _NEW: Final[Mapping[str, Object | Light]] = {
@@ -123,14 +125,8 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
 
 def card_ruler(scene: Scene) -> float | None:
     """What the rulers of the scene's printed card measure, metres; None where its marker is another one."""
-    board, made = scene.marker.board, SHEET.board
-    assert isinstance(made, CharucoBoard)
-    if not isinstance(board, CharucoBoard) or scene.marker.dictionary != SHEET.dictionary:
-        return None
-    if (board.columns, board.rows) != (made.columns, made.rows):
-        return None
-    scale = board.square_length / made.square_length
-    return RULER * scale if abs(board.marker_length / made.marker_length / scale - 1.0) < 1e-3 else None
+    scale = card_scale(scene.marker)
+    return None if scale is None else RULER * scale
 
 
 def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scene:
@@ -158,7 +154,7 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         raise UsageError(f"{part} {index}: the scene has {len(items)}")
     item = items[index]
     if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
-        items[index] = dataclasses.replace(item, material=_material(item.material, key, value))
+        items[index] = dataclasses.replace(item, material=_material(_shown_material(item), key, value))
     else:
         changes = {_key(part, key): value}
         if part == "light" and key in ("target", "direction"):
@@ -178,12 +174,21 @@ def _key(part: str, key: str) -> str:
     return key
 
 
+def _shown_material(item: Object) -> Material:
+    """An object's material; what has no file is chalk where no material is given."""
+    return LambertMaterial() if isinstance(item.material, FileMaterial) and item.shape != "mesh" else item.material
+
+
 def _material(material: Material, key: str, value: Any) -> Material:
     if key == "model":
         if value not in _MODELS:
             raise UsageError(f"material: model {value!r}; expected {', '.join(_MODELS)}")
-        color: Any = next(iter(vars(material).values()))  # the first field of every model is its colour
-        return _MODELS[value](color)
+        if value == "file":
+            return FileMaterial()
+        first = iter(vars(material).values())  # of every model but the file's own its colour
+        color: Any = next(first, LambertMaterial.base_color)
+        made: Any = _MODELS[value]
+        return cast(Material, made(color))
     if key not in vars(material):
         raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
     color_like = isinstance(vars(material)[key], tuple | Path)
@@ -299,6 +304,21 @@ class Wanted:
         return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
 
 
+def beside(scene: Scene, folder: Path) -> Scene:
+    """The scene with files of a folder named as if they lay beside its own file."""
+
+    def named(path: Any) -> Any:
+        return Path(path.name) if isinstance(path, Path) and path.parent == folder else path
+
+    captured = scene.captured
+    return dataclasses.replace(
+        scene,
+        camera=dataclasses.replace(scene.camera, transfer=named(scene.camera.transfer)),
+        objects=tuple(dataclasses.replace(item, file=named(item.file)) for item in scene.objects),
+        captured=None if captured is None else dataclasses.replace(captured, file=named(captured.file)),
+    )
+
+
 def make_edit(command: protocol.Command, original: Wanted) -> tuple[Callable[[Wanted], Wanted], str] | None:
     """What a command makes of what is wanted, and its name in words; None if it is no edit.
 
@@ -348,8 +368,9 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         record = {**plain(item), "visible": (kind, index) not in wanted.hidden}
         record["animated"] = not isinstance(item, Proxy) and item.animate is not None
         if isinstance(item, Object):
-            model = next(name for name, made in _MODELS.items() if isinstance(item.material, made))
-            record["material"] = {"model": model, **plain(item.material)}
+            material = _shown_material(item)
+            model = next(name for name, made in _MODELS.items() if isinstance(material, made))
+            record["material"] = {"model": model, **plain(material)}
             record["reach"] = _reach(item)
         return record
 
@@ -360,6 +381,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         "lights": [part("light", i, item) for i, item in enumerate(scene.lights)],
         "proxies": [part("proxy", i, item) for i, item in enumerate(scene.proxies)],
         "probes": [plain(item) for item in scene.probes],
+        "captured": None if scene.captured is None else scene.captured.file.name,
         "exposure": scene.exposure.scale,
         "marker": {
             "dictionary": marker.dictionary,
@@ -377,13 +399,9 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 def _reach(item: Object) -> float:
     """Radius in metres of a circle on the ground around an object, about its size."""
     if item.shape == "mesh":
-        assert item.file is not None
-        return item.scale * _mesh_reach(item.file)
+        mesh = mesh_of(item)
+        assert mesh is not None
+        return item.scale * float(np.abs(mesh.bounds)[:, :2].mean())
     if item.shape == "box":
         return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
     return item.scale * (item.radius + item.major_radius + item.minor_radius)
-
-
-@functools.lru_cache(maxsize=32)
-def _mesh_reach(file: Path) -> float:
-    return float(np.abs(load_mesh(file).bounds)[:, :2].mean())

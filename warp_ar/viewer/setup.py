@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,8 @@ from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.check_pictures import Look, look_at, why_unseen
 from warp_ar.input.checkup import check_look
 from warp_ar.input.finding import Finding
+from warp_ar.input.grey_response import measure_grey_response
+from warp_ar.input.response import write_response
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Probe, Scene
 from warp_ar.viewer.controls import Controls, Notify
@@ -30,6 +33,8 @@ LOST_SECONDS: Final = 1.5
 """How long the marker must not have been seen before it is looked at why."""
 AGAIN_SECONDS: Final = 3.0
 """How often that is looked at."""
+RESPONSE: Final = "response.txt"
+"""Name of a measured response's file."""
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
 
@@ -37,19 +42,27 @@ FEWEST: Final = 3
 class SetupChecks:
     """Keeps some of the frames and looks at them on a helper's thread. The thread of the frames calls ``note``."""
 
-    def __init__(self, controls: Controls, helper: Executor, notify: Notify) -> None:
+    def __init__(self, controls: Controls, helper: Executor, notify: Notify, folder: Path) -> None:
         """Start without frames.
 
         Args:
             controls: What is shown, and where measurements go.
             helper: Looks at the frames, beside them.
             notify: Takes ``message`` whenever it has changed.
+            folder: Where a measured response is kept.
         """
+        self._folder = folder
         self._controls, self._helper, self._notify = controls, helper, notify
         self._frames: collections.deque[tuple[Image, float]] = collections.deque(maxlen=KEPT)
         self._of: object = None
         self._busy: Future[None] | None = None
         self._step: str | None = None
+        self._waits = False
+        self._work: dict[str, Callable[[Scene, Look], None]] = {
+            "check": self._check,
+            "ball": self._ball,
+            "response": self._response,
+        }
         self._seen = self._looked = 0.0
         self._findings: list[Finding] | None = None
         self._measured: dict[str, str] = {}
@@ -73,6 +86,7 @@ class SetupChecks:
             self._seen, self.missing = now, None
         if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
             self._frames.append((image, now))
+        self._begin()
         if state in (None, TrackState.TRACKED):
             self._seen, self.missing = now, None
         elif now - self._seen > LOST_SECONDS and now - self._looked > AGAIN_SECONDS and not self._is_busy:
@@ -98,21 +112,23 @@ class SetupChecks:
             self.missing = None  # the source has changed meanwhile
 
     def step(self, name: str) -> None:
-        """Begin to look at the frames, or to measure by them.
+        """Begin to look at the frames, or to measure by them, as soon as there are enough.
 
         Raises:
-            UsageError: It is at that already, or there are too few frames yet.
+            UsageError: It is at that already.
         """
-        work: dict[str, Callable[[Scene, Look], None]] = {"check": self._check, "ball": self._ball}
-        if self._is_busy:
+        if self._step is not None:
             raise UsageError("the frames are being looked at already: wait until that is done")
-        if name not in work:
-            raise UsageError(f"no step {name!r}; expected {', '.join(work)}")
-        if len(self._frames) < FEWEST:
-            raise UsageError("too few frames have been seen yet: wait some seconds")
-        self._step = name
+        if name not in self._work:
+            raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
+        self._step, self._waits = name, True
         self._notify(self.message())
-        self._busy = self._helper.submit(self._run, work[name])
+
+    def _begin(self) -> None:
+        """Do what was asked for, if there are enough frames."""
+        if self._waits and self._step is not None and len(self._frames) >= FEWEST:
+            self._waits = False
+            self._busy = self._helper.submit(self._run, self._work[self._step])
 
     def _run(self, work: Callable[[Scene, Look], None]) -> None:
         self._failed = None
@@ -150,6 +166,29 @@ class SetupChecks:
             f"The ball's centre was {moved:.1f} mm off; it is known to ± {2e3 * found.deviation:.1f} mm now. "
             f"Its radius: {radius}."
         )
+
+    def _response(self, scene: Scene, look: Look) -> None:
+        """Measure how the camera encodes light, by the card's greys."""
+        found = measure_grey_response(look.images)
+        path = self._folder / RESPONSE
+        write_response(found.curve, path)
+        camera = dataclasses.replace(scene.camera, transfer=path)
+        self._controls.change(lambda w: w.with_camera(camera), "measure the response")
+        middle = found.curve[128].mean()
+        self._measured["response"] = (
+            f"Code 128 is {middle:.3f} of clipping ± {2 * found.deviation[128].max():.0%} (sRGB: 0.216), by "
+            f"{found.views} pictures. Several exposures, or lamps on and off, tell it better."
+        )
+
+    def response_file(self) -> bytes:
+        """The measured response.
+
+        Raises:
+            UsageError: None was measured.
+        """
+        if "response" not in self._measured:
+            raise UsageError("no response was measured here")
+        return (self._folder / RESPONSE).read_bytes()
 
     def message(self) -> dict[str, Any]:
         """What was found and measured."""

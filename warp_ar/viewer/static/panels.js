@@ -68,7 +68,7 @@ function color(label, value, change) {
 
 const shapeName = (proxy) => (proxy.shape === "plane" && proxy.rotate[0] ? "wall" : proxy.shape === "plane" ? "plane" : proxy.file?.replace(/\.\w+$/, "") ?? proxy.shape);
 
-const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror" };
+const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", file: "The file's own" };
 const EFFECTS = {
   objects: ["Virtual objects", ""],
   lights: ["Virtual lights", ""],

@@ -4,7 +4,7 @@ const SVG = "http://www.w3.org/2000/svg";
 const WORDS = {
   plane: ["a corner of it", "the next corner, around it", "the third corner", "the last corner"],
   wall: ["where its left end meets the desk", "where its right end meets the desk", "its top right corner", "its top left corner"],
-  box: ["a corner of its base", "the next corner of its base, around it", "the third corner of its base", "the corner of its top above the first"],
+  box: ["the left corner of its base in front", "the right corner of its base in front", "the corner of its top above that", "the next corner of its top, behind"],
 };
 const NAMES = { plane: "Plane on the desk", wall: "Wall", box: "Box" };
 
