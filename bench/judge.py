@@ -59,10 +59,10 @@ def truth_of(scene: Scene, frame: int) -> Image | None:
 
 
 def blocks_of(radiance: npt.NDArray[np.float32], known: KnownFrame) -> npt.NDArray[np.float64]:
-    """Means over blocks in linear light, in codes, not rounded."""
+    """Means over blocks in linear light as the camera clips it, in codes, not rounded."""
     table = decode_table(known.scene.camera.transfer).astype(np.float64)
     rows, columns = (side // BLOCK for side in radiance.shape[:2])
-    cut = np.clip(radiance[: rows * BLOCK, : columns * BLOCK].astype(np.float64), 0.0, None)
+    cut = np.clip(radiance[: rows * BLOCK, : columns * BLOCK].astype(np.float64), 0.0, 1.0)
     mean = cut.reshape(rows, BLOCK, columns, BLOCK, 3).mean(axis=(1, 3))
     return np.stack([np.interp(mean[..., c], table[:, c], np.arange(256.0)) for c in range(3)], axis=-1)
 
