@@ -109,7 +109,7 @@ def digest(run):
     return {path.relative_to(run).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished):
+def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished, capsys):
     run, code, out, err = finished
     assert code == 1, err
     assert "1 jobs failed:" in out
@@ -122,8 +122,13 @@ def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished):
     assert list((run / "parts").iterdir()) == [], "what was joined is not kept twice"
     status = read_status(run)
     assert status["done"] == {"survey": 1, "segment": 4, "join": 1}
-    assert not status["running"] or status["progress"]["jobs_open"] == 0
+    assert not status["running"]
+    capsys.readouterr()
     assert main(["status", str(run)]) == 0
+    told = capsys.readouterr().out
+    assert "12 frames lit" in told
+    assert "failed: cut/survey: " in told
+    assert "no driver is at work; nothing that is known is open" in told
     # Nothing is left to do, and what failed is still said.
     before = (run / "manifest.jsonl").read_text()
     assert main(["resume", str(run), "--workers", "1"]) == 1

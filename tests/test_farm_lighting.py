@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 
 import cv2
 import numpy as np
@@ -12,11 +13,11 @@ from tests.farm_rig import make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.farm.jobs import Job
-from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.lighting import PIPELINES, Lighter
 from warp_ar.farm.records import Context
-from warp_ar.farm.survey import Survey
+from warp_ar.farm.survey import Survey, lit_scene
 from warp_ar.farm.work import Work
-from warp_ar.scene import Animation, dumps_scene, load_scene
+from warp_ar.scene import Animation, Object, dumps_scene, load_scene
 from warp_ar.session import Session
 
 COUNT = 10
@@ -92,6 +93,19 @@ def test_a_preroll_over_all_frames_is_the_live_run(folder):
     with Lighter(jobs, run, "cpu") as lighter:
         for number, image in enumerate(lit(lighter, 6, COUNT), 6):
             np.testing.assert_array_equal(image, live[number])
+
+
+def test_pipelines_of_scenes_that_have_gone_are_let_go(folder):
+    jobs, run = surveyed(folder, light="fixed")
+    kept = []
+    with Lighter(jobs, run, "cpu") as lighter:
+        base = lit_scene(jobs, 0, lighter.survey(0))
+        for count in range(1, PIPELINES + 3):
+            balls = tuple(Object("sphere", radius=0.02, at=(0.05 * n - 0.2, -0.1, 0.02)) for n in range(count))
+            scene = dataclasses.replace(base, objects=balls, lights=())
+            kept.append(weakref.ref(list(lighter.light(Job("variation", 0, count, 0, 2), scene))[-1].pipeline))
+            assert kept[-1]() is not None
+        assert [ref() is not None for ref in kept] == [False] * 2 + [True] * PIPELINES
 
 
 def test_a_clip_without_a_marker_fails_with_its_reason(folder):

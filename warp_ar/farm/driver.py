@@ -183,7 +183,7 @@ class Driver:
                 self._index()
         finally:
             self._pool.close()
-            self._write_progress()
+            self._write_progress(ended=True)
         self.summary.failed = dict(self._manifest.failed)
         self.summary.done = len(self._manifest.done)
         return self.summary
@@ -301,7 +301,7 @@ class Driver:
             self._finished_now += 1
             self._settle(job.clip, failed=False)
 
-    def _write_progress(self) -> None:
+    def _write_progress(self, *, ended: bool = False) -> None:
         """Leave word of where things stand for ``farm status``; a disk that is full loses it, no more."""
         now = time.monotonic()
         workers = []
@@ -314,6 +314,7 @@ class Driver:
         told = {
             "program": "warp_ar",
             "time": time.time(),
+            "ended": ended,
             "workers": workers,
             "clips": len(self._jobs.clips),
             "clips_surveyed": len(self._open),

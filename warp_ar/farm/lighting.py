@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import gc
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -161,6 +162,7 @@ class Lighter:
         self._pipelines[key] = pipeline
         while len(self._pipelines) > PIPELINES:
             self._pipelines.popitem(last=False)[1].close()
+            gc.collect()  # its arrays are part of cycles, and large
         return pipeline
 
     def _light_alone(self, job: Job, survey: Survey, outputs: tuple[str, ...]) -> Iterator[Lit]:

@@ -44,7 +44,9 @@ def read_status(folder: Path) -> dict[str, Any]:
         "bytes": sum(int(record.get("bytes") or 0) for record in manifest.done.values()),
         "failed": manifest.failed,
         "progress": progress,
-        "running": bool(progress) and time.time() - float(progress.get("time", 0)) < STALE_SECONDS,
+        "running": bool(progress)
+        and not progress.get("ended")
+        and time.time() - float(progress.get("time", 0)) < STALE_SECONDS,
     }
 
 
@@ -60,10 +62,9 @@ def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
         lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / 'manifest.jsonl'}")
     progress = status["progress"]
     if not status["running"]:
-        return [
-            *lines,
-            f"no driver is at work; go on with: farm resume {folder}" if progress else "no driver has begun",
-        ]
+        nothing = progress.get("ended") and not progress["jobs_open"]
+        hint = "nothing that is known is open" if nothing else f"go on with: farm resume {folder}"
+        return [printable(line) for line in (*lines, f"no driver is at work; {hint}")]
     lines.append(
         f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed"
     )

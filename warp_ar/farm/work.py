@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import shutil
 import time
 import traceback
@@ -71,6 +72,9 @@ class Work:
             _note(log, f"failed: {told}", "" if known else traceback.format_exc())
             full = is_no_space(error) or _free_bytes(context.folder) < LEAST_FREE
             return Outcome("full" if full else "failed", reason=told)
+        finally:
+            if job.kind == "survey" or context.jobs.settings.light == "preroll":
+                gc.collect()  # a pipeline of its own has gone, whose arrays are large and part of cycles
         seconds = time.perf_counter() - start
         frames = int(values.get("frames", 0))
         _note(log, f"done: {frames} frames in {seconds:.2f} s by worker {context.worker} on {context.device}")
