@@ -31,6 +31,7 @@ from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
+from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.finite import check_finite
@@ -152,6 +153,7 @@ class Pipeline:
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._own_markers = OwnMarkers(self.scene, self.camera)
         self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -261,20 +263,22 @@ class Pipeline:
         self._shown = other._shown
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
+        if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):
+            self._own_markers = other._own_markers
         with exclusive(self.device):
             self._light.take_over(other._light)
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
-    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
-        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+    def restart(self, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
         Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
-        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not. So
+        are the poses, where the next frame is not the clip's first.
 
         Args:
-            first: Number of the next frame in its clip.
             saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
                 all frames to come.
 
@@ -285,7 +289,7 @@ class Pipeline:
         self._finish()
         if self.plan.features.observed:
             raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
-        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._begun, self._start_time, self._last_time = 0, 0.0, 0.0
         self._lit_time = math.inf  # no frame came before
         self._shown = None
         if self._tracker is not None:
@@ -460,15 +464,29 @@ class Pipeline:
         timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
         return track.pose, track.state
 
+    def _find_own_markers(self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]) -> Places:
+        """Find the markers that something rides on."""
+        if not self._own_markers:
+            return {}
+        if isinstance(image, wp.array):
+            with exclusive(self.device):
+                image = image.numpy()
+        start = time.perf_counter()
+        places = self._own_markers.track(cast(Image, image), now, pose)
+        before = timings[TRACK].milliseconds if TRACK in timings else 0.0
+        timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
+        return places
+
     def _look(self, image: Any, now: float, pose: Pose | None) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, pose, timings)
         lost = self._tracker is not None and pose is None
+        places = self._find_own_markers(image, now, pose, timings)
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""
