@@ -157,7 +157,9 @@ class Pipeline:
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
-            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
+            # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+            follows = self.quality.method("recover") != "clipped" and not exposures
+            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
             self._scheduler = Scheduler(
                 self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
             )
@@ -254,6 +256,7 @@ class Pipeline:
             self._tracker = other._tracker
         with exclusive(self.device):
             self._light.take_over(other._light)
+            self.inputs.continue_from(other.inputs)
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
@@ -406,6 +409,10 @@ class Pipeline:
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._light.known = False
+                ratio, is_bent = self.inputs.look(frame)
+                self._light.known &= not is_bent
+                if ratio is not None:
+                    self._light.scale(ratio)
                 self.inputs.write(frame, reset=not self._light.known)
                 timings = {**timings, **self._scheduler.run()}
             self._light.known = True

@@ -248,6 +248,7 @@ class HostScene:
         self._shaded: Outline | None = None
         self._balls = ball_outline(scene)
         self._lights_edited = False
+        self._gain = np.ones(3)
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_lights(np.zeros_like(self._lights), 0.0)
 
@@ -358,6 +359,10 @@ class HostScene:
                 record["rotation"], record["position"] = rotation, position + rotation @ center
         return _update(records_out, self._objects)
 
+    def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
+        """Have lights shine in the camera values of a camera whose gain is another one now, RGB; 1 at first."""
+        self._gain, self._lights_edited = gain, True
+
     def write_lights(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
         """Write the virtual lights as they stand ``seconds`` after the first frame; arguments as ``write_objects``."""
         for record, light in zip(self._lights, self.scene.lights, strict=True):
@@ -366,7 +371,7 @@ class HostScene:
             self._lit = None
             record["position"], record["direction"] = light.pose_at(seconds)
             record["kind"] = light_kind(light)
-            record["intensity"] = light.intensity * np.array(light.color)
+            record["intensity"] = light.intensity * np.array(light.color) * self._gain
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius
         self._lights_edited = False
