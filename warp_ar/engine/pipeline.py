@@ -32,6 +32,7 @@ from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.tracking import Tracker, TrackState
+from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
@@ -147,6 +148,7 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
+        emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None

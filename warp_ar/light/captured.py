@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 from warp_ar.errors import SceneError, SinkError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
+from warp_ar.light.axes import DESCRIPTIONS, from_axes
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-AXES = "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y"
+AXES = DESCRIPTIONS["z-up"]
 REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of red, green, blue and white that sRGB's primaries have."""
 BRIGHT = 6.0
@@ -105,6 +106,9 @@ class Light:
     def load(cls, path: str | Path) -> Light:
         """Read a captured light, or any latlong OpenEXR with channels R, G and B.
 
+        A file in other axes of `warp_ar.light.axes` is turned to this program's; one that does not say its axes is
+        taken to have them.
+
         Raises:
             SceneError: The file cannot be used.
         """
@@ -126,10 +130,18 @@ class Light:
         if confidence.shape != (height, width):
             size = "x".join(map(str, confidence.shape[::-1]))
             raise SceneError(f"{path}: its channel confidence is {size}; expected {width}x{height}, as the light is")
+        confidence = np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32)
+        axes, emitters = _axes(path, header), _parse_emitters(path, header.get("emitters", "[]"))
+        if axes != "z-up":
+            if emitters:
+                raise SceneError(f"{path}: its emitters are told in axes {header['axes']!r}; expected {AXES!r}")
+            if width % 4:
+                raise SceneError(f"{path} is {width}x{height}: a latlong in axes {axes} has a width divisible by 4")
+            radiance, confidence = from_axes(radiance, axes), from_axes(confidence, axes)
         return cls(
             radiance,
-            np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32),
-            _parse_emitters(path, header.get("emitters", "[]")),
+            confidence,
+            emitters,
             _attribute(path, header, "whiteLevel", 1.0),
             _attribute(path, header, "exposure", 0.0) or None,
             _attribute(path, header, "lowerBound", 0.0),
@@ -251,6 +263,53 @@ def _attribute(path: Path, header: dict[str, Any], name: str, default: float) ->
     if not 0.0 <= number < math.inf:
         raise SceneError(f"{path}: its attribute {name} is {str(value)[:40]!r}; expected a finite number, 0 or more")
     return number
+
+
+def _axes(path: Path, header: dict[str, Any]) -> str:
+    """Name of the axes that a file says it is in.
+
+    Raises:
+        SceneError: It says others than these.
+    """
+    said = str(header.get("axes", AXES))
+    for name, text in DESCRIPTIONS.items():
+        if said == text:
+            return name
+    known = "; ".join(DESCRIPTIONS.values())
+    raise SceneError(f"{path}: its attribute axes is {said[:80]!r}; expected one of: {known}; or no such attribute")
+
+
+def has_places(path: str | Path) -> bool:
+    """Whether a captured light says how far away an emitter is; False where the file cannot be read."""
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            header = dict(file.header())
+        return any(
+            emitter.distance is not None for emitter in _parse_emitters(Path(path), header.get("emitters", "[]"))
+        )
+    except (RuntimeError, OSError, ValueError, SceneError):
+        return False  # reading the light says why
+
+
+def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
+    """Fields of ``kernels.structs.Emitter`` for the emitters that stand at a known distance.
+
+    Args:
+        light: As it was read.
+        scale: Factor to the values of the frames' camera.
+        rotation: From the light's axes to the scene's, (3, 3).
+        most: How many at most, the most powerful ones.
+    """
+    return [
+        {
+            "origin": rotation @ np.array(emitter.origin),
+            "direction": rotation @ np.array(emitter.direction),
+            "distance": emitter.distance,
+            "power": scale * np.array(emitter.power),
+        }
+        for emitter in light.emitters
+        if emitter.distance is not None
+    ][:most]
 
 
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
