@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 
 from warp_ar import environment
-from warp_ar.light.axes import to_axes
+from warp_ar.output.environment_axes import to_axes
 from warp_ar.output.environment_file import EnvironmentInfo, read_environment_info, write_environment
 
 

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.light.axes import AXES, from_axes, to_axes
-from warp_ar.output.environment_axes import CUBES, cube_directions, sample_latlong, to_cube, world_from_marker
+from warp_ar.output.environment_axes import (
+    AXES,
+    CUBES,
+    cube_directions,
+    from_axes,
+    sample_latlong,
+    to_axes,
+    to_cube,
+    world_from_marker,
+)
 
 HEIGHT = 32
 EXACT = 1e-5  # float32 of the map

@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from warp_ar.light.axes import AXES
-from warp_ar.output.environment_axes import world_from_marker
+from warp_ar.output.environment_axes import AXES, world_from_marker
 from warp_ar.output.environment_harmonics import basis, encode_harmonics, project_radiance
 
 ROUNDING = 1e-6  # float32 of the map; sums are in double precision

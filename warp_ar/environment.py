@@ -11,8 +11,7 @@ from pathlib import Path
 
 from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import UsageError
-from warp_ar.light.axes import AXES
-from warp_ar.output.environment_axes import LAYOUTS
+from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
     ENVIRONMENT_SUFFIXES,
     read_environment,

@@ -235,7 +235,7 @@ def _still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bo
     margin = 0.3 * float((high - low).max())
     found, steps = [cells[white], cells[~white]], np.linspace(-0.45, 0.45, GRID)
     for proxy in scene.proxies:
-        if proxy.shape != "plane":
+        if proxy.shape != "plane" or proxy.marker is not None:
             continue
         local = np.stack(np.meshgrid(*(steps * side for side in proxy.size)), -1).reshape(-1, 2)
         points = np.array(proxy.at) + np.column_stack([local, np.zeros(len(local))]) @ rotation_matrix(proxy.rotate).T

@@ -13,7 +13,7 @@ import dataclasses
 import json
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,10 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
-from warp_ar.light.axes import DESCRIPTIONS, from_axes
+from warp_ar.light.latlong_axes import DESCRIPTIONS, from_axes, world_from_marker
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -106,8 +106,8 @@ class Light:
     def load(cls, path: str | Path) -> Light:
         """Read a captured light, or any latlong OpenEXR with channels R, G and B.
 
-        A file in other axes of `warp_ar.light.axes` is turned to this program's; one that does not say its axes is
-        taken to have them.
+        A map in the axes of another program that this one knows is turned; one that does not say its axes is taken to
+        have those of a scene.
 
         Raises:
             SceneError: The file cannot be used.
@@ -124,6 +124,7 @@ class Light:
         height, width = radiance.shape[:2]
         if width != 2 * height or height < 2:
             raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
+        axes = _axes_of(path, header)
         # Maps in the wild hold negative pixels, infinities and NaN.
         radiance = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6, neginf=0.0), 0.0, 1e6)
         confidence = channels.get("confidence", np.ones((height, width), np.float32))
@@ -131,13 +132,13 @@ class Light:
             size = "x".join(map(str, confidence.shape[::-1]))
             raise SceneError(f"{path}: its channel confidence is {size}; expected {width}x{height}, as the light is")
         confidence = np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32)
-        axes, emitters = _axes(path, header), _parse_emitters(path, header.get("emitters", "[]"))
+        emitters = _parse_emitters(path, header.get("emitters", "[]"))
         if axes != "z-up":
-            if emitters:
-                raise SceneError(f"{path}: its emitters are told in axes {header['axes']!r}; expected {AXES!r}")
-            if width % 4:
-                raise SceneError(f"{path} is {width}x{height}: a latlong in axes {axes} has a width divisible by 4")
-            radiance, confidence = from_axes(radiance, axes), from_axes(confidence, axes)
+            try:
+                radiance, confidence = (from_axes(channel, axes) for channel in (radiance, confidence))
+            except UsageError as error:
+                raise SceneError(f"{path}: {error}") from error
+            emitters = tuple(_turned(emitter, world_from_marker(axes).T) for emitter in emitters)
         return cls(
             radiance,
             confidence,
@@ -265,51 +266,21 @@ def _attribute(path: Path, header: dict[str, Any], name: str, default: float) ->
     return number
 
 
-def _axes(path: Path, header: dict[str, Any]) -> str:
-    """Name of the axes that a file says it is in.
-
-    Raises:
-        SceneError: It says others than these.
-    """
-    said = str(header.get("axes", AXES))
-    for name, text in DESCRIPTIONS.items():
-        if said == text:
-            return name
-    known = "; ".join(DESCRIPTIONS.values())
-    raise SceneError(f"{path}: its attribute axes is {said[:80]!r}; expected one of: {known}; or no such attribute")
+def _axes_of(path: Path, header: Mapping[str, Any]) -> str:
+    """Name of the axes that a file says it has; the scene's own where it says nothing."""
+    said = header.get("axes")
+    if said is None:
+        return "z-up"
+    known = {text: name for name, text in DESCRIPTIONS.items()}
+    if str(said) not in known:
+        listed = "; ".join(known)
+        raise SceneError(f"{path}: its attribute axes is {str(said)[:120]!r}; expected one of: {listed}")
+    return known[str(said)]
 
 
-def has_places(path: str | Path) -> bool:
-    """Whether a captured light says how far away an emitter is; False where the file cannot be read."""
-    try:
-        with OpenEXR.File(str(path), header_only=True) as file:
-            header = dict(file.header())
-        return any(
-            emitter.distance is not None for emitter in _parse_emitters(Path(path), header.get("emitters", "[]"))
-        )
-    except (RuntimeError, OSError, ValueError, SceneError):
-        return False  # reading the light says why
-
-
-def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
-    """Fields of ``kernels.structs.Emitter`` for the emitters that stand at a known distance.
-
-    Args:
-        light: As it was read.
-        scale: Factor to the values of the frames' camera.
-        rotation: From the light's axes to the scene's, (3, 3).
-        most: How many at most, the most powerful ones.
-    """
-    return [
-        {
-            "origin": rotation @ np.array(emitter.origin),
-            "direction": rotation @ np.array(emitter.direction),
-            "distance": emitter.distance,
-            "power": scale * np.array(emitter.power),
-        }
-        for emitter in light.emitters
-        if emitter.distance is not None
-    ][:most]
+def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
+    direction, origin = (_triple(rotation @ np.array(value)) for value in (emitter.direction, emitter.origin))
+    return dataclasses.replace(emitter, direction=direction, origin=origin)
 
 
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:

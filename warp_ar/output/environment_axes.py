@@ -1,8 +1,18 @@
 """Environments in the axes and layouts of other programs.
 
-Latlong maps are those of `warp_ar.light.axes`; cubes and worlds are told here. ``y-up`` is what OpenEXR means by a
-latlong and a cube, and USD's dome light takes it. ``blender`` is what Blender's world takes; three.js, whose world is
-that of ``y-up``, shows the same picture in the right place.
+A latlong map of this program (``z-up``) has row 0 toward +z and its centre column toward +x, and its columns grow
+toward +y: seen from the ball's place it is a mirror image. Every other latlong here is a picture as it is seen from
+the inside, with the columns growing to the right of who looks at the centre:
+
+    name      world                            centre column   columns grow toward
+    z-up      z up, of the marker              +x              +y
+    blender   the same                         +x              -y
+    y-up      y up, (x, z, -y) of the marker   +z              -x
+    opengl    the same                         -z              +x
+
+``y-up`` is what OpenEXR means by a latlong and a cube, and USD's dome light takes it. ``blender`` is what Blender's
+world takes; three.js, whose world is that of ``y-up``, shows the same picture in the right place. All four have +z of
+the marker above, so the maps differ by a mirror image and a turn by quarters: texels change places, none is filtered.
 
 References:
     OpenEXR, Technical Introduction, Environment Maps, and ``ImfEnvmap``.
@@ -17,7 +27,19 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.light.axes import AXES
+from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, from_axes, to_axes, world_from_marker
+
+__all__ = [
+    "AXES",
+    "CUBES",
+    "DESCRIPTIONS",
+    "LAYOUTS",
+    "check_axes",
+    "from_axes",
+    "to_axes",
+    "to_cube",
+    "world_from_marker",
+]
 
 Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
@@ -30,8 +52,6 @@ CUBES = {
 }
 """What a cube's attribute ``axes`` says."""
 
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-
 # Along a row, down a column, for +x, -x, +y, -y, +z, -z.
 _X, _Y, _Z = np.eye(3)
 _FACES = (_X, -_X, _Y, -_Y, _Z, -_Z)
@@ -39,16 +59,6 @@ _SPANS = {
     "y-up": ((_Z, -_Y), (-_Z, -_Y), (_X, -_Z), (_X, _Z), (-_X, -_Y), (_X, -_Y)),
     "opengl": ((-_Z, -_Y), (_Z, -_Y), (_X, _Z), (_X, -_Z), (_X, -_Y), (-_X, -_Y)),
 }
-
-
-def world_from_marker(axes: str) -> Array:
-    """Rotation from the marker's axes to those of a file's world, (3, 3).
-
-    Raises:
-        UsageError: There are no axes of this name.
-    """
-    check_axes(axes)
-    return _Y_UP.copy() if axes in _SPANS else np.eye(3)
 
 
 def check_axes(axes: str, layout: str = "latlong") -> None:

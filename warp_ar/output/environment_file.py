@@ -25,9 +25,8 @@ import OpenEXR
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, too_much, write_whole
-from warp_ar.light.axes import DESCRIPTIONS, from_axes, to_axes
 from warp_ar.light.captured import REC_709
-from warp_ar.output.environment_axes import CUBES, check_axes, to_cube
+from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.places import check_replaceable
 from warp_ar.output.radiance_hdr import encode_hdr

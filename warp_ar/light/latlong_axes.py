@@ -1,17 +1,6 @@
-"""Latlong maps in the axes of other programs.
+"""Latlong maps in the axes of other programs: what files call them, and texels moved from one to another.
 
-A latlong map of this program (``z-up``) has row 0 toward +z and its centre column toward +x, and its columns grow
-toward +y: seen from the ball's place it is a mirror image. Every other latlong here is a picture as it is seen from
-the inside, with the columns growing to the right of who looks at the centre:
-
-    name      world                            centre column   columns grow toward
-    z-up      z up, of the marker              +x              +y
-    blender   the same                         +x              -y
-    y-up      y up, (x, z, -y) of the marker   +z              -x
-    opengl    the same                         -z              +x
-
-All four have +z of the marker above, so the maps differ by a mirror image and a turn by quarters: texels change places,
-none is filtered.
+``output.environment_axes`` has the table of all axes, and cubes.
 """
 
 from __future__ import annotations
@@ -21,7 +10,8 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError
 
-Map = npt.NDArray[np.float32]
+Radiance = npt.NDArray[np.float32]
+Array = npt.NDArray[np.float64]
 
 AXES = ("z-up", "blender", "y-up", "opengl")
 """What a file's directions are told in; ``z-up`` is this program's own."""
@@ -34,12 +24,29 @@ DESCRIPTIONS = {
 }
 """What a latlong's attribute ``axes`` says."""
 
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
-def to_axes(radiance: Map, axes: str) -> Map:
+
+def world_from_marker(axes: str) -> Array:
+    """Rotation from the marker's axes to those of a file's world, (3, 3).
+
+    Raises:
+        UsageError: There are no axes of this name.
+    """
+    _check(axes)
+    return _Y_UP.copy() if axes in ("y-up", "opengl") else np.eye(3)
+
+
+def _check(axes: str) -> None:
+    if axes not in AXES:
+        raise UsageError(f"axes {axes!r}: expected {', '.join(AXES)} for a latlong")
+
+
+def to_axes(radiance: Radiance, axes: str) -> Radiance:
     """A latlong of this program in other axes, texel by texel.
 
     Args:
-        radiance: (height, width, 3) or (height, width), z-up.
+        radiance: (height, width, 3), z-up.
         axes: One of ``AXES``.
 
     Returns:
@@ -55,7 +62,7 @@ def to_axes(radiance: Map, axes: str) -> Map:
     return np.ascontiguousarray(np.roll(mirrored, _quarter(mirrored, axes), 1))
 
 
-def from_axes(radiance: Map, axes: str) -> Map:
+def from_axes(radiance: Radiance, axes: str) -> Radiance:
     """A latlong in other axes as this program's own; arguments and errors as `to_axes`."""
     _check(axes)
     if axes == "z-up":
@@ -63,12 +70,7 @@ def from_axes(radiance: Map, axes: str) -> Map:
     return np.ascontiguousarray(np.roll(radiance, -_quarter(radiance, axes), 1)[:, ::-1])
 
 
-def _check(axes: str) -> None:
-    if axes not in AXES:
-        raise UsageError(f"axes {axes!r}: expected {', '.join(AXES)} for a latlong")
-
-
-def _quarter(radiance: Map, axes: str) -> int:
+def _quarter(radiance: Radiance, axes: str) -> int:
     """Columns by which a map that is centred on +x must go right to be centred as ``axes`` say.
 
     ``y-up`` is centred on -y of the marker, which the map holds a quarter right of +x; ``opengl`` on +y.
