@@ -11,7 +11,6 @@ from tests.error_model import check_error
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError
-from warp_ar.light.axes import DESCRIPTIONS, to_axes
 from warp_ar.light.captured import (
     REC_709,
     CapturedEmitter,

@@ -149,6 +149,17 @@ class FrameInputs:
             self._write_decode()
             self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
 
+    def forget_drift(self) -> None:
+        """Take the next frame for the camera's first."""
+        if self._drift is None:
+            return
+        is_bent = self._drift.contrast != 0.0
+        self._drift = ExposureDrift(self.host_scene.scene, self._camera)
+        self.host_scene.set_gain(self._drift.gain)
+        if is_bent:
+            self._write_decode()
+            self._arrays["encode"].assign(encode_table(self._camera.transfer))
+
     def _write_decode(self) -> None:
         """Decode by what frames have told of the camera so far."""
         contrast = 0.0 if self._drift is None else self._drift.contrast
@@ -206,7 +217,7 @@ class FrameInputs:
         """Take codes at which channels saturate, (3,), as known: frames are no longer asked."""
         self.saturation.levels = np.asarray(levels)
         self._saturation_is_known = True
-        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels))
+        self._write_decode()
 
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""

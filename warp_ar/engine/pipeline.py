@@ -113,6 +113,7 @@ class Pipeline:
         profile: bool = False,
         synchronous: bool = False,
         emitters: bool = False,
+        follows_camera: bool = True,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -132,6 +133,8 @@ class Pipeline:
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
             emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
+            follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
+                from frames one after another. Parts of a clip that are lit by themselves need it off.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -170,7 +173,7 @@ class Pipeline:
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
             # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
-            follows = self.quality.method("recover") != "clipped" and not exposures
+            follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
             self._scheduler = Scheduler(
                 self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
@@ -276,14 +279,14 @@ class Pipeline:
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
-    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
-        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+    def restart(self, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
         Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
-        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not. So
+        are the poses, where the next frame is not the clip's first.
 
         Args:
-            first: Number of the next frame in its clip.
             saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
                 all frames to come.
 
@@ -294,11 +297,12 @@ class Pipeline:
         self._finish()
         if self.plan.features.observed:
             raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
-        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._begun, self._start_time, self._last_time = 0, 0.0, 0.0
         self._lit_time = math.inf  # no frame came before
         self._shown = None
         if self._tracker is not None:
             self._tracker.reset()
+        self.inputs.forget_drift()
         if saturation is not None:
             self.inputs.fix_saturation(saturation)
         self._scheduler.restart()
