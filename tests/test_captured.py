@@ -242,27 +242,6 @@ def test_virtual_lights_stand_beside_a_captured_one(tmp_path):
         loads_scene(text + '[[light]]\nfile = "light.exr"\n', tmp_path / "scene.toml")
 
 
-@pytest.mark.parametrize("axes", ["blender", "y-up", "opengl"])
-def test_a_light_in_other_axes_is_turned(tmp_path, axes):
-    """Texels change places: the light is the one that was written, to the bit."""
-    radiance = np.random.default_rng(3).random((16, 32, 3), np.float32)
-    path = tmp_path / "other.exr"
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "axes": DESCRIPTIONS[axes]}
-    channels = {"RGB": to_axes(radiance, axes), "confidence": to_axes(np.ascontiguousarray(radiance[..., 0]), axes)}
-    OpenEXR.File(header, channels).write(str(path))
-    light = Light.load(path)
-    assert np.array_equal(light.radiance, radiance)
-    assert np.array_equal(light.confidence, radiance[..., 0])
-
-
-def test_axes_that_nobody_knows_are_refused(tmp_path):
-    path = tmp_path / "odd.exr"
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "axes": "angular map"}
-    OpenEXR.File(header, {"RGB": np.ones((8, 16, 3), np.float32)}).write(str(path))
-    with pytest.raises(SceneError, match="attribute axes is 'angular map'; expected one of: latlong, row 0 toward"):
-        Light.load(path)
-
-
 def test_an_emitter_whose_place_is_known_keeps_it(tmp_path, device):
     """Elsewhere than where the light was captured it stands in another direction, and is nearer."""
     radiance = np.full((32, 64, 3), 0.05, np.float32)
