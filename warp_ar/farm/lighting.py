@@ -156,6 +156,7 @@ class Lighter:
                 size=size,
                 outputs=outputs,
                 synchronous=True,
+                follows_camera=False,
                 emitters=follows,
             )
         self._pipelines[key] = pipeline
@@ -177,6 +178,7 @@ class Lighter:
                 size=source.size,
                 outputs=outputs,
                 synchronous=True,
+                follows_camera=False,
             )
             with pipeline:
                 pipeline.start_clock(0.0)
