@@ -33,6 +33,7 @@ from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
+from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.finite import check_finite
 from warp_ar.scene.ray_scene import skeleton
@@ -112,6 +113,7 @@ class Pipeline:
         profile: bool = False,
         synchronous: bool = False,
         emitters: bool = False,
+        follows_camera: bool = True,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -131,6 +133,8 @@ class Pipeline:
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
             emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
+            follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
+                from frames one after another. Parts of a clip that are lit by themselves need it off.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -150,6 +154,7 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
+        emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
@@ -167,7 +172,9 @@ class Pipeline:
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
-            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
+            # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+            follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
+            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
             self._scheduler = Scheduler(
                 self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
             )
@@ -267,6 +274,7 @@ class Pipeline:
             self._own_markers = other._own_markers
         with exclusive(self.device):
             self._light.take_over(other._light)
+            self.inputs.continue_from(other.inputs)
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
@@ -294,6 +302,7 @@ class Pipeline:
         self._shown = None
         if self._tracker is not None:
             self._tracker.reset()
+        self.inputs.forget_drift()
         if saturation is not None:
             self.inputs.fix_saturation(saturation)
         self._scheduler.restart()
@@ -497,6 +506,10 @@ class Pipeline:
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._light.known = False
+                ratio, is_bent = self.inputs.look(frame)
+                self._light.known &= not is_bent
+                if ratio is not None:
+                    self._light.scale(ratio)
                 self.inputs.write(frame, reset=not self._light.known)
                 timings = {**timings, **self._scheduler.run()}
             self._light.known = True

@@ -157,6 +157,7 @@ class Lighter:
                 size=size,
                 outputs=outputs,
                 synchronous=True,
+                follows_camera=False,
                 emitters=follows,
             )
         self._pipelines[key] = pipeline
@@ -179,6 +180,7 @@ class Lighter:
                 size=source.size,
                 outputs=outputs,
                 synchronous=True,
+                follows_camera=False,
             )
             with pipeline:
                 pipeline.start_clock(0.0)

@@ -210,6 +210,7 @@ class HostScene:
         self._shaded: Outline | None = None
         self._balls = ball_outline(scene)
         self._lights_edited = False
+        self._gain = np.ones(3)
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_proxies(np.zeros_like(self._proxies))
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -374,6 +375,10 @@ class HostScene:
                 _place(record, item, rotation, position + rotation @ center, places)
         return _update(records_out, self._objects)
 
+    def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
+        """Have lights shine in the camera values of a camera whose gain is another one now, RGB; 1 at first."""
+        self._gain, self._lights_edited = gain, True
+
     def write_proxies(
         self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
@@ -401,7 +406,7 @@ class HostScene:
             record["position"], record["direction"] = position, direction
             record["kind"] = light_kind(light)
             lost = light.marker is not None and place is None
-            record["intensity"] = 0.0 if lost else light.intensity * np.array(light.color)
+            record["intensity"] = 0.0 if lost else light.intensity * np.array(light.color) * self._gain
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius
         self._lights_edited = False
