@@ -8,7 +8,7 @@ import signal
 import pytest
 
 from warp_ar.errors import UsageError
-from warp_ar.farm.pool import Teller, cores_of, devices_of, is_from_outside, words_of_exit
+from warp_ar.farm.pool import Teller, cores_of, devices_of, is_from_outside, keeping_to, words_of_exit
 from warp_ar.farm.ray_pool import _knock
 
 
@@ -25,6 +25,16 @@ from warp_ar.farm.ray_pool import _knock
 def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
     assert cores_of(workers) == expected
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="needs cores to keep to")
+def test_cores_are_kept_to_for_a_while():
+    before = os.sched_getaffinity(0)
+    with keeping_to([min(before)]):
+        assert os.sched_getaffinity(0) == {min(before)}
+    assert os.sched_getaffinity(0) == before
+    with keeping_to([]):
+        assert os.sched_getaffinity(0) == before
 
 
 def test_workers_on_cpu_are_as_many_as_asked_or_one_per_four_cores(monkeypatch):

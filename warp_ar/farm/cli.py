@@ -143,11 +143,15 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
 def plan(options: argparse.Namespace) -> int:
     """``farm plan``."""
     from warp_ar.farm.plan import make_plan
-    from warp_ar.farm.pool import devices_of
+    from warp_ar.farm.pool import cores_of, devices_of, keeping_to
 
     jobs = parse_jobs(read_jobs(options.jobs), str(options.jobs))
     devices = devices_of(options.device, options.workers)
-    found = make_plan(jobs, devices[0], say)
+    cores = cores_of(len(devices))
+    with keeping_to(cores[0]):  # as a worker has them
+        found = make_plan(jobs, devices[0], say)
+    # Workers that share a core are no faster than one that has it.
+    at_once = len({core for own in cores for core in own} or devices) if devices[0] == "cpu" else len(devices)
     for problem in found.problems:
         say(problem)
     kind = "segments" if jobs.dataset is None else "variations"
@@ -157,7 +161,7 @@ def plan(options: argparse.Namespace) -> int:
         f"{found.job_ms:.0f} ms beside its frames, at quality {jobs.settings.quality} on {devices[0]}"
     )
     for count in sorted({1, len(devices)}):
-        print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(count))}")
+        print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(min(count, at_once)))}")
     print(f"output: {found.bytes / 1e6:.1f} MB")
     return EXIT_FAILED if found.problems else EXIT_DONE
 

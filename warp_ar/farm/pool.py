@@ -92,6 +92,20 @@ def cores_of(workers: int) -> list[list[int]]:
     return [cores[a:b] for a, b in itertools.pairwise(ends)]
 
 
+@contextlib.contextmanager
+def keeping_to(cores: Sequence[int]) -> Iterator[None]:
+    """Have threads that are started within keep to some cores; without any, to all."""
+    if not cores or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
 class ProcessPool:
     """Workers as processes, started anew where they die."""
 
