@@ -29,8 +29,8 @@ from warp_ar.output.environment_axes import AXES, to_cube
 from warp_ar.output.environment_harmonics import basis
 from warp_ar.scene import Pose
 from warp_ar.viewer import shared_light
-from warp_ar.viewer.light_record import FACES, LightState, describe, key_light
-from warp_ar.viewer.shared_light import MOST_LISTENERS, check_origin
+from warp_ar.viewer.light_record import LightState, describe, key_light
+from warp_ar.viewer.shared_light import FACES, MOST_LISTENERS, check_origin
 
 ROOT = Path(__file__).resolve().parents[1]
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -18,9 +18,8 @@ from warp_ar.output.radiance_hdr import encode_hdr
 from warp_ar.scene import Pose
 from warp_ar.signature import PROGRAM
 from warp_ar.viewer.calibration import written
+from warp_ar.viewer.shared_light import FACES
 
-FACES: Final = ("px", "nx", "py", "ny", "pz", "nz")
-"""Of a cube, as three.js and others name their files."""
 _DEGREES: Final = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 
 

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 AXES: Final = ("y-up", "z-up", "blender", "opengl")
 LAYOUTS: Final = ("latlong", "cube")
 
+FACES: Final = ("px", "nx", "py", "ny", "pz", "nz")
+"""Of a cube, as three.js and others name their files."""
+
 WATCH_SECONDS: Final = 5.0
 """How long a request keeps frames going."""
 PUSH_SECONDS: Final = 0.1
@@ -48,8 +51,9 @@ class SharedLight:
         server.app.add_routes(
             [
                 web.get("/light.json", self._json),
-                web.get("/light.{kind:exr|hdr}", self._picture),
-                web.get("/light/{face:[pn][xyz]}.hdr", self._face),
+                web.get("/light.exr", self._picture),
+                web.get("/light.hdr", self._picture),
+                *(web.get(f"/light/{face}.hdr", self._face) for face in FACES),
                 web.get("/light", self._channel),
             ]
         )
@@ -89,7 +93,7 @@ class SharedLight:
 
     async def _picture(self, request: web.Request) -> web.Response:
         layout, size = request.query.get("layout", "latlong"), _size(request)
-        axes, kind = _axes(request), request.match_info["kind"]
+        axes, kind = _axes(request), request.path.rpartition(".")[2]
         if layout not in LAYOUTS:
             raise web.HTTPBadRequest(text=f"layout = {layout!r}: expected {' or '.join(LAYOUTS)}\n")
         state = await self._state()
@@ -103,7 +107,8 @@ class SharedLight:
         state = await self._state()
         from warp_ar.viewer.light_record import encode_face
 
-        return self._answer(await self._made(encode_face, state, axes, size, request.match_info["face"]), "hdr")
+        face = request.path.rpartition("/")[2].removesuffix(".hdr")
+        return self._answer(await self._made(encode_face, state, axes, size, face), "hdr")
 
     async def _made(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """What a function makes beside the loop; what it refuses is the request's fault."""
