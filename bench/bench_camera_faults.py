@@ -1,7 +1,8 @@
 """Errors of light and picture for each fault of a simulated camera, alone and all together.
 
 Frames of ``../shared/truth`` go through the camera; so does the picture with the virtual things really there, which the
-program's is compared with. Clipped pixels of those frames stay at 1 before the sensor: the lens mixes them too dark.
+program's is compared with. Clipped pixels of those frames are taken to be ``BEYOND`` before the lens, so that a lower
+exposure leaves them clipped, as it leaves a lamp.
 ``WARP_AR_FAULT_CASES`` names the cases, ``WARP_AR_FAULTS`` the faults.
 """
 
@@ -25,10 +26,18 @@ from warp_ar.session import Session
 
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
 QUALITY = "medium"
+BEYOND = 4.0
+"""Linear value of what clips."""
 
 
 def read(path: Path) -> Any:
     return cv2.imread(str(path))[..., ::-1]
+
+
+def light_of(path: Path) -> Any:
+    """Linear values of a frame before the camera."""
+    codes = read(path)
+    return np.where(codes >= 254, BEYOND, decode_srgb(codes))
 
 
 def irradiance(radiance: Any) -> Any:
@@ -48,10 +57,10 @@ def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, fl
     names = sorted(path.name for path in (case / "camera").glob("*.png"))
     phase = np.linspace(0.0, 1.0, len(names))
     truths = sorted(path.name for path in (case / version).glob("*.png"))
-    clean = {name: decode_srgb(read(case / "camera" / name)) for name in names}
+    clean = {name: light_of(case / "camera" / name) for name in names}
     frames = expose([clean[name] for name in names], faults)
     # The same clip with the things there, so that its noise, codec and drift are the same camera's.
-    there = [decode_srgb(read(case / version / name)) if name in truths else clean[name] for name in names]
+    there = [light_of(case / version / name) if name in truths else clean[name] for name in names]
     wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
     scene = load_scene(case / f"scene_{version}.toml")
     known = (faults.distortion, 0.0, 0.0, 0.0, 0.0)

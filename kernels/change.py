@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
@@ -64,3 +66,25 @@ def measure_difference(
         rows=rows,
         device=environment.device,
     )
+
+
+@wp.kernel(enable_backward=False)
+def scale_radiance_kernel(
+    # In:
+    factor: wp.vec3,
+    # Out:
+    radiance_out: wp.array2d[wp.vec3],
+):
+    """One texel a thread."""
+    i, j = wp.tid()
+    radiance_out[i, j] = wp.cw_mul(radiance_out[i, j], factor)
+
+
+def scale_radiance(radiance_out: wp.array, factor: Sequence[float]) -> None:
+    """Multiply a map.
+
+    Args:
+        radiance_out: ``wp.vec3`` (h, w).
+        factor: RGB.
+    """
+    wp.launch(scale_radiance_kernel, radiance_out.shape, [wp.vec3(*factor)], [radiance_out], device=radiance_out.device)

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.structs import (
     BLENDED,
@@ -524,8 +524,38 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 
 
 @functools.cache
+def _make_meets(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+    """Whether a ray meets a shape of one of the given kinds."""
+    label = "_".join(map(str, (*kinds, int(detail))))
+
+    @wp.func(name=f"meets_{label}", module="unique")
+    def meets(scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        o = to_local_point(shape, origin)
+        d = to_local_vector(shape, direction)
+        if wp.static(SPHERE in kinds):
+            if shape.kind == SPHERE:
+                return intersect_sphere(shape.extent[0], o, d, t_max) < t_max
+        if wp.static(BOX in kinds):
+            if shape.kind == BOX:
+                return intersect_box(shape.extent, o, d, t_max) < t_max
+        if wp.static(PLANE in kinds):
+            if shape.kind == PLANE:
+                return intersect_plane(shape.extent, o, d, t_max) < t_max
+        if wp.static(MESH in kinds):
+            if shape.kind == MESH:
+                if wp.static(detail):
+                    if shape.holed != 0:
+                        return intersect_solid(scene, shape, o, d, t_max, False).t < t_max
+                return meets_mesh(shape, o, d, t_max)
+        return False
+
+    return meets
+
+
+@functools.cache
 def _make_any(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     """Whether a ray meets any of the shapes of the given kinds."""
+    meets = _make_meets(kinds, detail)
     label = "_".join(map(str, (*kinds, int(detail))))
 
     @wp.func(name=f"any_hit_{label}", module="unique")
@@ -534,35 +564,32 @@ def _make_any(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     ) -> wp.bool:
         if wp.static(len(kinds) > 0):
             for index in range(shapes.shape[0]):
-                shape = shapes[index]
-                o = to_local_point(shape, origin)
-                d = to_local_vector(shape, direction)
-                if wp.static(SPHERE in kinds):
-                    if shape.kind == SPHERE:
-                        if intersect_sphere(shape.extent[0], o, d, t_max) < t_max:
-                            return True
-                if wp.static(BOX in kinds):
-                    if shape.kind == BOX:
-                        if intersect_box(shape.extent, o, d, t_max) < t_max:
-                            return True
-                if wp.static(PLANE in kinds):
-                    if shape.kind == PLANE:
-                        if intersect_plane(shape.extent, o, d, t_max) < t_max:
-                            return True
-                if wp.static(MESH in kinds):
-                    if shape.kind == MESH:
-                        if wp.static(detail):
-                            if shape.holed != 0:
-                                if intersect_solid(scene, shape, o, d, t_max, False).t < t_max:
-                                    return True
-                            elif meets_mesh(shape, o, d, t_max):
-                                return True
-                        else:
-                            if meets_mesh(shape, o, d, t_max):
-                                return True
+                if meets(scene, shapes[index], origin, direction, t_max):
+                    return True
         return False
 
     return any_hit
+
+
+@functools.cache
+def _make_any_of_both(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+    """Whether a ray meets any object or proxy, both of the given kinds: one loop, for the walks in it are long code."""
+    meets = _make_meets(kinds, detail)
+
+    @wp.func(module="unique")
+    def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        objects = scene.objects.shape[0]
+        for index in range(objects + scene.proxies.shape[0]):
+            shape = Shape()  # no ternary: in a kernel it reads both arrays, beyond their ends
+            if index < objects:  # noqa: SIM108
+                shape = scene.objects[index]
+            else:
+                shape = scene.proxies[index - objects]
+            if meets(scene, shape, origin, direction, t_max):
+                return True
+        return False
+
+    return occluded
 
 
 @functools.cache
@@ -588,11 +615,15 @@ def make_trace(config: TraceConfig) -> Trace:
     def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
         return any_proxy(scene, scene.proxies, origin, direction, t_max)
 
-    @wp.func(module="unique")
-    def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        if any_object(scene, scene.objects, origin, direction, t_max):
-            return True
-        return any_proxy(scene, scene.proxies, origin, direction, t_max)
+    if config.objects == config.proxies:
+        occluded = _make_any_of_both(config.objects, config.detail)
+    else:
+
+        @wp.func(module="unique")
+        def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+            if any_object(scene, scene.objects, origin, direction, t_max):
+                return True
+            return any_proxy(scene, scene.proxies, origin, direction, t_max)
 
     return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
 
@@ -690,7 +721,7 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
     closest_visible = make_primary(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_pixels_kernel(
         row_start: wp.int32,
         # In:

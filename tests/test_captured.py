@@ -240,3 +240,27 @@ def test_virtual_lights_stand_beside_a_captured_one(tmp_path):
     assert len(scene.lights) == 1
     with pytest.raises(SceneError, match="one captured light"):
         loads_scene(text + '[[light]]\nfile = "light.exr"\n', tmp_path / "scene.toml")
+
+
+def test_an_emitter_whose_place_is_known_keeps_it(tmp_path, device):
+    """Elsewhere than where the light was captured it stands in another direction, and is nearer."""
+    radiance = np.full((32, 64, 3), 0.05, np.float32)
+    light = Light(radiance, np.ones((32, 64), np.float32))
+    area = np.broadcast_to(texel_solid_angles(32), (32, 64))
+    inside = latlong_directions(32) @ np.array([0.0, 0.6, 0.8]) > 0.97
+    power = 60.0 * float(area[inside].sum())
+    radiance[inside] += 60.0
+    emitter = CapturedEmitter((0.0, 0.6, 0.8), 0.2, (power,) * 3, (power,) * 3, None, 0.5)
+    found = {}
+    for name, emitters in (("far", ()), ("near", (emitter,))):
+        dataclasses.replace(light, emitters=emitters).save(tmp_path / f"{name}.exr")
+        text = SCENE.replace("light.exr", f"{name}.exr").replace("at = [0.0, 0.0, 0.08]", "at = [0.0, 0.2, 0.08]")
+        with Pipeline(loads_scene(text, tmp_path / "scene.toml"), device=device, quality="medium") as pipeline:
+            assert ("emitters" in pipeline.arrays) == (name == "near")
+            found[name] = pipeline(np.full((72, 96, 3), 40, np.uint8), time_seconds=0.0).image.astype(float)
+            if name == "near":
+                record = pipeline.arrays["emitters"].numpy()[0]
+                assert record["distance"] == pytest.approx(0.5)
+                assert record["power"] == pytest.approx(power, rel=1e-4)
+    # The ball stands nearly under the emitter, 0.34 m from it instead of 0.5 m.
+    assert np.abs(found["near"] - found["far"]).max() > 10

@@ -154,7 +154,8 @@ def test_a_video_that_was_cut_off_by_a_kill_is_known_as_ones_own(tmp_path: pathl
         while not (tmp_path / "clip.mp4").exists():
             sink.write(flat(0))
         shutil.copy(tmp_path / "clip.mp4", tmp_path / "killed.mp4")
-    assert "this program wrote it before" in open_sink(tmp_path / "killed.mp4", fps=24).replaced
+    with open_sink(tmp_path / "killed.mp4", fps=24) as sink:
+        assert "this program wrote it before" in sink.replaced
 
 
 @pytest.mark.parametrize("name", ["frames", "clip.mp4"])
@@ -666,6 +667,18 @@ def test_shared_environments_load(shared: pathlib.Path) -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- signals
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "frames"])
+def test_no_thread_is_started_while_frames_flow(tmp_path: pathlib.Path, name: str, monkeypatch) -> None:
+    """A signal that interrupts the start of an executor's thread leaves one that works and that nobody waits for."""
+    with open_sink(tmp_path / name, fps=24) as sink:
+        own = {thread for thread in threading.enumerate() if thread.name.startswith("warp-ar-sink")}
+        assert len(own) == sink._executor._max_workers == len(sink._executor._threads)
+        monkeypatch.setattr(ThreadPoolExecutor, "_adjust_thread_count", lambda pool: None)
+        for level in range(30):
+            sink.write(flat(8 * level))
+    assert levels(tmp_path / name) == pytest.approx([8 * level for level in range(30)], abs=VIDEO_LEVELS)
 
 
 @pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])

@@ -9,10 +9,14 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ar.kernels.change import scale_radiance
+from warp_ar.kernels.structs import Emitter
 from warp_ar.stages.base import Arrays
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the environment."""
+SCALED_ARRAYS = ("environment_radiance", "recover_recovered")
+"""Remembered radiance."""
 
 
 class CarriedLight:
@@ -28,6 +32,25 @@ class CarriedLight:
     def environment(self) -> Any:
         """The environment as an output: None where it was not asked for or not seen yet."""
         return self._arrays["environment"] if self.known and self._wanted else None
+
+    def scale(self, ratio: npt.NDArray[np.float64]) -> None:
+        """Turn remembered radiance into the camera values of a camera whose gain has changed.
+
+        Args:
+            ratio: Of the gain to that before, RGB.
+        """
+        arrays = self._arrays
+        captured = ("environment",) if "environment" in arrays and SCALED_ARRAYS[0] not in arrays else ()
+        for name in (*SCALED_ARRAYS, *captured):
+            if name in arrays:
+                scale_radiance(arrays[name], ratio)
+        for name in captured:
+            arrays.touch(name)
+        if "emitters" in arrays and isinstance(arrays["emitters"], wp.array):
+            emitters = arrays["emitters"]
+            records = np.array(emitters.numpy()).view(np.dtype(Emitter.numpy_dtype()))
+            records["power"] *= ratio
+            emitters.assign(records)
 
     def take_over(self, other: CarriedLight) -> None:
         """Go on from what another pipeline remembers, at the size of this one's arrays."""

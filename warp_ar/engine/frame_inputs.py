@@ -16,6 +16,7 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
+from warp_ar.input.drift import ExposureDrift
 from warp_ar.input.own_markers import Places
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
@@ -55,7 +56,9 @@ class SeenFrame:
 class FrameInputs:
     """Owns the inputs of stages and writes them before a frame is rendered; says which of them changed."""
 
-    def __init__(self, scene: Scene, camera: Camera, arrays: Arrays, device: Any) -> None:
+    def __init__(
+        self, scene: Scene, camera: Camera, arrays: Arrays, device: Any, *, follows_gain: bool = False
+    ) -> None:
         """Allocate, and add to ``arrays`` what stages read.
 
         Args:
@@ -63,6 +66,7 @@ class FrameInputs:
             camera: Of the frames.
             arrays: Of the pipeline, empty.
             device: Warp device, the current one.
+            follows_gain: Whether a drift of the camera's exposure and white balance is looked for.
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
@@ -80,6 +84,7 @@ class FrameInputs:
         """Linear value of each code, (256, 3)."""
         self.saturation = SaturationLevels()
         """Codes at which channels saturate, as frames have told so far."""
+        self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         self._saturation_is_known = False
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
@@ -108,6 +113,57 @@ class FrameInputs:
             add(f"{name}_rows", functools.partial(self._rows, name))
         add("reach", self.reach)
         add("seconds", lambda: float(params["time"][0]))
+        add("gain", lambda: self.gain)
+
+    @property
+    def gain(self) -> npt.NDArray[np.float64]:
+        """What the camera multiplies radiance by, against the first frame, RGB: 1 unless its exposure drifts."""
+        return np.ones(3) if self._drift is None else self._drift.gain
+
+    def look(self, frame: SeenFrame) -> tuple[npt.NDArray[np.float64] | None, bool]:
+        """Look whether the camera's gain drifts, if the frame is on the host and shows what stands still.
+
+        Returns:
+            Ratio of the gain to that of the frame before, RGB, None where it is the same; and whether the tone curve
+            is taken for another one: light of former frames is of no use then.
+        """
+        if self._drift is None or frame.pose is None or isinstance(frame.image, wp.array):
+            return None, False
+        gain, contrast = self._drift.gain, self._drift.contrast
+        if not self._drift.observe(frame.image, frame.pose, frame.seconds):
+            return None, False
+        self.host_scene.set_gain(self._drift.gain)
+        is_bent = contrast != self._drift.contrast
+        if is_bent:
+            self._write_decode()
+            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
+        return np.asarray(self._drift.gain / gain), is_bent
+
+    def continue_from(self, other: FrameInputs) -> None:
+        """Go on with what another pipeline's frames have told of the same camera's gain and tone curve."""
+        if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
+            return
+        self._drift = other._drift
+        self.host_scene.set_gain(self._drift.gain)
+        if self._drift.contrast != 0.0:
+            self._write_decode()
+            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
+
+    def forget_drift(self) -> None:
+        """Take the next frame for the camera's first."""
+        if self._drift is None:
+            return
+        is_bent = self._drift.contrast != 0.0
+        self._drift = ExposureDrift(self.host_scene.scene, self._camera)
+        self.host_scene.set_gain(self._drift.gain)
+        if is_bent:
+            self._write_decode()
+            self._arrays["encode"].assign(encode_table(self._camera.transfer))
+
+    def _write_decode(self) -> None:
+        """Decode by what frames have told of the camera so far."""
+        contrast = 0.0 if self._drift is None else self._drift.contrast
+        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels, contrast))
 
     def close(self) -> None:
         """Stop the copying threads."""
@@ -161,7 +217,7 @@ class FrameInputs:
         """Take codes at which channels saturate, (3,), as known: frames are no longer asked."""
         self.saturation.levels = np.asarray(levels)
         self._saturation_is_known = True
-        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels))
+        self._write_decode()
 
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
@@ -170,8 +226,7 @@ class FrameInputs:
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
         if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
-            table = camera_table(self._camera.transfer, self.saturation.levels)
-            self._arrays["decode"].assign(table)
+            self._write_decode()
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
         """Move lights and objects to where they are now; gives the inputs that changed."""

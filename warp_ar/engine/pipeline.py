@@ -33,7 +33,9 @@ from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
+from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
+from warp_ar.scene.finite import check_finite
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
@@ -79,7 +81,7 @@ def _read_scene(scene: object) -> Scene:
     """What was given as a scene, checked.
 
     Raises:
-        SceneError: It cannot be read.
+        SceneError: It cannot be read, or one of its numbers is not finite.
         UsageError: It is none.
     """
     if isinstance(scene, str | os.PathLike):
@@ -87,6 +89,7 @@ def _read_scene(scene: object) -> Scene:
     if not isinstance(scene, Scene):
         raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
     _check_exposure(scene)
+    check_finite(scene)
     return scene
 
 
@@ -110,6 +113,7 @@ class Pipeline:
         profile: bool = False,
         synchronous: bool = False,
         emitters: bool = False,
+        follows_camera: bool = True,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -129,11 +133,13 @@ class Pipeline:
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
             emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
+            follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
+                from frames one after another. Parts of a clip that are lit by themselves need it off.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
             UsageError: An argument that cannot be used.
-            SceneError: The scene cannot be used, or its camera does not fit ``size``.
+            SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
         scene = _read_scene(scene)
         for exposure in exposures:
@@ -148,6 +154,7 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
+        emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
@@ -165,7 +172,9 @@ class Pipeline:
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
-            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device)
+            # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+            follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
+            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
             self._scheduler = Scheduler(
                 self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
             )
@@ -223,11 +232,12 @@ class Pipeline:
             False if the scene needs a new pipeline; nothing has changed then.
 
         Raises:
-            SceneError: The scene's camera does not fit the size of the frames.
+            SceneError: The scene's camera does not fit the size of the frames, or a number is not finite.
             UsageError: The pipeline is closed, or another process's.
         """
         self._check_usable()
         _check_exposure(scene)
+        check_finite(scene, leave=("pose",))  # which stays as it was, or calls for another pipeline
         self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
         if skeleton(scene) != skeleton(self.scene):
@@ -264,18 +274,19 @@ class Pipeline:
             self._own_markers = other._own_markers
         with exclusive(self.device):
             self._light.take_over(other._light)
+            self.inputs.continue_from(other.inputs)
             self._scheduler.continue_from(other._scheduler)
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
-    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
-        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+    def restart(self, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
         Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
-        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not. So
+        are the poses, where the next frame is not the clip's first.
 
         Args:
-            first: Number of the next frame in its clip.
             saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
                 all frames to come.
 
@@ -286,11 +297,12 @@ class Pipeline:
         self._finish()
         if self.plan.features.observed:
             raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
-        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._begun, self._start_time, self._last_time = 0, 0.0, 0.0
         self._lit_time = math.inf  # no frame came before
         self._shown = None
         if self._tracker is not None:
             self._tracker.reset()
+        self.inputs.forget_drift()
         if saturation is not None:
             self.inputs.fix_saturation(saturation)
         self._scheduler.restart()
@@ -494,6 +506,10 @@ class Pipeline:
             with exclusive(self.device):
                 if self._short is not None and self._short.refresh(frame.time):
                     self._light.known = False
+                ratio, is_bent = self.inputs.look(frame)
+                self._light.known &= not is_bent
+                if ratio is not None:
+                    self._light.scale(ratio)
                 self.inputs.write(frame, reset=not self._light.known)
                 timings = {**timings, **self._scheduler.run()}
             self._light.known = True

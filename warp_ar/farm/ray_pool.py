@@ -16,8 +16,8 @@ from typing import Any
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.pool import Event
+from warp_ar.farm.records import Context
 from warp_ar.farm.version import program_version
-from warp_ar.farm.work import Context, Work
 
 CONNECT_SECONDS = 30.0
 """Within which a cluster must answer."""
@@ -31,6 +31,8 @@ class Member:
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
+        from warp_ar.farm.work import Work
+
         self._work, self._frames = Work(context), 0
         self._lock = threading.Lock()
 
@@ -99,7 +101,8 @@ class RayPool:
         return ""
 
     def _ask_version(self, worker: int) -> None:
-        self._tasks[self._actors[worker].version.remote()] = worker, "ready"
+        """Ask until an actor that is being started, perhaps again, answers."""
+        self._tasks[self._actors[worker].version.options(max_task_retries=-1).remote()] = worker, "ready"
 
     def give(self, worker: int, job: Job, arguments: Any) -> None:
         """As ``Pool.give``."""

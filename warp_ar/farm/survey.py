@@ -214,6 +214,7 @@ def _look_at_frames(
             size=source.size,
             outputs=outputs,
             synchronous=True,
+            follows_camera=False,
         )
         with pipeline:
             for frame in source:

@@ -61,6 +61,15 @@ PERIOD = 12
 """Of later frames one of so many is."""
 WIDTH = 1
 """Codes to either side of a plateau's own that belong to it."""
+WIDE = 2
+"""The same of luma after hard compression."""
+NEUTRAL_WIDE = 6.0
+"""Codes by which the median pixel of such a plateau may be off it: chroma is compressed harder than luma."""
+LOPSIDED = 0.7
+"""Most that a wide plateau may have above it, of what as many codes below it have: a lit surface has as much."""
+HELD_HEAP = 2e-3
+"""Share of the whole picture that has codes 254 and 255 where a level that was seen is taken back: sharpening and
+compression throw some there."""
 
 
 class SaturationLevels:
@@ -88,7 +97,8 @@ class SaturationLevels:
             part = np.ascontiguousarray(image[::2, ::2, c])
             heap = int(np.count_nonzero(part >= 254))
             before_it = int(np.count_nonzero(part >= 252)) - heap
-            self._is_full[c] |= heap >= max(LEAST_PIXELS, LEAST_HEAP * part.size) and heap > 2 * before_it
+            share = LEAST_HEAP if self.levels[c] == FULL else HELD_HEAP
+            self._is_full[c] |= heap >= max(LEAST_PIXELS, share * part.size) and heap > 2 * before_it
             level = find_plateau(np.bincount(codes[:, c], minlength=256), STEEP, ABOVE)
             if level is None:
                 level = found
@@ -99,25 +109,27 @@ class SaturationLevels:
         return bool((before != self.levels).any())
 
 
-def find_plateau(counts: NDArray[np.int64], steep: float, above: float) -> int | None:
+def find_plateau(counts: NDArray[np.int64], steep: float, above: float, width: int = WIDTH) -> int | None:
     """The code at which a channel saturates, or None where its pixels do not tell.
 
     Args:
         counts: How often each code is seen, (256,).
         steep: How many times as frequent as the codes before and behind it a plateau must be.
         above: Share of its pixels that may be higher.
+        width: Codes to either side of its own that belong to it.
     """
     highest = int(np.flatnonzero(counts).max(initial=0))
     if highest < LEAST_LEVEL:
         return None
     candidates = np.arange(max(highest - RINGING, LEAST_LEVEL), highest + 1)
     level = int(candidates[np.argmax(counts[candidates])])
-    on = int(counts[level - WIDTH : level + WIDTH + 1].sum())
-    below = int(counts[level - 3 * WIDTH - 1 : level - WIDTH].sum())
-    behind = counts[level + WIDTH + 1 :]
+    on = int(counts[level - width : level + width + 1].sum())
+    below = int(counts[level - 3 * width - 1 : level - width].sum())
+    behind = counts[level + width + 1 :]
     if level >= NEAR_FULL or on < max(LEAST_PIXELS, LEAST_SHARE * int(counts.sum())):
         return None
-    is_steep = on >= steep * max(below, int(behind[: 2 * WIDTH + 1].sum()))
+    after = int(behind[: 2 * width + 1].sum())
+    is_steep = on >= steep * max(below, after) and (width == WIDTH or after <= LOPSIDED * below)
     return level if is_steep and int(behind.sum()) <= above * on else None
 
 
@@ -128,11 +140,15 @@ def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
         codes: Pixels, (n, 3).
     """
     luma = np.round(codes @ LUMA).astype(np.int64)
-    level = find_plateau(np.bincount(luma, minlength=256), STEEP, ABOVE_LUMA)
+    counts = np.bincount(luma, minlength=256)
+    level, width = find_plateau(counts, STEEP, ABOVE_LUMA), WIDTH
+    if level is None:
+        level, width = find_plateau(counts, STEEP, ABOVE_LUMA, WIDE), WIDE
     if level is None:
         return None
-    on = codes[np.abs(luma - level) <= WIDTH].astype(np.float64)
-    return level if np.median(np.abs(on - level), axis=0).max() <= NEUTRAL else None
+    on = codes[np.abs(luma - level) <= width].astype(np.float64)
+    off = np.median(np.abs(on - level), axis=0).max()
+    return level if off <= (NEUTRAL if width == WIDTH else NEUTRAL_WIDE) else None
 
 
 def ball_codes(image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> NDArray[np.uint8]:

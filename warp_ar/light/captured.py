@@ -283,6 +283,37 @@ def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
     return dataclasses.replace(emitter, direction=direction, origin=origin)
 
 
+def has_places(path: str | Path) -> bool:
+    """Whether a captured light says how far away an emitter is; False where the file cannot be read."""
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            emitters = _parse_emitters(Path(path), dict(file.header()).get("emitters", "[]"))
+        return any(emitter.distance is not None for emitter in emitters)
+    except (RuntimeError, OSError, ValueError, SceneError):
+        return False  # reading the light says why
+
+
+def placed_emitters(light: Light, scale: float, rotation: Array, most: int) -> list[dict[str, Any]]:
+    """Fields of ``kernels.structs.Emitter`` for the emitters that stand at a known distance.
+
+    Args:
+        light: As it was read.
+        scale: Factor to the values of the frames' camera.
+        rotation: From the light's axes to the scene's, (3, 3).
+        most: How many at most, the most powerful ones.
+    """
+    return [
+        {
+            "origin": rotation @ np.array(emitter.origin),
+            "direction": rotation @ np.array(emitter.direction),
+            "distance": emitter.distance,
+            "power": scale * np.array(emitter.power),
+        }
+        for emitter in light.emitters
+        if emitter.distance is not None
+    ][:most]
+
+
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
     label = f"{path}: its attribute emitters"
     entries = parse_json(str(text), label, SceneError)

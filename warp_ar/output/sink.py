@@ -92,7 +92,7 @@ class ThreadedSink(Sink):
     """Stores frames on threads, at most FRAMES_WAITING of them behind."""
 
     def __init__(self, threads: int) -> None:
-        self._executor = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink")
+        self._executor = _started_pool(threads)
         self._pending: collections.deque[Future[None]] = collections.deque()
         self._error: BaseException | None = None
         self._closed = self._ended = self._finished = False
@@ -173,6 +173,21 @@ class ThreadedSink(Sink):
 
     def _finish(self) -> None:
         """Close what is open, after the last frame has been stored; runs on a thread."""
+
+
+def _started_pool(threads: int) -> ThreadPoolExecutor:
+    """An executor whose threads all run.
+
+    It starts them as they are needed, and where a signal interrupts that it forgets the thread, which works all the
+    same: nobody waits for it, and another one that takes its place works beside it. Here no frame is there to be lost.
+    """
+    pool, everyone = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink"), threading.Event()
+    try:
+        for _ in range(threads):
+            pool.submit(everyone.wait)
+    finally:
+        everyone.set()
+    return pool
 
 
 class NullSink(Sink):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -167,6 +168,21 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
 
 
+_SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
+
+
+def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
+    """``make_ray_mesh`` of a file's mesh, one for all scenes of a device for as long as any of them holds it.
+
+    A mesh that a program made itself may change in its hands: each scene has its own of that.
+    """
+    by_device = _SHARED.setdefault(mesh, weakref.WeakValueDictionary())
+    known = by_device.get(str(device))
+    if known is None:
+        known = by_device[str(device)] = make_ray_mesh(mesh, device)
+    return known
+
+
 class HostScene:
     """The host's side of a scene: owns what the device's ``RayScene`` points to, and moves what is animated."""
 
@@ -194,6 +210,7 @@ class HostScene:
         self._shaded: Outline | None = None
         self._balls = ball_outline(scene)
         self._lights_edited = False
+        self._gain = np.ones(3)
         self.write_objects(np.zeros_like(self._objects), 0.0)
         self.write_proxies(np.zeros_like(self._proxies))
         self.write_lights(np.zeros_like(self._lights), 0.0)
@@ -300,7 +317,7 @@ class HostScene:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
             mesh = key if isinstance(key, Mesh) else file_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
-            ray_mesh = make_ray_mesh(mesh, device)
+            ray_mesh = shared_ray_mesh(mesh, device) if isinstance(key, Path) else make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
         return self._meshes[key]
@@ -358,6 +375,10 @@ class HostScene:
                 _place(record, item, rotation, position + rotation @ center, places)
         return _update(records_out, self._objects)
 
+    def set_gain(self, gain: npt.NDArray[np.float64]) -> None:
+        """Have lights shine in the camera values of a camera whose gain is another one now, RGB; 1 at first."""
+        self._gain, self._lights_edited = gain, True
+
     def write_proxies(
         self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
     ) -> bool:
@@ -385,7 +406,7 @@ class HostScene:
             record["position"], record["direction"] = position, direction
             record["kind"] = light_kind(light)
             lost = light.marker is not None and place is None
-            record["intensity"] = 0.0 if lost else light.intensity * np.array(light.color)
+            record["intensity"] = 0.0 if lost else light.intensity * np.array(light.color) * self._gain
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius
         self._lights_edited = False

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ar.errors import UsageError
 from warp_ar.kernels.structs import Emitter
-from warp_ar.light.captured import Light
+from warp_ar.light.captured import Light, placed_emitters
 from warp_ar.light.config import CONFIG
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
@@ -57,6 +57,10 @@ class Captured(Stage):
         self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
 
         self._emitters = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
+        placed = placed_emitters(light, spec.scale, turn, CONFIG.search.most)
+        for record, fields in zip(self._emitters, placed, strict=False):
+            for name, value in fields.items():
+                record[name] = value
 
         def copy(rows: Rows | None) -> None:
             arrays["environment"].assign(self._radiance)

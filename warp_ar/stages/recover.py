@@ -51,6 +51,8 @@ class _Progress:
     """When that was, seconds."""
     rested: bool = False
     """Whether nothing has read the environment since."""
+    gain: npt.NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.ones(3))
+    """Of the camera when the last estimate was begun."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,6 +257,7 @@ class Recover(Stage):
             self._worker = ThreadPoolExecutor(1, "warp_ar-recover")
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
+        now.gain = self._arrays["gain"]()
         now.pending = self._worker.submit(self._solve, now.solver)
         if self._at_once():
             self._take(None)
@@ -310,12 +313,15 @@ class Recover(Stage):
         if solution is None:
             return
         now.estimate = solution.estimate
-        values = {"recover_recovered": solution.estimate.recovered, "recover_cells": solution.cells}
+        # In camera values of the frame that it was begun in; the camera's gain may have changed since.
+        ratio = (self._arrays["gain"]() / now.gain).astype(np.float32)
+        recovered = solution.estimate.recovered * ratio
+        values = {"recover_recovered": recovered, "recover_cells": solution.cells}
         if "emitters" in self.wiring.writes:
             records = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
             for record, emitter in zip(records, solution.estimate.emitters, strict=False):
                 record["origin"], record["direction"] = emitter.origin, emitter.direction
-                record["distance"], record["power"] = emitter.distance, emitter.power
+                record["distance"], record["power"] = emitter.distance, emitter.power * ratio
             values["emitters"] = records
         self._effects.send(values, self._frames_stream)
 

@@ -1,0 +1,149 @@
+"""A camera whose exposure, white balance and tone curve are told from what stands still."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.simulated_camera import decode_srgb
+from warp_ar import Pipeline
+from warp_ar.input.drift import ExposureDrift
+from warp_ar.input.marker_pattern import printed_cells
+from warp_ar.kernels.change import scale_radiance
+from warp_ar.kernels.color import ENCODE_KEYS, camera_table, decode_table, encode_table
+from warp_ar.scene import Pose, Scene, loads_scene
+
+SCENE = """schema = 1
+[camera]
+width = 160
+height = 120
+fx = 160.0
+fy = 160.0
+cx = 79.5
+cy = 59.5
+transfer = "srgb"
+[marker]
+dictionary = "DICT_4X4_50"
+id = 0
+size = 0.24
+[probe]
+center = [0.0, 0.3, 0.03]
+radius = 0.03
+[[proxy]]
+shape = "plane"
+size = [1.0, 0.7]
+"""
+POSE = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.8]))
+GAIN = 0.02
+"""Relative error of a gain: 8-bit codes of ink and table."""
+
+
+def linear_picture(scene: Scene, ink: float = 0.03) -> np.ndarray:
+    """A textured table under the camera, brighter to one side, with the print on it; linear, (120, 160, 3)."""
+    y, x = np.mgrid[:120, :160]
+    table = 0.15 + 0.1 * (x / 160) + 0.03 * np.sin(0.7 * x) * np.sin(0.9 * y)
+    picture = np.repeat(table[..., None], 3, axis=2) * np.array([1.0, 0.9, 0.8])
+    cells, white, side, _ = printed_cells(scene.marker)
+    for cell, is_white in zip(cells, white, strict=True):
+        at = scene.camera.matrix() @ (POSE.rotation @ cell + POSE.translation)
+        u, v = at[:2] / at[2]
+        half = 0.5 * side * scene.camera.fx / 0.8
+        rows, columns = slice(round(v - half), round(v + half) + 1), slice(round(u - half), round(u + half) + 1)
+        picture[rows, columns] = 0.55 if is_white else 0.55 * ink / 0.85
+    return picture
+
+
+def encode(linear: np.ndarray, contrast: float = 0.0) -> np.ndarray:
+    x = np.clip(linear, 0.0, 1.0)
+    code = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    code = code + contrast * code * (1.0 - code) * (code - 0.5)
+    return np.round(255 * code).astype(np.uint8)
+
+
+def follow(pictures: list[np.ndarray]) -> ExposureDrift:
+    scene = loads_scene(SCENE)
+    drift = ExposureDrift(scene, scene.camera)
+    for index, picture in enumerate(pictures):
+        drift.observe(picture, POSE, 0.1 * index)
+    return drift
+
+
+@pytest.mark.parametrize("gain", [(0.6, 0.6, 0.6), (1.5, 1.5, 1.5), (1.1, 1.0, 0.85)])
+def test_a_gain_is_told_per_channel(gain):
+    picture = linear_picture(loads_scene(SCENE))
+    drift = follow([encode(picture), encode(picture * gain)])
+    assert drift.gain == pytest.approx(gain, rel=GAIN)
+    assert drift.contrast == 0.0
+
+
+def test_a_still_camera_is_left_alone():
+    picture = linear_picture(loads_scene(SCENE))
+    drift = follow([encode(picture), encode(picture * 1.01), encode(picture)])
+    assert (drift.gain == 1.0).all()
+
+
+def test_an_emitter_that_goes_out_is_no_drift():
+    """What it lit most becomes darkest; the camera's gain is the same."""
+    picture = linear_picture(loads_scene(SCENE))
+    fading = np.linspace(0.35, 1.0, 160)[None, :, None]
+    assert (follow([encode(picture), encode(picture * fading)]).gain == 1.0).all()
+
+
+def test_what_covers_the_picture_holds_the_gain_and_then_ends_it():
+    picture = linear_picture(loads_scene(SCENE))
+    drifted, covered = encode(0.7 * picture), encode(0.7 * picture)
+    covered[:, 40:140] = np.random.default_rng(1).integers(30, 200, (120, 100, 3))
+    drift = follow([encode(picture), drifted, covered])
+    assert drift.gain == pytest.approx([0.7] * 3, rel=GAIN)
+    for index in range(8):
+        drift.observe(covered, POSE, 1.0 + 0.1 * index)
+    assert (drift.gain == 1.0).all()
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.5, 1.0])
+def test_a_tone_curve_is_told_by_print_that_is_too_black(contrast):
+    drift = follow([encode(linear_picture(loads_scene(SCENE)), contrast)])
+    assert drift.contrast == pytest.approx(contrast, abs=0.26)
+
+
+def test_a_tone_curve_is_told_by_a_drift_where_ink_is_grey():
+    picture = linear_picture(loads_scene(SCENE), ink=0.15)
+    gains = (1.0, 1.25, 1.45, 0.7, 0.55)
+    bent = follow([encode(picture * gain, 1.0) for gain in gains])
+    assert bent.contrast >= 0.5
+    assert bent.gain == pytest.approx([gains[-1]] * 3, rel=0.1)
+    assert follow([encode(picture * gain) for gain in gains]).contrast == 0.0
+
+
+def test_tables_of_a_tone_curve_are_each_others_inverse():
+    values = camera_table("srgb", contrast=0.75)[:256]
+    codes = np.arange(256) / 255.0
+    plain = np.interp(values[:, 0], decode_table("srgb")[:, 0], codes)
+    assert plain + 0.75 * plain * (1 - plain) * (plain - 0.5) == pytest.approx(codes, abs=1e-3)
+    thresholds = encode_table("srgb", 0.75)[2 * ENCODE_KEYS : -1]
+    assert ((thresholds > values[:-1]) & (thresholds < values[1:])).all()
+    assert decode_srgb(np.array([0, 255], np.uint8)) == pytest.approx(values[[0, 255], 0])
+
+
+def test_remembered_light_is_scaled(device):
+    with wp.ScopedDevice(device):
+        light = wp.array(np.arange(24, dtype=np.float32).reshape(2, 4, 3), dtype=wp.vec3)
+        scale_radiance(light, (2.0, 1.0, 0.5))
+        assert np.array_equal(light.numpy(), np.arange(24).reshape(2, 4, 3) * np.array([2.0, 1.0, 0.5]))
+
+
+def test_virtual_lights_keep_their_value_while_the_exposure_moves():
+    """A pipeline's lights shine in the camera values of each frame."""
+    text = SCENE + '[[light]]\nkind = "point"\nat = [0.2, 0.0, 0.3]\nintensity = 0.2\n'
+    picture = linear_picture(loads_scene(text))
+    with Pipeline(loads_scene(text), device="cpu", quality="low") as pipeline:
+        lit = []
+        for index, gain in enumerate((1.0, 0.6)):
+            result = pipeline(encode(picture * gain), pose=POSE, time_seconds=0.2 * index)
+            lit.append(decode_srgb(cv2.blur(result.image, (5, 5))) / gain)
+    added = [part - picture for part in lit]
+    table = (slice(10, 30), slice(60, 100))
+    assert added[0][table].mean() > 0.05
+    assert added[1][table].mean() == pytest.approx(added[0][table].mean(), rel=0.1)
