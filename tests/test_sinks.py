@@ -675,9 +675,10 @@ def test_no_thread_is_started_while_frames_flow(tmp_path: pathlib.Path, name: st
     with open_sink(tmp_path / name, fps=24) as sink:
         own = {thread for thread in threading.enumerate() if thread.name.startswith("warp-ar-sink")}
         assert len(own) == sink._executor._max_workers == len(sink._executor._threads)
-        monkeypatch.setattr(ThreadPoolExecutor, "_adjust_thread_count", lambda pool: None)
-        for level in range(30):
-            sink.write(flat(8 * level))
+        with monkeypatch.context() as patched:
+            patched.setattr(ThreadPoolExecutor, "_adjust_thread_count", lambda pool: None)
+            for level in range(30):
+                sink.write(flat(8 * level))
     assert levels(tmp_path / name) == pytest.approx([8 * level for level in range(30)], abs=VIDEO_LEVELS)
 
 

@@ -63,7 +63,7 @@ def make_scene(shapes=()):
     scene.proxies = wp.array(value, dtype=Shape) if len(shapes) else wp.zeros(0, dtype=Shape)
     scene.objects = wp.zeros(0, dtype=Shape)
     scene.materials, scene.textures = wp.zeros(0, dtype=Material), wp.zeros(0, dtype=Texture)
-    scene.texels, scene.vertex_normals = wp.zeros(0, dtype=wp.vec3), wp.zeros(0, dtype=wp.vec3)
+    scene.texels, scene.vertex_normals = wp.zeros(0, dtype=wp.uint32), wp.zeros(0, dtype=wp.vec3)
     scene.vertex_uvs = wp.zeros(0, dtype=wp.vec2)
     return scene
 
