@@ -22,7 +22,7 @@ from warp_ar.kernels.environment_shadow_cells import (
     ShadowCells,
     any_shaded,
 )
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.reflect import DistantLightConfig
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FACES, MESH_KEY, inside_rect, make_visible_proxy, surface_key
@@ -130,7 +130,9 @@ def make_spread_ratio_kernel(config: DistantLightConfig) -> wp.Kernel:
     """Kernel of ``spread_ratio``, specialised to ``config``."""
     visible_proxy = make_visible_proxy(config.trace, config.probes)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+    )
     def spread_ratio_kernel(
         # In:
         row_start: wp.int32,

@@ -21,7 +21,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.color import decode
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
 from warp_ar.kernels.relight import Receiver, RelightConfig, make_direct_lighting
@@ -89,7 +89,9 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
     find_in_frame = make_find_in_frame(config.trace, True)
     sample_direction = make_sample_direction(config.samples)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+    )
     def mirror_ball_kernel(
         # In:
         row_start: wp.int32,

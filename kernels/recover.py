@@ -39,7 +39,7 @@ from warp_ar.kernels.latlong import (
     sample_row,
     texel_solid_angle,
 )
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.unwrap import reflecting_normal
 from warp_ar.kernels.visibility import FAR, ROUNDING, TraceConfig, make_trace, offset_origin
@@ -239,7 +239,7 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def condense_cells_kernel(
         # In:
         row_start: wp.int32,
@@ -504,7 +504,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
     """Kernels for the given kinds of proxy: observe, transfer, emitters."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def observe_surfaces_kernel(
         # In:
         row_start: wp.int32,
@@ -562,7 +562,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     seen.deviation[channel] = wp.sqrt(wp.max(squares[channel], 0.0) / count)
         observations_out[index] = seen
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_transfer_kernel(
         # In:
         row_start: wp.int32,
@@ -604,7 +604,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_emitters_kernel(
         # In:
         row_start: wp.int32,

@@ -82,7 +82,7 @@ from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_lis
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows
 from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean, intensity
@@ -535,7 +535,9 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
     """Kernel that samples edges in place; if ``left``, only where the list did not hold all."""
     sample_lighting = make_sample_lighting(config)
 
-    @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
+    @wp.kernel(
+        module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS, module_options=QUICK_TO_COMPILE
+    )
     def smooth_edges_kernel(
         # In:
         row_start: wp.int32,

@@ -33,7 +33,7 @@ import warp as wp
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
 
@@ -147,7 +147,7 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
                         return True
         return False
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def project_corners_kernel(
         # In:
         row_start: wp.int32,

@@ -31,7 +31,7 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
 from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
@@ -558,7 +558,7 @@ def make_trace_pixels_kernel(config: TraceConfig) -> wp.Kernel:
     """Kernel of ``trace_pixels``, specialised to the kinds of shape that exist."""
     closest_visible = make_primary(config)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_pixels_kernel(
         row_start: wp.int32,
         # In:

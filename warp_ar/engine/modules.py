@@ -2,7 +2,8 @@
 
 Warp translates Python to C++ in one thread at a time and leaves its compilers, which take most of the time, to run
 beside it. Each thread of a process has Clang parse Warp's headers anew, for 1.5 s, before it compiles its first module;
-here they are parsed once and kept beside the compiled kernels.
+here they are parsed once and kept beside the compiled kernels. Modules of the same flags follow each other: Clang's
+options belong to the process, so that compilers with other flags would wait for each other.
 """
 
 from __future__ import annotations
@@ -50,10 +51,11 @@ def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress |
 
 def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
     cores = usable_cores()
-    headers = _Headers() if device.is_cpu else None
+    headers = _Headers({_flags(module) for module in modules}) if device.is_cpu else None
+    modules = sorted(modules, key=_is_quick)
 
     def work(module: Any) -> None:
-        with headers.shared() if headers is not None else contextlib.nullcontext():
+        with headers.shared(_flags(module)) if headers is not None else contextlib.nullcontext():
             if device.is_cpu:
                 _load(module, device)
             else:
@@ -66,6 +68,16 @@ def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None
             job.result()
             if progress is not None:
                 progress(done, len(modules))
+
+
+def _flags(module: Any) -> str:
+    """What Clang is called with for a module."""
+    own = module.options.get("cpu_compiler_flags")
+    return str(wp.config.cpu_compiler_flags if own is None else own)
+
+
+def _is_quick(module: Any) -> bool:
+    return module.options.get("cpu_compiler_flags") is not None
 
 
 def _load(module: Any, device: Any) -> None:
@@ -82,14 +94,21 @@ class _Headers:
     """Warp's headers, parsed once for all threads and kept for the next process.
 
     Clang itself sees to it that they fit what it compiles, by the files' times and its own flags, and parses them anew
-    where they do not. Where this Warp keeps them elsewhere, each thread does.
+    where they do not. Warp names the file by all flags; those of LLVM say nothing about headers, so that flags which
+    differ in them alone share one. Where this Warp keeps or names headers otherwise, each thread parses them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, flags: Iterable[str]) -> None:
+        """Find what is there, that of the caller's thread too.
+
+        Args:
+            flags: Of the modules that will be compiled.
+        """
         runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
         self._folder_of_thread = (
             getattr(runtime, "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
         )
+        self._flags = {*flags, str(wp.config.cpu_compiler_flags)}
         builtin = Path(wp.__file__).parent / "native" / "builtin.h"
         self._lock = threading.Lock()
         self._first: int | None = None
@@ -100,10 +119,16 @@ class _Headers:
         stat = builtin.stat()
         key = f"{wp.__version__} {builtin} {stat.st_mtime_ns} {stat.st_size} {wp.config.cpu_compiler_flags}"
         self._store = Path(wp.config.kernel_cache_dir) / f"headers_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+        if not _headers_in(self._store):
+            _copy_headers(Path(self._folder_of_thread()), self._store)
 
     @contextlib.contextmanager
-    def shared(self) -> Any:
-        """Around what a thread compiles: it finds the headers if anyone has parsed them, and leaves its own."""
+    def shared(self, flags: str) -> Any:
+        """Around what a thread compiles: it finds the headers if anyone has parsed them, and leaves its own.
+
+        Args:
+            flags: Those of the module.
+        """
         if self._folder_of_thread is None:
             yield
             return
@@ -115,10 +140,11 @@ class _Headers:
                 watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
         if first:
             watcher.start()
-        elif not _headers_in(own):
-            if self._first is not None:
+        else:
+            if self._first is not None and not _headers_in(own):
                 self._parsed.wait(_HEADER_WAIT)
             _copy_headers(self._store, own)
+            self._rename(own, flags)
         yield
 
     def _keep(self, own: Path) -> None:
@@ -129,6 +155,32 @@ class _Headers:
         _copy_headers(own, self._store)
         self._parsed.set()
 
+    def _rename(self, own: Path, flags: str) -> None:
+        """Have headers that were parsed with other flags of LLVM found with these."""
+        wanted = _digest(flags)
+        headers = _headers_in(own)
+        if any(wanted in path.name for path in headers):
+            return
+        for other in self._flags:
+            if _clang_flags(other) == _clang_flags(flags):
+                for path in headers:
+                    if _digest(other) in path.name:
+                        _copy_file(path, own / path.name.replace(_digest(other), wanted))
+
+
+def _clang_flags(flags: str) -> list[str]:
+    """Flags without those of LLVM and of its passes."""
+    words = flags.split()
+    return [word for word in words if not word.startswith("-mllvm=") and not word.endswith("vectorize")]
+
+
+def _digest(flags: str) -> str:
+    """By which Warp names headers: FNV-1a of the flags, a zero byte behind each."""
+    value = 0xCBF29CE484222325
+    for byte in "".join(f"{word}\0" for word in flags.split()).encode():
+        value = (value ^ byte) * 0x100000001B3 % (1 << 64)
+    return f"{value:016x}"
+
 
 def _headers_in(folder: Path) -> list[Path]:
     return list(folder.glob("*.pch"))
@@ -136,10 +188,17 @@ def _headers_in(folder: Path) -> list[Path]:
 
 def _copy_headers(source: Path, target: Path) -> None:
     """Copy parsed headers; a file appears whole or not at all. A full or foreign disk only costs the time again."""
+    headers = _headers_in(source)
     with contextlib.suppress(OSError):
-        target.mkdir(parents=True, exist_ok=True)
-        for path in _headers_in(source):
+        if headers:
+            target.mkdir(parents=True, exist_ok=True)
+        for path in headers:
             if not (target / path.name).exists():
-                part = target / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
-                shutil.copyfile(path, part)
-                part.replace(target / path.name)
+                _copy_file(path, target / path.name)
+
+
+def _copy_file(source: Path, target: Path) -> None:
+    with contextlib.suppress(OSError):
+        part = target.with_name(f"{target.name}.{os.getpid()}.{threading.get_ident()}")
+        shutil.copyfile(source, part)
+        part.replace(target)
