@@ -20,7 +20,7 @@ import warp as wp
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import direction_from_latlong
-from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
 
@@ -56,7 +56,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     """Kernel for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+    @wp.kernel(module="unique", enable_backward=False)
     def fill_frame_kernel(
         # In:
         row_start: wp.int32,

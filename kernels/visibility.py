@@ -402,36 +402,67 @@ def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
 
 
 @functools.cache
+def _make_meets(kinds: tuple[int, ...]) -> wp.Function:
+    """Whether a ray meets a shape of one of the given kinds."""
+    label = "_".join(map(str, kinds))
+
+    @wp.func(name=f"meets_{label}", module="unique")
+    def meets(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        o = to_local_point(shape, origin)
+        d = to_local_vector(shape, direction)
+        if wp.static(SPHERE in kinds):
+            if shape.kind == SPHERE:
+                return intersect_sphere(shape.extent[0], o, d, t_max) < t_max
+        if wp.static(BOX in kinds):
+            if shape.kind == BOX:
+                return intersect_box(shape.extent, o, d, t_max) < t_max
+        if wp.static(PLANE in kinds):
+            if shape.kind == PLANE:
+                return intersect_plane(shape.extent, o, d, t_max) < t_max
+        if wp.static(MESH in kinds):
+            if shape.kind == MESH:
+                return meets_mesh(shape, o, d, t_max)
+        return False
+
+    return meets
+
+
+@functools.cache
 def _make_any(kinds: tuple[int, ...]) -> wp.Function:
     """Whether a ray meets any of the shapes of the given kinds."""
+    meets = _make_meets(kinds)
     label = "_".join(map(str, kinds))
 
     @wp.func(name=f"any_hit_{label}", module="unique")
     def any_hit(shapes: wp.array[Shape], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
         if wp.static(len(kinds) > 0):
             for index in range(shapes.shape[0]):
-                shape = shapes[index]
-                o = to_local_point(shape, origin)
-                d = to_local_vector(shape, direction)
-                if wp.static(SPHERE in kinds):
-                    if shape.kind == SPHERE:
-                        if intersect_sphere(shape.extent[0], o, d, t_max) < t_max:
-                            return True
-                if wp.static(BOX in kinds):
-                    if shape.kind == BOX:
-                        if intersect_box(shape.extent, o, d, t_max) < t_max:
-                            return True
-                if wp.static(PLANE in kinds):
-                    if shape.kind == PLANE:
-                        if intersect_plane(shape.extent, o, d, t_max) < t_max:
-                            return True
-                if wp.static(MESH in kinds):
-                    if shape.kind == MESH:
-                        if meets_mesh(shape, o, d, t_max):
-                            return True
+                if meets(shapes[index], origin, direction, t_max):
+                    return True
         return False
 
     return any_hit
+
+
+@functools.cache
+def _make_any_of_both(kinds: tuple[int, ...]) -> wp.Function:
+    """Whether a ray meets any object or proxy, both of the given kinds: one loop, for the walks in it are long code."""
+    meets = _make_meets(kinds)
+
+    @wp.func(module="unique")
+    def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+        objects = scene.objects.shape[0]
+        for index in range(objects + scene.proxies.shape[0]):
+            shape = Shape()
+            if index < objects:
+                shape = scene.objects[index]
+            else:
+                shape = scene.proxies[index - objects]
+            if meets(shape, origin, direction, t_max):
+                return True
+        return False
+
+    return occluded
 
 
 @functools.cache
@@ -456,11 +487,15 @@ def make_trace(config: TraceConfig) -> Trace:
     def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
         return any_proxy(scene.proxies, origin, direction, t_max)
 
-    @wp.func(module="unique")
-    def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        if any_object(scene.objects, origin, direction, t_max):
-            return True
-        return any_proxy(scene.proxies, origin, direction, t_max)
+    if config.objects == config.proxies:
+        occluded = _make_any_of_both(config.objects)
+    else:
+
+        @wp.func(module="unique")
+        def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+            if any_object(scene.objects, origin, direction, t_max):
+                return True
+            return any_proxy(scene.proxies, origin, direction, t_max)
 
     return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
 
