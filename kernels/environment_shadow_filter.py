@@ -52,8 +52,10 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     """Kernel of ``filter_ratio`` for tiles of so many cells along."""
     wide, narrow = side // 2, side // 4
     width = 2 * wide + 1
-    wide_weights = tuple(window_weight(a - wide, wide) for a in range(width))
-    narrow_weights = tuple(window_weight(a - wide, narrow) for a in range(width))
+    # Values, not ``wp.static`` of a loop's variable: Warp would translate the whole kernel to tell whether it is cached.
+    weights = wp.types.vector(length=width, dtype=wp.float32)
+    wide_weights = weights(*(window_weight(a - wide, wide) for a in range(width)))
+    narrow_weights = weights(*(window_weight(a - wide, narrow) for a in range(width)))
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_ratio_kernel(
@@ -88,6 +90,8 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
         squares = wp.vec4(0.0)
         far_sent = wp.vec3(0.0)
         near_sent = wp.vec3(0.0)
+        wide_at = wp.static(wide_weights)
+        narrow_at = wp.static(narrow_weights)
         for a in range(wp.static(width)):
             ni = i + a - wp.static(wide)
             for b in range(wp.static(width)):
@@ -98,14 +102,15 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
                         # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
                         if key % FACES != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
                             value[3] = 1.0
-                            far_left += wp.static(wide_weights[a] * wide_weights[b]) * value
-                            if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
-                                near_left += wp.static(narrow_weights[a] * narrow_weights[b]) * value
-                                squares += wp.static(narrow_weights[a] * narrow_weights[b]) * wp.cw_mul(value, value)
+                            weight = wide_at[a] * wide_at[b]
+                            near = narrow_at[a] * narrow_at[b]
                             sent = bounced[ni, nj]
-                            far_sent += wp.static(wide_weights[a] * wide_weights[b]) * sent
-                            if wp.static(narrow_weights[a] * narrow_weights[b] > 0.0):
-                                near_sent += wp.static(narrow_weights[a] * narrow_weights[b]) * sent
+                            far_left += weight * value
+                            far_sent += weight * sent
+                            if near > 0.0:
+                                near_left += near * value
+                                squares += near * wp.cw_mul(value, value)
+                                near_sent += near * sent
         left = wp.vec3(far_left[0], far_left[1], far_left[2]) / far_left[3]
         mean = left + far_sent / far_left[3]
         if wp.static(wide > 1):
