@@ -6,7 +6,10 @@ Parts, which ``WARP_AR_BENCH`` picks, separated by commas:
   first of the wanted quality, with no kernel compiled and again with all; and the longest time between two frames from
   the first lit one on, pipelines being built and swapped in meanwhile;
 - ``memory``: resident memory after each preset has run once, and its growth over ``WARP_AR_BENCH_CHANGES`` changes of
-  quality (default 1000), each waited for until its frames are lit.
+  quality (default 1000), each waited for until its frames are lit;
+- ``visits``: the same over pages that are opened and closed for ``WARP_AR_BENCH_SECONDS`` (default 3600), as a chart
+  where ``WARP_AR_BENCH_PLOT`` names an SVG. A visit loads the page and what it names, looks at some frames and goes:
+  with a word, or cut off; every third by two viewers at once, every fifth turns the quality.
 """
 
 from __future__ import annotations
@@ -31,8 +34,15 @@ from typing import Any
 import aiohttp
 
 from bench.common import commit
+from warp_ar.accuracy.charts import lines, stand_alone
 
-PARTS = ("start", "memory")
+PARTS = ("start", "memory", "visits")
+SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "3600"))
+VISIT_FRAMES = 12
+SETTLED_VISITS = 20
+"""Visits before memory counts: every quality has run, and every part of the page has been sent."""
+SAMPLES = 200
+"""Points of the chart."""
 CHANGES = int(os.environ.get("WARP_AR_BENCH_CHANGES", "1000"))
 QUALITIES = ("low", "medium", "paper")
 START_SECONDS = 300.0
@@ -164,6 +174,86 @@ async def memory(url: str, pid: int) -> dict[str, Any]:
     }
 
 
+async def load_page(session: aiohttp.ClientSession, url: str) -> None:
+    """Fetch the page and every script, style and picture that it names."""
+    async with session.get(url) as answer:
+        text = await answer.text()
+    for name in set(re.findall(r'(?:src|href)="([^":#]+)"', text)):
+        async with session.get(url + name.lstrip("/")) as answer:
+            await answer.read()
+
+
+async def look(session: aiohttp.ClientSession, url: str, quality: str, *, polite: bool) -> None:
+    """One viewer: some frames, then gone."""
+    socket = await session.ws_connect(f"{url}live", max_msg_size=1 << 24)
+    if quality:
+        await change(socket, quality)
+    frames = 0
+    while frames < VISIT_FRAMES:
+        frames += (await hear(socket))["type"] == "frame"
+    if polite:
+        await socket.close()
+    else:
+        connection = socket.get_extra_info("transport") or socket._response.connection.transport
+        connection.abort()
+
+
+async def visit(url: str, number: int) -> None:
+    """Open the page, look, and close it."""
+    async with aiohttp.ClientSession() as session:
+        await load_page(session, url)
+        quality = QUALITIES[number // 5 % len(QUALITIES)] if number % 5 == 0 else ""
+        viewers = [look(session, url, quality, polite=number % 2 == 0)]
+        if number % 3 == 0:
+            viewers.append(look(session, url, "", polite=number % 4 == 0))
+        await asyncio.gather(*viewers)
+
+
+async def visits(url: str, pid: int) -> dict[str, Any]:
+    """Memory while pages come and go."""
+    begun, taken = time.monotonic(), []
+    number = 0
+    while time.monotonic() - begun < SECONDS:
+        await visit(url, number)
+        number += 1
+        taken.append((time.monotonic() - begun, number, resident_mb(pid), open_files(pid), threads_of(pid)))
+    settled = taken[min(SETTLED_VISITS, len(taken) - 1) :]
+    shown = settled[:: -(-len(settled) // SAMPLES)]
+    if plot := os.environ.get("WARP_AR_BENCH_PLOT"):
+        minutes, memory_mb = [row[0] / 60.0 for row in shown], [row[2] for row in shown]
+        chart = lines([("resident memory", minutes, memory_mb)], "minutes of pages opened and closed", "MB")
+        Path(plot).write_text(stand_alone(chart), encoding="utf-8")
+    memory_mb = [row[2] for row in settled]
+    return {
+        "seconds": round(taken[-1][0]),
+        "visits": number,
+        "start_mb": round(memory_mb[0]),
+        "end_mb": round(memory_mb[-1]),
+        "most_mb": round(max(memory_mb)),
+        "ratio": round(memory_mb[-1] / memory_mb[0], 3),
+        "most_ratio": round(max(memory_mb) / memory_mb[0], 3),
+        "files": [settled[0][3], settled[-1][3]],
+        "threads": [settled[0][4], settled[-1][4]],
+        "asked": "at most 1.3 times the start",
+    }
+
+
+def open_files(pid: int) -> int:
+    """Files and sockets that a process has open; -1 where the system does not tell."""
+    try:
+        return len(os.listdir(f"/proc/{pid}/fd"))
+    except OSError:
+        return -1
+
+
+def threads_of(pid: int) -> int:
+    """Threads of a process; -1 where the system does not tell."""
+    try:
+        return len(os.listdir(f"/proc/{pid}/task"))
+    except OSError:
+        return -1
+
+
 def _print(case: str, device: str, figures: dict[str, Any]) -> None:
     print(json.dumps({"case": case, "device": device, "commit": commit(), **figures}), flush=True)
 
@@ -179,3 +269,6 @@ def main(device: str) -> None:
     if "memory" in parts:
         with served(device, QUALITIES[0]) as (url, pid, _):
             _print("memory", device, asyncio.run(memory(url, pid)))
+    if "visits" in parts:
+        with served(device, QUALITIES[0]) as (url, pid, _):
+            _print("visits", device, asyncio.run(visits(url, pid)))

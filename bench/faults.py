@@ -34,6 +34,11 @@ def _object(scene: Scene, **changes: Any) -> Scene:
     return dataclasses.replace(scene, objects=(dataclasses.replace(scene.objects[0], **changes),))
 
 
+def _proxy(scene: Scene, off: float) -> Scene:
+    moved = (dataclasses.replace(p, at=(p.at[0] + off, *p.at[1:])) if p.shape == "box" else p for p in scene.proxies)
+    return dataclasses.replace(scene, proxies=tuple(moved))
+
+
 def _camera(scene: Scene, **factors: float) -> Scene:
     values = {key: getattr(scene.camera, key) * factor for key, factor in factors.items()}
     return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, **values))
@@ -71,6 +76,8 @@ SCENES: dict[str, tuple[str, Callable[[Scene], Scene]]] = {
     "camera.center": ("20 % of the width off", lambda s: _camera(s, cx=1.4)),
     "camera.edges": ("fy 10 % off", lambda s: _camera(s, fy=1.1)),
     "card.white": ("0.3 for 0.85", lambda s: _marker(s, white=0.3)),
+    "card.print": ("printed at 97 %", lambda s: _marker(s, size=0.08 / 0.97)),
+    "proxy.edges": ("a box 20 mm off", lambda s: _proxy(s, 0.02)),
     "ball.outside": ("2 m off", lambda s: _ball(s, center=(2.0, 0.03, 0.0346))),
     "units.at": ("millimetres", lambda s: _object(s, at=(150.0, 55.0, 0.0))),
     "units.object": ("a scale of 26", lambda s: _object(s, scale=26.0)),
@@ -89,7 +96,7 @@ PICTURES: dict[str, tuple[str, Callable[[Any, int], Any]]] = {
 }
 NOTHING = ("marker.unseen", "marker.other", "marker.mirrored", "picture.dark", "picture.clipped", "source.empty")
 """What leaves nothing to light."""
-ALSO_NOTHING = ("source.unreadable", "camera.aspect")
+ALSO_NOTHING = ("source.unreadable", "source.absent", "source.permission", "camera.aspect")
 
 
 def lit(scene: Scene, images: list[Any], change: Callable[[Any, int], Any] | None = None) -> Any:

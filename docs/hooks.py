@@ -12,7 +12,19 @@ import pathlib
 import re
 from typing import Any
 
-COMMANDS = ("init", "live", "doctor", "calibrate", "capture", "environment", "explain", "tradeoff", "paper")
+COMMANDS = (
+    "init",
+    "live",
+    "doctor",
+    "calibrate",
+    "capture",
+    "environment",
+    "export",
+    "explain",
+    "tradeoff",
+    "paper",
+    "reference",
+)
 """Commands whose options are listed, in the order of the page."""
 
 

@@ -77,6 +77,10 @@ CALL = (
 
 ARGUMENT_ROOM = 8192
 """Bytes of the largest arguments that can be packed."""
+BOUNDS_ROOM = 64
+"""The same of a launch's bounds."""
+MOST_STAGES = 64
+"""Stages that can begin at once."""
 WORTH = 30_000
 """Nanoseconds that the shortest piece takes."""
 
@@ -91,7 +95,7 @@ def _struct(name: str, fields: tuple[str, ...]) -> str:
     {_struct("Stage", STAGE)}
     {_struct("Pass", PASS)}
     {_struct("Call", CALL)}
-    constexpr long long room = {ARGUMENT_ROOM}, worth = {WORTH};
+    constexpr long long room = {ARGUMENT_ROOM}, bounds_room = {BOUNDS_ROOM}, most = {MOST_STAGES}, worth = {WORTH};
 """
     + """
     typedef signed Answer;  // "int (" is a macro of Warp's
@@ -167,7 +171,7 @@ def _struct(name: str, fields: tuple[str, ...]) -> str:
     };
 
     // Go to the stage's next pass that has rows; at its end, its readers may begin: those come here in turn.
-    long long pending[64];
+    long long pending[most];
     auto advance = [&](long long first) {
         int waiting = 0;
         pending[waiting++] = first;
@@ -260,7 +264,7 @@ def _struct(name: str, fields: tuple[str, ...]) -> str:
                     continue;
                 }
                 alignas(16) char arguments[room];
-                alignas(16) char bounds[64];
+                alignas(16) char bounds[bounds_room];
                 memcpy(arguments, (const void*)c.arguments, c.argument_bytes);
                 memcpy(bounds, (const void*)c.bounds, c.bounds_bytes);
                 if (c.row_offset >= 0) {

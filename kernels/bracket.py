@@ -141,12 +141,12 @@ def merge_exposures_kernel(
             certainty = wp.max(certainty, c)
             ratio = exposures[k].ratio
             value = radiance[k, i, j]
-            near = wp.vec3(0.0, 0.0, 0.0)
+            brightest = wp.vec3(0.0, 0.0, 0.0)
             for row in range(first, last + 1):
-                near = wp.max(near, spread[k, row, j])
+                brightest = wp.max(brightest, spread[k, row, j])
             for channel in range(3):
                 light = value[channel] / ratio
-                if near[channel] == 0.0:
+                if brightest[channel] == 0.0:
                     weight = c * ratio * ratio / (FLOOR * FLOOR + SHOT * value[channel])
                     total[channel] += weight
                     mean[channel] += weight / total[channel] * (light - mean[channel])

@@ -263,14 +263,14 @@ def push_level_kernel(
     if coarse_rows > 0:
         above = sample_coarser(levels_out, coarse_offset, coarse_rows, coarse_columns, i, j)
     known = wp.min(sums[3], 1.0)
-    lacking = 1.0 - known
+    unknown = 1.0 - known
     # known / weight: 1 up to a weight of 1, so a weight of 0 is no division.
     share = wp.where(sums[3] > 1.0, 1.0 / wp.max(sums[3], 1.0), 1.0)
     levels_out[at] = wp.vec4(
-        share * sums[0] + lacking * above[0],
-        share * sums[1] + lacking * above[1],
-        share * sums[2] + lacking * above[2],
-        lacking * (above[3] + 1.0),
+        share * sums[0] + unknown * above[0],
+        share * sums[1] + unknown * above[1],
+        share * sums[2] + unknown * above[2],
+        unknown * (above[3] + 1.0),
     )
 
 

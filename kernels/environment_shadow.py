@@ -173,6 +173,8 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
                                     light = estimated(
                                         scene, distant, other, direction, alpha, before.up, before.from_receiver
                                     )
+                                    if wp.static(config.distant.textures):
+                                        sent += stands_for * light.emitted
                                     brightness = wp.max(light.distant + light.receiver)
                                     stands_for *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
                                     sent += stands_for * light.distant

@@ -28,6 +28,7 @@ from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import make_surface, reflect
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
+    RAY_SPREAD,
     DistantLight,
     DistantLightConfig,
     knows_irradiance,
@@ -81,6 +82,7 @@ class Sent:
 
     distant: wp.vec3  # radiance that it has from the environment
     receiver: wp.vec3  # radiance that it would have from a receiver without shadows
+    emitted: wp.vec3  # radiance of its own
 
 
 @functools.cache
@@ -132,10 +134,14 @@ def make_estimated(config: DistantLightConfig) -> wp.Function:
         if wp.dot(hit.geometric_normal, wo) < 0.0:
             normal = -normal
         cosine = wp.max(wp.dot(normal, wo), 0.0)
-        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cosine)
+        surface = surface_at(scene, distant.dfg, hit, cosine, RAY_SPREAD)
         sent = Sent()
+        if wp.static(config.textures):
+            sent.emitted = surface.emission
         if wp.static(config.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
+            if wp.static(config.textures):
+                irradiance *= surface.occlusion
             # A surface sees (1 - n.up) / 2 of what an even receiver sends to one that faces it.
             received = wp.min(0.5 * (1.0 - wp.dot(normal, up)) * from_receiver, irradiance)
             sent.receiver = wp.cw_mul(surface.diffuse, received) / wp.pi
@@ -192,9 +198,10 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         if wp.dot(geometric, wo) < 0.0:
             normal = -normal
             geometric = -geometric
-        surface = surface_at(
-            scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
-        )
+        surface = surface_at(scene, distant.dfg, hit, wp.max(wp.dot(normal, wo), 0.0), RAY_SPREAD)
+        emitted = wp.vec3(0.0)
+        if wp.static(config.textures):
+            emitted = surface.emission
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
         if wp.static(config.diffuse == "none") or not knows_irradiance(distant):
@@ -202,7 +209,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
         if wp.static(not config.specular) or not knows_levels(distant):
             glossy = float(0.0)
         if rough + glossy <= 0.0:
-            return wp.vec3(0.0)
+            return emitted
         rough_share = rough / (rough + glossy)
         u = wp.vec2(uniform_from_bits(seed[0]), uniform_from_bits(seed[1]))
         is_rough = uniform_from_bits(seed[2]) < rough_share
@@ -212,7 +219,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             weight = surface.diffuse / rough_share
             wi = frame_from_normal(normal) * sample_cosine_hemisphere(u)
         if wp.dot(wi, geometric) <= 0.0:
-            return wp.vec3(0.0)
+            return emitted
 
         received = wp.vec3(0.0)
         origin = offset_origin(hit.point, geometric, wi, hit.error)
@@ -236,7 +243,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             if occluded_by_objects(scene, start, leaving, FAR):
                 received = wp.cw_mul(received, FURTHER * (surface.diffuse + surface.reflectance))
         elif other.shape >= 0:
-            received = shade_unoccluded(scene, distant, other, wi)
+            received = shade_unoccluded(scene, distant, other, wi, RAY_SPREAD)
         elif is_rough:
             received = distant_irradiance(distant, hit.point, normal) / wp.pi
         else:
@@ -245,6 +252,8 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
                 received = reflected_radiance(
                     distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor
                 )
+        if wp.static(config.textures):
+            return wp.cw_mul(weight, received) + emitted
         return wp.cw_mul(weight, received)
 
     return bounced

@@ -274,9 +274,11 @@ def make_trace_secondary_kernel(config: EnvironmentShadowConfig) -> wp.Kernel:
                 else:
                     before = look_before(distant, hit.geometric_normal, direction)
                     light = estimated(scene, distant, other, direction, alpha, before.up, before.from_receiver)
+                    if wp.static(config.distant.textures):
+                        sent = stands_for * light.emitted
                     brightness = wp.max(light.distant + light.receiver)
                     stands_for *= wp.min(before.brightest / wp.max(brightness, 1.0e-20), 1.0)
-                    sent = stands_for * light.distant
+                    sent += stands_for * light.distant
                     returned = stands_for * light.receiver
             wave_out.reflected[0, place] = sent
             if wp.static(not traced):

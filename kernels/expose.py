@@ -135,8 +135,8 @@ def surrounding_mean(
     reach = 0.5 * (1.0 - scale) * wp.float32(max_box - 1)
     inner = wp.int32(reach)
     fraction = reach - wp.float32(inner)
-    near = box_mean(table, row, col, 2 * inner + 1)
-    return near + fraction * (box_mean(table, row, col, 2 * inner + 3) - near)
+    smaller = box_mean(table, row, col, 2 * inner + 1)
+    return smaller + fraction * (box_mean(table, row, col, 2 * inner + 3) - smaller)
 
 
 @wp.func
@@ -258,10 +258,34 @@ def adapt_scale_kernel(
 
 
 @functools.cache
+def make_find_gain(method: str) -> wp.Function:
+    """``find_gain(code, i, j, table, max_box, s) -> float``: a clipped pixel's guessed radiance over what it shows.
+
+    It is 1 for pixels that do not clip, and on methods that look at no box.
+    """
+    box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(method, clipped_gain)
+
+    @wp.func(module="unique")
+    def find_gain(
+        code: wp.vec3ub, i: wp.int32, j: wp.int32, table: wp.array2d[wp.uint32], max_box: wp.int32, s: wp.float32
+    ) -> wp.float32:
+        gain = float(1.0)
+        if wp.static(method in BOXES):
+            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
+            if least > KNEE and s < 1.0:
+                clipped = (least - KNEE) / (255.0 - KNEE)
+                mean = surrounding_mean(table, i, j, s, max_box)
+                gain = 1.0 + clipped * (box_gain(mean, s) - 1.0)
+        return gain
+
+    return find_gain
+
+
+@functools.cache
 def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
     """Kernel specialised to ``config``, by warps (see ``codes``) or by runs of pixels; equal ones share one kernel."""
     read_layers = make_read_layers(config.layers)
-    box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(config.method, clipped_gain)
+    find_gain = make_find_gain(config.method)
 
     @wp.func(module="unique")
     def exposed(
@@ -278,13 +302,7 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         s: wp.float32,
         codes: wp.array[wp.vec3ub],
     ) -> wp.vec3ub:
-        gain = float(1.0)
-        if wp.static(config.method in BOXES):
-            least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
-            if least > KNEE and s < 1.0:
-                clipped = (least - KNEE) / (255.0 - KNEE)
-                mean = surrounding_mean(table, i, j, s, max_box)
-                gain = 1.0 + clipped * (box_gain(mean, s) - 1.0)
+        gain = find_gain(code, i, j, table, max_box, s)
         guessed = bool(gain != 1.0)
         if wp.static(config.method == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0

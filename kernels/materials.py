@@ -1,4 +1,4 @@
-"""What surfaces do with light: textures, and four reflection models under virtual lights and under the environment.
+"""What surfaces do with light: four reflection models under virtual lights and under the environment.
 
 Directions ``wi`` (to the light), ``wo`` (to the viewer) and ``normal`` are unit and point away from the surface. Every
 model is first reduced to a ``Surface``: a diffuse reflectance and a lobe. Under the environment that is
@@ -23,6 +23,7 @@ References:
     [WMLT07] Walter et al., "Microfacet Models for Refraction through Rough Surfaces", EGSR 2007.
     [Hei14] Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014.
     [glTF] Khronos, glTF 2.0 specification, appendix B.
+    [LdR14] Lagarde, de Rousiers, "Moving Frostbite to Physically Based Rendering", 2014, section 4.10.2.
     [Tur19] Turquin, "Practical Multiple Scattering Compensation for Microfacet Models", 2019.
 """
 
@@ -33,7 +34,8 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.prefilter import energy_compensation, sample_dfg
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS, MIRROR, PHONG, RayScene
+from warp_ar.kernels.structs import BOX, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene
+from warp_ar.kernels.textures import SurfacePoint, point_of_triangle, sample_texture, slant
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,53 +63,97 @@ class Surface:
     gain: wp.vec3  # METALLIC_ROUGHNESS: factor for light that scatters more than once
     shininess: wp.float32  # PHONG
     roughness: wp.float32  # METALLIC_ROUGHNESS; perceptual
+    # Only where there are textures, else not set:
+    emission: wp.vec3  # radiance that it sends out itself
+    occlusion: wp.float32  # share of the environment's irradiance that reaches it
 
 
 @wp.func
-def sample_texture(scene: RayScene, index: wp.int32, uv: wp.vec2) -> wp.vec3:
-    """Bilinear, repeating lookup; v points up the picture, texel centres lie at half-integers."""
-    texture = scene.textures[index]
-    x = (uv[0] - wp.floor(uv[0])) * wp.float32(texture.width) - 0.5
-    y = (1.0 - (uv[1] - wp.floor(uv[1]))) * wp.float32(texture.height) - 0.5
-    fx = x - wp.floor(x)
-    fy = y - wp.floor(y)
-    # x lies in [-0.5, width - 0.5], also where uv is so close below an integer that its fraction rounds to 1.
-    left = wp.int32(wp.floor(x))
-    top = wp.int32(wp.floor(y))
-    right = wp.where(left + 1 >= texture.width, 0, left + 1)
-    bottom = wp.where(top + 1 >= texture.height, 0, top + 1)
-    left = wp.where(left < 0, texture.width - 1, left)
-    top = wp.where(top < 0, texture.height - 1, top)
-    upper = texture.offset + top * texture.width
-    lower = texture.offset + bottom * texture.width
-    above = scene.texels[upper + left] * (1.0 - fx) + scene.texels[upper + right] * fx
-    below = scene.texels[lower + left] * (1.0 - fx) + scene.texels[lower + right] * fx
-    return above * (1.0 - fy) + below * fy
+def material_at(scene: RayScene, hit: Hit) -> wp.int32:
+    """Index of the material that a hit has."""
+    index = scene.objects[hit.shape].material
+    if hit.corner >= 0:
+        if scene.triangle_materials.shape[0] > 0:
+            index += scene.triangle_materials[hit.corner / 3]
+    return index
+
+
+@wp.func
+def surface_point(scene: RayScene, hit: Hit, cos_o: wp.float32, spread: wp.float32) -> SurfacePoint:
+    """What pictures see of a hit; ``spread`` is the angle of the ray's cone, whose apex is where the ray starts.
+
+    The pictures of a sphere and a box are as dense as on their largest circle and their mean side.
+    """
+    shape = scene.objects[hit.shape]
+    width = spread * hit.t * slant(cos_o)
+    if hit.corner >= 0:
+        return point_of_triangle(scene, hit.corner, hit.weights, hit.uv, width, shape.scale)
+    point = SurfacePoint()
+    point.uv = hit.uv
+    point.uv_second = hit.uv
+    point.color = wp.vec4(1.0, 1.0, 1.0, 1.0)
+    point.width = width
+    length = wp.pi * shape.extent[0]
+    if shape.kind == BOX:
+        length = 2.0 * (shape.extent[0] + shape.extent[1] + shape.extent[2]) / 3.0
+    density = 1.0 / (shape.scale * length)
+    point.density = wp.vec2(density, density)
+    return point
+
+
+@wp.func
+def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp.float32:
+    """Roughness of a point, its picture included."""
+    if material.metallic_roughness_texture >= 0:
+        return material.roughness * sample_texture(scene, material.metallic_roughness_texture, point)[1]
+    return material.roughness
 
 
 @functools.cache
 def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
-    """``surface_at(scene, dfg, material, uv, cos_o) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.
+    """``surface_at(scene, dfg, hit, cos_o, spread) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.
+
+    ``spread`` is the angle of the ray's cone.
 
     Args:
         models: Sorted models that exist.
-        textures: Whether any material has a texture.
+        textures: Whether any material has a texture, or is that of a triangle.
     """
     label = "_".join(map(str, models))
 
     @wp.func(name=f"surface_at_{label}_{int(textures)}", module="unique")
     def surface_at(
-        scene: RayScene, dfg: wp.array2d[wp.vec2], index: wp.int32, uv: wp.vec2, cos_o: wp.float32
+        scene: RayScene, dfg: wp.array2d[wp.vec2], hit: Hit, cos_o: wp.float32, spread: wp.float32
     ) -> Surface:
+        index = scene.objects[hit.shape].material
+        if wp.static(textures):
+            index = material_at(scene, hit)
         material = scene.materials[index]
         base = material.base_color
         specular = material.specular
-        if wp.static(textures):
-            if material.base_texture >= 0:
-                base = wp.cw_mul(base, sample_texture(scene, material.base_texture, uv))
-            if material.specular_texture >= 0:
-                specular = wp.cw_mul(specular, sample_texture(scene, material.specular_texture, uv))
+        metallic = material.metallic
+        roughness = material.roughness
         surface = Surface()
+        if wp.static(textures):
+            point = surface_point(scene, hit, cos_o, spread)
+            base = wp.cw_mul(base, wp.vec3(point.color[0], point.color[1], point.color[2]))
+            if material.base_texture >= 0:
+                base = wp.cw_mul(base, rgb(sample_texture(scene, material.base_texture, point)))
+            if material.specular_texture >= 0:
+                specular = wp.cw_mul(specular, rgb(sample_texture(scene, material.specular_texture, point)))
+            if material.metallic_roughness_texture >= 0:
+                factors = sample_texture(scene, material.metallic_roughness_texture, point)
+                roughness *= factors[1]
+                metallic *= factors[2]
+            surface.emission = material.emission
+            if material.emissive_texture >= 0:
+                surface.emission = wp.cw_mul(
+                    surface.emission, rgb(sample_texture(scene, material.emissive_texture, point))
+                )
+            surface.occlusion = float(1.0)
+            if material.occlusion_texture >= 0:
+                reached = sample_texture(scene, material.occlusion_texture, point)[0]
+                surface.occlusion = 1.0 + material.occlusion_strength * (reached - 1.0)
         surface.model = material.model
         surface.diffuse = base
         if wp.static(PHONG in models):
@@ -121,8 +167,7 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
         if wp.static(METALLIC_ROUGHNESS in models):
             if material.model == METALLIC_ROUGHNESS:
                 one = wp.vec3(1.0, 1.0, 1.0)
-                metallic = material.metallic
-                scale_bias = sample_dfg(dfg, cos_o, material.roughness)
+                scale_bias = sample_dfg(dfg, cos_o, roughness)
                 dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * energy_compensation(
                     scale_bias, DIELECTRIC_F0 * one
                 )
@@ -130,10 +175,32 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
                 surface.gain = energy_compensation(scale_bias, surface.f0)
                 surface.reflectance = wp.cw_mul(scale_bias[0] * surface.f0 + scale_bias[1] * one, surface.gain)
                 surface.diffuse = (1.0 - metallic) * wp.cw_mul(base, one - dielectric)
-                surface.roughness = material.roughness
+                surface.roughness = roughness
+        if wp.static(textures):
+            if material.unlit != 0:
+                surface.emission = base
+                surface.diffuse = wp.vec3(0.0)
+                surface.reflectance = wp.vec3(0.0)
+                surface.gain = wp.vec3(0.0)
         return surface
 
     return surface_at
+
+
+@wp.func
+def rgb(color: wp.vec4) -> wp.vec3:
+    """A colour without its alpha."""
+    return wp.vec3(color[0], color[1], color[2])
+
+
+@wp.func
+def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.float32) -> wp.float32:
+    """Share of the reflected environment that reaches a point of which ``occlusion`` of the diffuse one does [LdR14].
+
+    1 where nothing is hidden and, for a mirror, where it is seen from ahead.
+    """
+    power = wp.pow(2.0, -16.0 * roughness - 1.0)
+    return wp.clamp(wp.pow(wp.max(cos_o + occlusion, 0.0), power) - 1.0 + occlusion, 0.0, 1.0)
 
 
 @wp.func

@@ -111,7 +111,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             return
         origin = params[0].camera_position
         ray = receiver.picture.rays[i, j]
-        seen = decode(receiver.picture.decode_table, receiver.picture.frame[i, j])
+        shown = decode(receiver.picture.decode_table, receiver.picture.frame[i, j])
         change = wp.vec3(0.0, 0.0, 0.0)
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
@@ -141,8 +141,11 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             rho = wp.max(probe.reflectance, wp.vec3(MIN_REFLECTANCE, MIN_REFLECTANCE, MIN_REFLECTANCE))
             if wp.static(config.shade is not None):
                 if item.shape >= 0:
-                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j))
-                    change += wp.cw_mul(rho, radiance) - seen
+                    # A pixel's rays leave the ball turned by twice the angle between the normals where they meet it.
+                    width = scene.pixel_spread * t / wp.max(-wp.dot(normal, wp.normalize(direction)), 0.1)
+                    spread = width / wp.max(item.t, 1.0e-6) + 2.0 * width / probe.radius
+                    radiance = shade_hit(scene, lights, distant, item, wi, NearPoint(), tile_turn(i, j), spread)
+                    change += wp.cw_mul(rho, radiance) - shown
                     continue
             if surface.shape < 0 or wp.dot(surface.geometric_normal, wi) >= 0.0:
                 continue
@@ -150,7 +153,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
                 if shadow_ratio.shape[0] > 0:
                     at = find_in_frame(params[0], receiver.picture, scene, receiver.probes, surface)
                     if at[0] >= 0.0:
-                        change += wp.cw_mul(seen, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
+                        change += wp.cw_mul(shown, look_up_layer(shadow_ratio, at[0], at[1]) - wp.vec3(1.0, 1.0, 1.0))
             if wp.static(config.relight is not None):
                 lit = direct_lighting(scene, lights, receiver, surface, i, j, rho, tile_turn(i, j))
                 change += wp.cw_mul(rho, lit.added)

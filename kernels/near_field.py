@@ -47,9 +47,10 @@ from warp_ar.kernels.color import brightness
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.materials import Surface, make_surface, reflect
+from warp_ar.kernels.materials import Surface, make_surface, material_at, reflect, roughness_at, surface_point
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
+    RAY_SPREAD,
     DistantLight,
     DistantLightConfig,
     look_up,
@@ -168,6 +169,7 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
         origin: wp.vec3,
         direction: wp.vec3,
         t_max: wp.float32,
+        spread: wp.float32,
     ) -> wp.vec4:
         other = closest_object(scene, origin, direction, t_max)
         proxy = closest_proxy(scene, origin, direction, other.t)
@@ -185,7 +187,7 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
                     radiance += layers.added[row, column]
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         if other.shape >= 0:
-            radiance = shade_unoccluded(scene, distant, other, direction)
+            radiance = shade_unoccluded(scene, distant, other, direction, spread)
             return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
         return wp.vec4(0.0)
 
@@ -225,7 +227,8 @@ def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
                 wi = reflect(-direction, seen.normal)
                 if wp.dot(wi, geometric) > 0.0:
                     origin = offset_origin(seen.point, geometric, wi, seen.error)
-                    shown = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR)
+                    spread = scene.pixel_spread
+                    shown = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR, spread)
                     if shown[3] <= 0.0:
                         beyond = reflected_radiance(
                             distant, surface.model, surface.roughness, surface.shininess, seen.point, wi, 0.0
@@ -276,7 +279,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             normal = -normal
             geometric = -geometric
         cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
-        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        surface = surface_at(scene, distant.dfg, hit, cos_o, scene.pixel_spread)
         set_index = (i % side) * side + j % side
 
         if wp.static(config.distant.diffuse != "none"):
@@ -298,7 +301,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                         else:
                             origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
                             wi = toward.direction
-                            near = look_near(params[0], picture, layers, scene, distant, origin, wi, toward.distance)
+                            reach = toward.distance
+                            near = look_near(params[0], picture, layers, scene, distant, origin, wi, reach, RAY_SPREAD)
                             if near[3] > 0.0:
                                 radiance = wp.vec3(near[0], near[1], near[2])
                         total += share * cosine * toward.measure * radiance
@@ -330,7 +334,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                                 width = ggx_ray_width(wp.dot(half, normal), alpha)
                             if wp.dot(wi, geometric) > 0.0:
                                 origin = offset_origin(hit.point, geometric, wi, hit.error)
-                                near = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR)
+                                near = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR, width)
                                 leaving += 1.0
                                 reflected += near
                                 level = level_from_alpha(
@@ -379,7 +383,14 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
             return
         normal = hits[i, j].normal
         material = scene.materials[scene.objects[found].material]
-        sharp = lobe_alpha(material.model, material.roughness, material.shininess) < SHARP
+        roughness = material.roughness
+        if wp.static(config.distant.textures):
+            material = scene.materials[material_at(scene, hits[i, j])]
+            direction = wp.normalize(hits[i, j].point - params[0].camera_position)
+            cos_o = wp.max(wp.abs(wp.dot(normal, direction)), 1.0e-3)
+            point = surface_point(scene, hits[i, j], cos_o, scene.pixel_spread)
+            roughness = roughness_at(scene, material, point)
+        sharp = lobe_alpha(material.model, roughness, material.shininess) < SHARP
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)

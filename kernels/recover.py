@@ -11,7 +11,7 @@ The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_tr
 the same for emitters at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
 ``add_recovered`` puts it into the map.
 
-**Rims.** Half a pixel around an emitter clips as well: ``weigh_boundaries``.
+**Saturation boundaries.** Half a pixel around an emitter clips as well: ``weigh_boundaries``.
 
 **Cells.** The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each
 with its mean radiance, its share at clipping, and the direction in which that share lies.
@@ -65,8 +65,7 @@ GRAZING = wp.constant(wp.float32(1.0e-3))
 MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
 """Radians: balls of less than ten pixels are taken to have ten."""
 WIDE = wp.constant(wp.float32(6.0))
-"""Half pixels: what is wider clips hardly beyond its rim, for it is not so much brighter than clipping as an emitter
-is."""
+"""Half pixels: what is wider clips hardly beyond its boundary, for it exceeds clipping by less than an emitter does."""
 SHARPNESS = wp.constant(wp.float32(2.0))
 """Exponent of the share around a texel of the smallest emitter."""
 BOUNDARY_REACH = wp.constant(2)
@@ -103,7 +102,7 @@ class Cell:
 
     radiance: wp.vec3  # mean, as captured
     clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
-    missing: wp.vec3  # the same, rims of what clips counting less
+    missing: wp.vec3  # the same, saturation boundaries counting less
     hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
     modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
     middle: wp.vec3  # unit
@@ -190,12 +189,12 @@ def weigh_boundaries_kernel(
     pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
     # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
     half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    near = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
-    if near < 0.999:
+    around = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
+    if around < 0.999:
         # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
         wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
-        near = wp.pow(near, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
-    missing_out[i, j] = share * near
+        around = wp.pow(around, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
+    missing_out[i, j] = share * around
 
 
 def weigh_boundaries(
@@ -206,15 +205,15 @@ def weigh_boundaries(
     *,
     rows: Rows | None = None,
 ) -> None:
-    """Weigh what clips by how likely it is the light itself: rims count less.
+    """Weigh what clips by how likely it is the light itself: saturation boundaries count less.
 
-    A pixel at a light's rim shows part of the light, and clips all the same if that is bright: what clips in the
+    A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
     ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
     in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
 
         2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
 
-    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep their rims
+    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
     (w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
 
     Args:
@@ -265,13 +264,13 @@ def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
             area = texel_solid_angle(i, height, width)
             for j in range(column * width // columns, (column + 1) * width // columns):
                 direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
-                seen = trust(confidence[i, j])
-                lost = seen * clipped[i, j]
+                trusted = trust(confidence[i, j])
+                lost = trusted * clipped[i, j]
                 cell.solid_angle += area
                 cell.radiance += area * radiance[i, j]
                 cell.clipped += area * lost
-                cell.missing += area * seen * missing[i, j]
-                cell.hidden += area * (1.0 - seen)
+                cell.missing += area * trusted * missing[i, j]
+                cell.hidden += area * (1.0 - trusted)
                 toward += area * direction
                 lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
         cell.radiance /= cell.solid_angle
@@ -332,8 +331,8 @@ def condense_cells(
 @wp.func
 def missing_share(confidence: wp.float32, missing: wp.vec3, unseen: wp.float32) -> wp.vec3:
     """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
-    seen = trust(confidence)
-    return seen * missing + unseen * (1.0 - seen) * wp.vec3(1.0, 1.0, 1.0)
+    trusted = trust(confidence)
+    return trusted * missing + unseen * (1.0 - trusted) * wp.vec3(1.0, 1.0, 1.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -413,14 +412,12 @@ def add_recovered(
 
 
 @wp.func
-def leave_surface(scene: RayScene, point: SurfacePoint, direction: wp.vec3) -> wp.vec3:
-    """Origin of a ray from a surface point; which proxy it lies on is not kept, so the largest bounds the rounding."""
+def surface_error(scene: RayScene, point: SurfacePoint) -> wp.float32:
+    """How far off its surface a point may lie, metres; which proxy that is is not kept, so the largest bounds it."""
     size = wp.float32(0.0)
     for index in range(scene.proxies.shape[0]):
-        shape = scene.proxies[index]
-        size = wp.max(size, shape.scale * wp.length(shape.extent))
-    error = ROUNDING * (8.0 * wp.max(wp.abs(point.position)) + 32.0 * size)
-    return offset_origin(point.position, point.normal, direction, error)
+        size = wp.max(size, scene.proxies[index].scale * wp.length(scene.proxies[index].extent))
+    return ROUNDING * (8.0 * wp.max(wp.abs(point.position)) + 32.0 * size)
 
 
 @wp.func
@@ -586,6 +583,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
             transfer_out[index, m] = 0.0
             mirrored_out[index, m] = 0.0
         point = points[index]
+        error = surface_error(scene, point)
         for m in range(rows * columns):
             middle = cells[m // columns, m % columns].middle
             solid_angle = cells[m // columns, m % columns].solid_angle
@@ -599,7 +597,8 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 for k in range(probes.shape[0]):
                     share *= 1.0 - hidden_share(probes[k].center, probes[k].radius, point.position, middle, angle)
                 target = m
-                hit = trace.closest_proxy(scene, leave_surface(scene, point, middle), middle, FAR)
+                origin = offset_origin(point.position, point.normal, middle, error)
+                hit = trace.closest_proxy(scene, origin, middle, FAR)
                 if hit.shape >= 0:
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
@@ -629,7 +628,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
             if cosine > 0.0 and away > emitter[3]:
                 direction = ray / away
                 given = cosine / (away * away)
-                origin = leave_surface(scene, point, direction)
+                origin = offset_origin(point.position, point.normal, direction, surface_error(scene, point))
                 if trace.occluded_by_proxies(scene, origin, direction, away - emitter[3]):
                     given = 0.0
                 for k in range(probes.shape[0]):

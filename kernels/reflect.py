@@ -20,7 +20,7 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.emitters import add_emitters, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.materials import make_surface, reflect, specular_occlusion
 from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -39,6 +39,8 @@ wp.set_module_options({"enable_backward": False})
 
 HIDDEN_MARGIN = wp.constant(wp.float32(1.0e-3))
 """Share of the camera's distance within which a proxy is the point itself and does not hide it."""
+RAY_SPREAD = wp.constant(wp.float32(0.1))
+"""Angle in radians that one of a few dozen rays stands for, in the pictures on what it meets."""
 
 DiffuseForm = Literal["none", "sh", "map"]
 
@@ -52,7 +54,7 @@ class DistantLightConfig:
     models: tuple[int, ...]
     """Sorted material models of the objects."""
     textures: bool
-    """Whether any material has a texture."""
+    """Whether any material has a texture or emits, or any object's triangles have materials of their own."""
     diffuse: DiffuseForm
     """Where the environment's irradiance comes from: nine coefficients, a latlong map, or nowhere."""
     specular: bool
@@ -65,7 +67,7 @@ class DistantLightConfig:
     """Whether the environment is known without mirror balls, from a file."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
-        """For any scene with as many mirror balls: forms that it does not call for may then be empty.
+        """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
 
         Args:
             form: Where irradiance comes from in scenes that call for it.
@@ -74,7 +76,7 @@ class DistantLightConfig:
         known = self.probes or self.captured
         diffuse: DiffuseForm = form if known else "none"
         return DistantLightConfig(
-            self.trace.general(), models, True, diffuse, known, self.probes, self.emitters, self.captured
+            self.trace.general(), models, self.textures, diffuse, known, self.probes, self.emitters, self.captured
         )
 
 
@@ -162,25 +164,33 @@ def make_find_in_frame(trace: TraceConfig, probes: bool) -> wp.Function:
 
 @functools.cache
 def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
-    """``shade_unoccluded(scene, distant, hit, direction) -> vec3``: radiance under the environment alone."""
+    """``shade_unoccluded(scene, distant, hit, direction, spread) -> vec3``: radiance under the environment alone.
+
+    ``spread`` is the angle that the ray stands for.
+    """
     surface_at = make_surface(config.models, config.textures)
     glossy = make_reflected_radiance(config)
     distant_irradiance = make_distant_irradiance(config)
 
     @wp.func(module="unique")
-    def shade_unoccluded(scene: RayScene, distant: DistantLight, hit: Hit, direction: wp.vec3) -> wp.vec3:
+    def shade_unoccluded(
+        scene: RayScene, distant: DistantLight, hit: Hit, direction: wp.vec3, spread: wp.float32
+    ) -> wp.vec3:
         wo = -wp.normalize(direction)
         normal = hit.normal
         if wp.dot(hit.geometric_normal, wo) < 0.0:
             normal = -normal
-        surface = surface_at(
-            scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, wp.max(wp.dot(normal, wo), 0.0)
-        )
+        cos_o = wp.max(wp.dot(normal, wo), 0.0)
+        surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
         radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
+        if wp.static(config.textures):
+            radiance = surface.occlusion * radiance + surface.emission
         if wp.static(config.specular):
             if knows_levels(distant):
                 wi = reflect(wo, normal)
                 reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
+                if wp.static(config.textures):
+                    reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
                 radiance += wp.cw_mul(surface.reflectance, reflected)
         return radiance
 

@@ -23,7 +23,7 @@ import warp as wp
 
 from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect
+from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.reflect import (
     DiffuseForm,
@@ -93,7 +93,7 @@ class NearPoint:
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
-    ``turn`` is for ``visible_share``.
+    ``turn`` is for ``visible_share``, ``spread`` the width of the ray at t = 1 in metres.
     """
     forms = config.distant
     surface_at = make_surface(forms.models, forms.textures)
@@ -113,6 +113,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         direction: wp.vec3,
         near: NearPoint,
         turn: wp.float32,
+        spread: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
         normal = hit.normal
@@ -124,14 +125,18 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if facing < MIN_FACING:
             normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
         cos_o = wp.dot(normal, wo)
-        surface = surface_at(scene, distant.dfg, scene.objects[hit.shape].material, hit.uv, cos_o)
+        surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
 
         radiance = wp.vec3(0.0)
+        if wp.static(forms.textures):
+            radiance = surface.emission
         if wp.static(forms.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.near_field):
                 if near.known:
                     irradiance = near.irradiance
+            if wp.static(forms.textures):
+                irradiance *= surface.occlusion
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
@@ -142,6 +147,8 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                     if near.known:
                         added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
                         reflected = (1.0 - near.reflected[3]) * reflected + added
+                if wp.static(forms.textures):
+                    reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
                 radiance += wp.cw_mul(surface.reflectance, reflected)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
@@ -250,7 +257,8 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
                 if wp.static(config.distant.specular):
                     if near.reflected.shape[0] > 0:
                         point.reflected = near.reflected[pixel[0], pixel[1]]
-        radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j))
+        spread = scene.pixel_spread
+        radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j), spread)
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
 
     return shade_sample

@@ -75,10 +75,10 @@ def find_disc(camera: FrameParams, probe: Probe) -> Disc:
     """Outline of a ball as if it lay on the camera's axis: a circle of the angle that the ball subtends."""
     disc = Disc()
     from_camera = probe.center - camera.camera_position
-    seen = project(camera, from_camera)
+    pixel = project(camera, from_camera)
     beyond = wp.dot(from_camera, from_camera) - probe.radius * probe.radius
-    if seen[2] > 0.0 and beyond > 0.0:
-        disc.center = wp.vec2(seen[0], seen[1])
+    if pixel[2] > 0.0 and beyond > 0.0:
+        disc.center = wp.vec2(pixel[0], pixel[1])
         disc.radius = camera.focal * (probe.radius / wp.sqrt(beyond))
     return disc
 

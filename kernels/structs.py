@@ -26,6 +26,16 @@ PHONG = 1
 METALLIC_ROUGHNESS = 2
 MIRROR = 3
 
+# What alpha does.
+OPAQUE = 0
+MASKED = 1
+BLENDED = 2
+
+# What lies beyond a picture's border.
+REPEATED = wp.constant(0)
+CLAMP = wp.constant(1)
+MIRRORED = wp.constant(2)
+
 
 @wp.struct
 class FrameParams:
@@ -85,8 +95,9 @@ class Shape:
     mesh: wp.uint64  # id of the wp.Mesh in local space, for MESH
     tree: wp.uint64  # on CPU the address of its tree of kernels/wide_bvh.py; 0: rays walk the wp.Mesh's own
     first_vertex: wp.int32  # where this mesh's vertices start in the vertex arrays
-    material: wp.int32  # index into the materials; -1 for proxies
+    material: wp.int32  # index of its first material; -1 for proxies
     smooth: wp.int32  # 1: interpolate vertex normals
+    holed: wp.int32  # 1: rays may pass through some of its triangles
 
 
 @wp.struct
@@ -101,15 +112,37 @@ class Material:
     shininess: wp.float32  # PHONG exponent
     metallic: wp.float32
     roughness: wp.float32  # perceptual; alpha is its square
+    # What files add; a scene's own material leaves it at zero, and texture indices at -1.
+    alpha_mode: wp.int32  # OPAQUE, MASKED or BLENDED
+    opacity: wp.float32  # factor of alpha
+    cutoff: wp.float32  # MASKED: alpha from which on there is something
+    single_sided: wp.int32  # 1: not there for rays from behind, but for those that look for light
+    unlit: wp.int32  # 1: shows its base colour as it is
+    emission: wp.vec3  # radiance
+    metallic_roughness_texture: wp.int32  # G times roughness, B times metallic
+    normal_texture: wp.int32
+    normal_scale: wp.float32
+    occlusion_texture: wp.int32  # R
+    occlusion_strength: wp.float32
+    emissive_texture: wp.int32
 
 
 @wp.struct
 class Texture:
-    """Where one texture lies in the packed texels: linear RGB, row 0 is v = 1 (the image's top)."""
+    """One use of a picture: where its texels lie, row 0 is v = 1 (the image's top), and how they are read."""
 
-    offset: wp.int32
+    offset: wp.int32  # of level 0; the others follow, each half as wide and high, rounded down, at least 1
     width: wp.int32
     height: wp.int32
+    levels: wp.int32
+    decode: wp.int32  # where in the table its codes' values start: 0 linear, 256 sRGB
+    wrap_u: wp.int32  # REPEATED, CLAMP or MIRRORED
+    wrap_v: wp.int32
+    nearest: wp.int32  # 1: texels are squares where they are larger than pixels
+    uv_set: wp.int32
+    row_u: wp.vec3  # the picture is read at (row_u, row_v) . (u, v, 1)
+    row_v: wp.vec3
+    size: wp.float32  # texels per texture coordinate, along the transform's longer axis
 
 
 @wp.struct
@@ -120,9 +153,32 @@ class RayScene:
     proxies: wp.array[Shape]
     materials: wp.array[Material]
     textures: wp.array[Texture]
-    texels: wp.array[wp.vec3]
-    vertex_normals: wp.array[wp.vec3]  # all meshes, one after another
+    texels: wp.array[wp.uint32]  # RGBA of 8 bits, R lowest
+    decode_table: wp.array[wp.float32]  # (512,) value of a linear code, then of an sRGB-encoded one
+    vertex_normals: wp.array[wp.vec3]  # of each corner, all meshes one after another
     vertex_uvs: wp.array[wp.vec2]
+    # Empty where no object calls for them, else of all meshes.
+    vertex_uvs_second: wp.array[wp.vec2]
+    vertex_colors: wp.array[wp.vec4]
+    vertex_tangents: wp.array[wp.vec4]
+    triangle_materials: wp.array[wp.int32]  # to be added to ``Shape.material``
+    triangle_density: wp.array[wp.vec2]  # texture coordinates of both sets per unit of the mesh
+    pixel_spread: wp.float32  # angle of a pixel in the picture, radians
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets the scene, in the world. Normals point out of the shape, whichever side the ray comes from."""
+
+    t: wp.float32
+    shape: wp.int32  # index of the object or proxy, -1 for none
+    point: wp.vec3
+    normal: wp.vec3  # for shading: interpolated where the shape is smooth
+    geometric_normal: wp.vec3  # of the surface that rays meet
+    uv: wp.vec2
+    corner: wp.int32  # of the triangle's first corner, among those of all meshes; -1: the shape is no mesh
+    weights: wp.vec2  # barycentric, of the first and second corner
+    error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
 
 
 @wp.struct

@@ -189,16 +189,16 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         # Relative to the camera from the start: far from the world's origin nothing cancels.
         point = probe.radius * (n[0] * axis + n[1] * side) - to_camera
         rim = probe.radius * (least * axis + rim_sine * side) - to_camera
-        seen = project(camera, point)
+        pixel = project(camera, point)
         edge = project(camera, rim)
-        if seen[2] < 0.01 * probe.radius or edge[2] < 0.01 * probe.radius:
+        if pixel[2] < 0.01 * probe.radius or edge[2] < 0.01 * probe.radius:
             return  # beside or behind the lens
-        margin = wp.length(wp.vec2(edge[0] - seen[0], edge[1] - seen[1]))
+        margin = wp.length(wp.vec2(edge[0] - pixel[0], edge[1] - pixel[1]))
 
         # A polynomial lens model folds over beyond its field of view: there the pixel's own ray is another one.
-        i = wp.int32(wp.round(wp.clamp(seen[1], 0.0, wp.float32(rays.shape[0] - 1))))
-        j = wp.int32(wp.round(wp.clamp(seen[0], 0.0, wp.float32(rays.shape[1] - 1))))
-        if wp.abs(seen[1] - wp.float32(i)) < 1.0 and wp.abs(seen[0] - wp.float32(j)) < 1.0:
+        i = wp.int32(wp.round(wp.clamp(pixel[1], 0.0, wp.float32(rays.shape[0] - 1))))
+        j = wp.int32(wp.round(wp.clamp(pixel[0], 0.0, wp.float32(rays.shape[1] - 1))))
+        if wp.abs(pixel[1] - wp.float32(i)) < 1.0 and wp.abs(pixel[0] - wp.float32(j)) < 1.0:
             p = wp.transpose(camera.world_from_camera) * point
             off = wp.cw_mul(wp.vec2(p[0] / p[2], p[1] / p[2]) - rays[i, j], camera.focal)
             if wp.length(off) > FOLD_TOLERANCE:
@@ -217,7 +217,7 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         if wp.static(len(kinds) > 0):
             if hidden_by_proxies(scene, camera.camera_position, point, t_max, pad):
                 return
-        corners_out[row, column, index] = wp.vec3(seen[0], seen[1], margin)
+        corners_out[row, column, index] = wp.vec3(pixel[0], pixel[1], margin)
 
     return project_corners_kernel
 
@@ -324,9 +324,9 @@ def make_gather_probe_kernel(method: str) -> wp.Kernel:
             c01 = corners[row, column + 1, index]
             c10 = corners[row + 1, column, index]
             c11 = corners[row + 1, column + 1, index]
-            seen = wp.min(wp.min(c00[2], c01[2]), wp.min(c10[2], c11[2])) >= 0.0
+            facing = wp.min(wp.min(c00[2], c01[2]), wp.min(c10[2], c11[2])) >= 0.0
             closest = wp.max(wp.max(c00[2], c01[2]), wp.max(c10[2], c11[2]))
-            if seen and closest > rim_start:
+            if facing and closest > rim_start:
                 count_y = 1
                 count_x = 1
                 if wp.static(method == "area"):

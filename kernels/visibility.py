@@ -19,6 +19,7 @@ References:
     [Ize13] Ize, "Robust BVH Ray Traversal", JCGT 2(2), 2013.
     [HHO19] Haines, Guenther, Akenine-Moeller, "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems
     ch. 7, 2019.
+    [WM17] Wyman, McGuire, "Hashed Alpha Testing", I3D 2017.
     [WB19] Waechter, Binder, "A Fast and Robust Method for Avoiding Self-Intersection", Ray Tracing Gems ch. 6, 2019.
 """
 
@@ -32,7 +33,21 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
-from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, FrameParams, Probe, RayScene, Shape
+from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
+from warp_ar.kernels.structs import (
+    BLENDED,
+    BOX,
+    MESH,
+    OPAQUE,
+    PLANE,
+    SPHERE,
+    FrameParams,
+    Hit,
+    Probe,
+    RayScene,
+    Shape,
+)
+from warp_ar.kernels.textures import point_of_triangle, sample_texture, slant
 from warp_ar.kernels.wide_bvh import walk_any, walk_closest
 
 wp.set_module_options({"enable_backward": False})
@@ -46,6 +61,8 @@ MESH_KEY = wp.constant(7)
 # Half the spacing of float32 at 1: the relative error of one rounding.
 ROUNDING = wp.constant(wp.float32(2.0**-24))
 FAR = wp.constant(wp.float32(3.0e38))
+MOST_LAYERS = wp.constant(64)
+"""Triangles of one mesh that a ray passes; behind them it sees nothing of it."""
 
 
 @wp.struct
@@ -56,19 +73,6 @@ class Contact:
     face: wp.int32  # of a mesh
     u: wp.float32  # barycentric weights of the face's first and second corner
     v: wp.float32
-
-
-@wp.struct
-class Hit:
-    """Where a ray meets the scene, in the world. Normals point out of the shape, whichever side the ray comes from."""
-
-    t: wp.float32
-    shape: wp.int32  # index of the object or proxy, -1 for none
-    point: wp.vec3
-    normal: wp.vec3  # for shading: interpolated where the shape is smooth
-    geometric_normal: wp.vec3  # of the surface that rays meet
-    uv: wp.vec2
-    error: wp.float32  # bound on how far rounding may have moved the point off the surface; see offset_origin
 
 
 @wp.struct
@@ -204,6 +208,109 @@ def meets_mesh(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.floa
 
 
 @wp.func
+def is_there(
+    scene: RayScene, shape: Shape, contact: Contact, origin: wp.vec3, direction: wp.vec3, sided: wp.bool
+) -> wp.bool:
+    """Whether a triangle holds up a ray in the shape's coordinates; ``sided``: not from behind, if it is seen so.
+
+    Blended triangles hold up as large a share of rays as their alpha says, by a threshold for each cell of space that
+    is about a pixel wide: it stays with the surface when the camera moves [WM17].
+    """
+    corner = shape.first_vertex + 3 * contact.face
+    index = shape.material
+    if scene.triangle_materials.shape[0] > 0:
+        index += scene.triangle_materials[corner / 3]
+    material = scene.materials[index]
+    if sided and material.single_sided != 0:
+        if wp.dot(wp.mesh_eval_face_normal(shape.mesh, contact.face), direction) > 0.0:
+            return False
+    if material.alpha_mode == OPAQUE:
+        return True
+    uvs = scene.vertex_uvs
+    w = 1.0 - contact.u - contact.v
+    uv = contact.u * uvs[corner] + contact.v * uvs[corner + 1] + w * uvs[corner + 2]
+    weights = wp.vec2(contact.u, contact.v)
+    width = scene.pixel_spread * contact.t
+    point = point_of_triangle(scene, corner, weights, uv, width, shape.scale)
+    alpha = material.opacity * point.color[3]
+    if material.base_texture >= 0:
+        alpha *= sample_texture(scene, material.base_texture, point)[3]
+    if material.alpha_mode == BLENDED:
+        place = origin + contact.t * direction
+        finest = 1.0e-6 * wp.length(shape.extent) + 1.0e-30
+        cells = wp.pow(2.0, -wp.ceil(wp.log2(wp.max(width / shape.scale, finest))))
+        cell = place * cells
+        bits = pcg3d_hash(
+            wp.uint32(wp.int32(wp.floor(cell[0]))),
+            wp.uint32(wp.int32(wp.floor(cell[1]))),
+            wp.uint32(wp.int32(wp.floor(cell[2]))),
+        )
+        return uniform_from_bits(bits[0]) < alpha
+    return alpha >= material.cutoff
+
+
+@wp.func
+def intersect_solid(
+    scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32, sided: wp.bool
+) -> Contact:
+    """Closest face of a mesh that holds up a ray: those that do not are passed, ``MOST_LAYERS`` at most.
+
+    A ray goes on a little behind what it passed: further than rounding could have put it before, so that it does not
+    meet the same face for ever.
+    """
+    found = Contact()
+    found.t = FAR
+    step = 64.0 * ROUNDING * wp.length(shape.extent) / wp.length(direction)
+    start = float(0.0)
+    layer = wp.int32(0)
+    while layer < MOST_LAYERS and start < t_max:
+        contact = intersect_mesh(shape, origin + start * direction, direction, t_max - start)
+        if contact.t >= t_max - start:
+            layer = MOST_LAYERS
+        else:
+            contact.t += start
+            if is_there(scene, shape, contact, origin, direction, sided):
+                found = contact
+                layer = MOST_LAYERS
+            start = contact.t * (1.0 + 8.0 * ROUNDING) + step
+        layer += 1
+    return found
+
+
+@wp.func
+def bumped(scene: RayScene, shape: Shape, hit: Hit, normal: wp.vec3, direction: wp.vec3) -> wp.vec3:
+    """Unit normal of a mesh in its own coordinates as its normal map tilts it, if it has one."""
+    index = shape.material
+    if scene.triangle_materials.shape[0] > 0:
+        index += scene.triangle_materials[hit.corner / 3]
+    material = scene.materials[index]
+    if material.normal_texture < 0 or scene.vertex_tangents.shape[0] == 0:
+        return normal
+    frames = scene.vertex_tangents
+    corner = hit.corner
+    w = 1.0 - hit.weights[0] - hit.weights[1]
+    frame = hit.weights[0] * frames[corner] + hit.weights[1] * frames[corner + 1] + w * frames[corner + 2]
+    tangent = wp.vec3(frame[0], frame[1], frame[2])
+    tangent -= wp.dot(tangent, normal) * normal
+    length = wp.length(tangent)
+    if length < 1.0e-6:
+        return normal
+    tangent = tangent / length
+    bitangent = wp.where(frame[3] < 0.0, -1.0, 1.0) * wp.cross(normal, tangent)
+    cosine = wp.dot(normal, wp.normalize(direction))
+    width = scene.pixel_spread * hit.t * slant(cosine)
+    point = point_of_triangle(scene, corner, hit.weights, hit.uv, width, shape.scale)
+    texel = sample_texture(scene, material.normal_texture, point)
+    x = material.normal_scale * (2.0 * texel[0] - 1.0)
+    y = material.normal_scale * (2.0 * texel[1] - 1.0)
+    tilted = x * tangent + y * bitangent + (2.0 * texel[2] - 1.0) * normal
+    size = wp.length(tilted)
+    if size < 1.0e-6:
+        return normal
+    return tilted / size
+
+
+@wp.func
 def meets_probe(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
     """Whether a mirror ball lies in the way."""
     for index in range(probes.shape[0]):
@@ -294,28 +401,32 @@ class TraceConfig:
     """Kinds among the virtual objects."""
     proxies: tuple[int, ...]
     """Kinds among the proxies."""
+    detail: bool = False
+    """Whether any object's triangles let rays pass or have normal maps."""
 
     def general(self) -> TraceConfig:
-        """For any scene: each shape's kind is asked for as it is met."""
-        return TraceConfig(ALL_KINDS, ALL_KINDS)
+        """For any scene with such triangles or without: each shape's kind is asked for as it is met."""
+        return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail)
 
 
 @functools.cache
-def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
+def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     """Closest hit among shapes of the given kinds."""
-    label = "_".join(map(str, kinds))
+    label = "_".join(map(str, (*kinds, int(detail))))
 
     @wp.func(name=f"closest_hit_{label}", module="unique")
     def closest_hit(
+        scene: RayScene,
         shapes: wp.array[Shape],
-        vertex_normals: wp.array[wp.vec3],
-        vertex_uvs: wp.array[wp.vec2],
         origin: wp.vec3,
         direction: wp.vec3,
         t_max: wp.float32,
     ) -> Hit:
+        vertex_normals = scene.vertex_normals
+        vertex_uvs = scene.vertex_uvs
         hit = Hit()
         hit.shape = -1
+        hit.corner = -1
         hit.t = t_max
         if wp.static(len(kinds) > 0):
             contact = Contact()
@@ -335,7 +446,14 @@ def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
                         t = intersect_plane(shape.extent, o, d, hit.t)
                 if wp.static(MESH in kinds):
                     if shape.kind == MESH:
-                        met = intersect_mesh(shape, o, d, hit.t)
+                        met = Contact()
+                        if wp.static(detail):
+                            if shape.holed != 0:
+                                met = intersect_solid(scene, shape, o, d, hit.t, True)
+                            else:
+                                met = intersect_mesh(shape, o, d, hit.t)
+                        else:
+                            met = intersect_mesh(shape, o, d, hit.t)
                         t = met.t
                         if t < hit.t:
                             contact = met
@@ -387,6 +505,10 @@ def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
                                 normal = geometric
                         hit.uv = contact.u * vertex_uvs[corner] + contact.v * vertex_uvs[corner + 1]
                         hit.uv += w * vertex_uvs[corner + 2]
+                        hit.corner = corner
+                        hit.weights = wp.vec2(contact.u, contact.v)
+                        if wp.static(detail):
+                            normal = bumped(scene, shape, hit, normal, to_local_vector(shape, direction))
                 arm = shape.rotation * (shape.scale * p)
                 hit.point = arm + shape.position
                 hit.normal = shape.rotation * normal
@@ -402,12 +524,12 @@ def _make_closest(kinds: tuple[int, ...]) -> wp.Function:
 
 
 @functools.cache
-def _make_meets(kinds: tuple[int, ...]) -> wp.Function:
+def _make_meets(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     """Whether a ray meets a shape of one of the given kinds."""
-    label = "_".join(map(str, kinds))
+    label = "_".join(map(str, (*kinds, int(detail))))
 
     @wp.func(name=f"meets_{label}", module="unique")
-    def meets(shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    def meets(scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
         o = to_local_point(shape, origin)
         d = to_local_vector(shape, direction)
         if wp.static(SPHERE in kinds):
@@ -421,6 +543,9 @@ def _make_meets(kinds: tuple[int, ...]) -> wp.Function:
                 return intersect_plane(shape.extent, o, d, t_max) < t_max
         if wp.static(MESH in kinds):
             if shape.kind == MESH:
+                if wp.static(detail):
+                    if shape.holed != 0:
+                        return intersect_solid(scene, shape, o, d, t_max, False).t < t_max
                 return meets_mesh(shape, o, d, t_max)
         return False
 
@@ -428,16 +553,18 @@ def _make_meets(kinds: tuple[int, ...]) -> wp.Function:
 
 
 @functools.cache
-def _make_any(kinds: tuple[int, ...]) -> wp.Function:
+def _make_any(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     """Whether a ray meets any of the shapes of the given kinds."""
-    meets = _make_meets(kinds)
-    label = "_".join(map(str, kinds))
+    meets = _make_meets(kinds, detail)
+    label = "_".join(map(str, (*kinds, int(detail))))
 
     @wp.func(name=f"any_hit_{label}", module="unique")
-    def any_hit(shapes: wp.array[Shape], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
+    def any_hit(
+        scene: RayScene, shapes: wp.array[Shape], origin: wp.vec3, direction: wp.vec3, t_max: wp.float32
+    ) -> wp.bool:
         if wp.static(len(kinds) > 0):
             for index in range(shapes.shape[0]):
-                if meets(shapes[index], origin, direction, t_max):
+                if meets(scene, shapes[index], origin, direction, t_max):
                     return True
         return False
 
@@ -445,9 +572,9 @@ def _make_any(kinds: tuple[int, ...]) -> wp.Function:
 
 
 @functools.cache
-def _make_any_of_both(kinds: tuple[int, ...]) -> wp.Function:
+def _make_any_of_both(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     """Whether a ray meets any object or proxy, both of the given kinds: one loop, for the walks in it are long code."""
-    meets = _make_meets(kinds)
+    meets = _make_meets(kinds, detail)
 
     @wp.func(module="unique")
     def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
@@ -458,7 +585,7 @@ def _make_any_of_both(kinds: tuple[int, ...]) -> wp.Function:
                 shape = scene.objects[index]
             else:
                 shape = scene.proxies[index - objects]
-            if meets(shape, origin, direction, t_max):
+            if meets(scene, shape, origin, direction, t_max):
                 return True
         return False
 
@@ -468,34 +595,35 @@ def _make_any_of_both(kinds: tuple[int, ...]) -> wp.Function:
 @functools.cache
 def make_trace(config: TraceConfig) -> Trace:
     """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
-    closest_shape_object, closest_shape_proxy = _make_closest(config.objects), _make_closest(config.proxies)
-    any_object, any_proxy = _make_any(config.objects), _make_any(config.proxies)
+    closest_shape_object = _make_closest(config.objects, config.detail)
+    closest_shape_proxy = _make_closest(config.proxies, False)
+    any_object, any_proxy = _make_any(config.objects, config.detail), _make_any(config.proxies, False)
 
     @wp.func(module="unique")
     def closest_object(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
-        return closest_shape_object(scene.objects, scene.vertex_normals, scene.vertex_uvs, origin, direction, t_max)
+        return closest_shape_object(scene, scene.objects, origin, direction, t_max)
 
     @wp.func(module="unique")
     def closest_proxy(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
-        return closest_shape_proxy(scene.proxies, scene.vertex_normals, scene.vertex_uvs, origin, direction, t_max)
+        return closest_shape_proxy(scene, scene.proxies, origin, direction, t_max)
 
     @wp.func(module="unique")
     def occluded_by_objects(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        return any_object(scene.objects, origin, direction, t_max)
+        return any_object(scene, scene.objects, origin, direction, t_max)
 
     @wp.func(module="unique")
     def occluded_by_proxies(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        return any_proxy(scene.proxies, origin, direction, t_max)
+        return any_proxy(scene, scene.proxies, origin, direction, t_max)
 
     if config.objects == config.proxies:
-        occluded = _make_any_of_both(config.objects)
+        occluded = _make_any_of_both(config.objects, config.detail)
     else:
 
         @wp.func(module="unique")
         def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-            if any_object(scene.objects, origin, direction, t_max):
+            if any_object(scene, scene.objects, origin, direction, t_max):
                 return True
-            return any_proxy(scene.proxies, origin, direction, t_max)
+            return any_proxy(scene, scene.proxies, origin, direction, t_max)
 
     return Trace(closest_object, closest_proxy, occluded_by_objects, occluded_by_proxies, occluded)
 

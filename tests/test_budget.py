@@ -13,7 +13,7 @@ import pytest
 
 from tests.test_pipeline import Frames, frames, make_scene  # noqa: F401  (a fixture)
 from warp_ar.accuracy import budget as auto_quality
-from warp_ar.accuracy.budget import AIM, GAIN, MEMORY, RAISE, SETTING_SECONDS, WINDOW, AutoPipeline, Controller
+from warp_ar.accuracy.budget import AIM, HELD_SECONDS, MEMORY, RAISE, WINDOW, AutoPipeline, Controller
 from warp_ar.accuracy.cost_table import Setting, chosen, load_errors, relevant_settings
 from warp_ar.accuracy.costs import Costs
 from warp_ar.errors import UsageError
@@ -238,7 +238,7 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
     machine.run(2.0)
     for _ in range(30):
         machine.load = float(loads.choice([0.5, 1.0, 1.5, 3.0]))
-        machine.run(1.3, noise=0.3)
+        machine.run(2.0, noise=0.3)
     moved: dict[str, float] = {}
     assert machine.changes() > 5, "the load must have moved it at all"
     for (_, _, a), (now, _, b) in itertools.islice(itertools.pairwise(machine.history), int(2.0 * FPS), None):
@@ -247,7 +247,7 @@ def test_no_setting_moves_twice_in_half_a_second_or_by_two_methods(seed):
                 continue
             methods = machine.controller._methods[setting]
             assert abs(methods.index(a[setting]) - methods.index(b[setting])) == 1
-            assert now - moved.get(setting, -1.0) >= SETTING_SECONDS - 1e-9
+            assert now - moved.get(setting, -1.0) >= HELD_SECONDS - 1e-9
             moved[setting] = now
 
 
@@ -292,14 +292,6 @@ def test_a_single_slow_frame_changes_nothing():
     machine.controller.observe(900.0, machine.now)
     machine.run(5.0)
     assert machine.changes() == before
-
-
-def test_what_is_hardly_better_is_not_worth_a_change():
-    errors = {"irradiance": {"sh2": 1.0, "sh4": 1.0 - 0.5 * GAIN}}
-    costs = Costs(20.0, {"irradiance": {"sh2": 0.0, "sh4": 12.0}})
-    controller = Controller(costs, errors, 30.0)
-    assert controller.settings == {"irradiance": "sh2"}
-    assert not any(controller.observe(1.0, index / FPS) for index in range(600))
 
 
 # ------------------------------------------------------------------------------------------------------ the pipelines

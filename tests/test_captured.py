@@ -96,12 +96,22 @@ def test_somebody_elses_map_is_cleaned(tmp_path):
     assert light.exposure is None
 
 
+NO_NUMBER = (
+    '{"direction": [0, 0, 1], "solid_angle": NaN, "power": [1, 1, 1], "low": [1, 1, 1], "high": null, '
+    '"distance": null, "origin": [0, 0, 0]}'
+)
+
+
 @pytest.mark.parametrize(
     ("channels", "attributes", "message"),
     [
         ({"Y": np.ones((4, 8), np.float32)}, {}, "R, G and B"),
         ({"RGB": np.ones((4, 9, 3), np.float32)}, {}, "twice as wide"),
         ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": "[{}]"}, "emitters is damaged"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": "[" * 200_000}, "levels of nesting"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"emitters": f"[{NO_NUMBER}]"}, "a number that is not finite"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"whiteLevel": "bright"}, "whiteLevel is 'bright'"),
+        ({"RGB": np.ones((4, 8, 3), np.float32)}, {"exposure": float("nan")}, "exposure is 'nan'"),
     ],
 )
 def test_files_that_are_no_light(tmp_path, channels, attributes, message):

@@ -13,11 +13,13 @@ from warp_ar import doctor
 from warp_ar.errors import SceneError
 from warp_ar.input.check_ball import check_balls
 from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_print import check_print
+from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.checkup import check_up
 from warp_ar.input.finding import Finding, fault_errors, worst_first
 from warp_ar.input.sources import open_source
-from warp_ar.scene import Scene, load_scene, loads_scene
+from warp_ar.scene import Scene, SourceSpec, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 
 FRAMES = 96
@@ -141,6 +143,22 @@ def painted(color, share=1.0):
     return change
 
 
+def test_a_box_beside_its_edges_is_seen(looks):
+    scene = load_scene("desk")
+    look = looks["desk"]
+    few = look.views[::24]
+    assert check_proxies(scene, look.camera, few) == []
+    box = next(index for index, proxy in enumerate(scene.proxies) if proxy.shape == "box")
+    for off in ((0.015, 0.0, 0.0), (-0.01, 0.01, 0.0)):
+        at = tuple(a + b for a, b in zip(scene.proxies[box].at, off, strict=True))
+        proxies = list(scene.proxies)
+        proxies[box] = dataclasses.replace(proxies[box], at=at)
+        (found,) = check_proxies(dataclasses.replace(scene, proxies=tuple(proxies)), look.camera, few)
+        assert found.name == "proxy.edges"
+        right = [float(value) for value in found.remedy.split("[")[1].split("]")[0].split(",")]
+        assert right == pytest.approx(scene.proxies[box].at, abs=0.003)
+
+
 PICTURES = {
     "overexposed": ("card.clipped", gain(2.2)),
     "underexposed": ("card.dark", gain(0.2)),
@@ -217,6 +235,10 @@ def test_right_set_ups_raise_no_alarm(clip, change, looks):
     few = spoiled(few, RIGHT[change])
     scene = load_scene(clip)
     found = [*check_scene(scene), *check_pictures(scene, few), *check_balls(scene, few, 1)]
+    found += [
+        *check_proxies(scene, few.camera, few.views[::12]),
+        *check_print(scene.marker, few.camera, few.views[::12]),
+    ]
     assert [(finding.name, finding.text) for finding in found] == []
 
 
@@ -231,6 +253,25 @@ def test_command_says_it_and_ends_with_1(capsys, tmp_path):
     assert "35 millimetres are 0.035 m" in said
     assert "do: write the radius in metres" in said
     assert doctor.main(["nowhere"]) == 2
+
+
+def test_a_camera_that_may_not_be_opened_is_a_finding(tmp_path, monkeypatch):
+    monkeypatch.setattr(doctor, "DEVICES", tmp_path)
+    scene = dataclasses.replace(load_scene("desk"), source=SourceSpec(camera=3))
+    (found,) = doctor.check_access(scene, None)
+    assert found.name == "source.absent"
+    assert "no capture device 3" in found.text
+    (tmp_path / "video0").touch()
+    (found,) = doctor.check_access(scene, None)
+    assert "there are 0" in found.remedy
+    device = tmp_path / "video3"
+    device.touch()
+    assert doctor.check_access(scene, None) == []
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    (found,) = doctor.check_access(scene, None)
+    assert found.name == "source.permission"
+    assert "group" in found.remedy
+    assert doctor.check_access(scene, tmp_path / "clip.mp4") == []
 
 
 def test_unreadable_source_is_a_finding(tmp_path):

@@ -14,6 +14,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 
 from warp_ar import explain, live
@@ -415,3 +416,33 @@ def test_a_guessed_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[
     scene.write_text(text.replace("[camera]", "[camera]\nfield_of_view = 50.0"))
     assert run(tmp_path, "--headless", "--frames", 2) == 0  # the folder, which holds one scene
     assert "the camera is guessed, with a field of view of 50 degrees" in message(capsys)
+
+
+def test_layers_are_written_beside_the_picture(tmp_path: Path) -> None:
+    scene, out, layers = write_scene(tmp_path), tmp_path / "out", tmp_path / "layers"
+    arguments = ("--headless", "--frames", 2, "--output", out, "--save-layers", layers)
+    assert run(scene, *arguments, "--layers", "objects,depth", "--layer-pictures") == 0
+    assert sorted(path.name for path in layers.glob("*.exr")) == ["0000.exr", "0001.exr"]
+    assert sorted(path.name for path in (layers / "depth").iterdir()) == ["0000.png", "0001.png"]
+    with OpenEXR.File(str(layers / "0001.exr")) as file:
+        assert [part.header["name"] for part in file.parts] == ["objects", "depth"]
+    plain = tmp_path / "plain"
+    assert run(scene, "--headless", "--frames", 2, "--output", plain) == 0
+    for name in ("0000.png", "0001.png"):
+        assert (plain / name).read_bytes() == (out / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--layers", "depth"), "--layers depth needs --save-layers DIR"),
+        (("--layer-pictures",), "--layer-pictures needs --save-layers DIR"),
+        (("--save-layers", "layers", "--layers", "beauty"), "--layers: 'beauty' is no layer"),
+    ],
+)
+def test_layers_that_cannot_be_are_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: tuple, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(write_scene(tmp_path), "--headless", *arguments) == 2
+    assert words in message(capsys)

@@ -10,9 +10,9 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.reference import materials as reference
-from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe, sample_texture
+from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe
 from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Material, RayScene, Texture
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene, Shape
 
 MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
 
@@ -65,24 +65,14 @@ def reflect_kernel(
 ):
     i = wp.tid()
     normal = wp.vec3(0.0, 0.0, 1.0)
-    surface = surface_at(scene, dfg, 0, wp.vec2(0.0), wo[i][2])
+    hit = Hit()
+    hit.corner = -1
+    surface = surface_at(scene, dfg, hit, wo[i][2], 0.0)
     direct_out[i] = reflect_direct(surface, normal, wo[i], wi[i])
     diffuse_out[i] = surface.diffuse
     reflectance_out[i] = surface.reflectance
-    lambert = lambert_at(scene, dfg, 0, wp.vec2(0.0), wo[i][2])
+    lambert = lambert_at(scene, dfg, hit, wo[i][2], 0.0)
     lambert_out[i] = reflect_lambert(lambert, normal, wo[i], wi[i])
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def texture_kernel(
-    # In:
-    scene: RayScene,
-    uvs: wp.array[wp.vec2],
-    # Out:
-    color_out: wp.array[wp.vec3],
-):
-    i = wp.tid()
-    color_out[i] = sample_texture(scene, 1, uvs[i])
 
 
 def vectors(values, device):
@@ -103,7 +93,9 @@ def lobes(wi, wo, parameter, device):
 
 def material(**fields):
     record = np.zeros(1, np.dtype(Material.numpy_dtype()))
-    record["base_texture"] = record["specular_texture"] = -1
+    for name in record.dtype.names:
+        if name.endswith("_texture"):
+            record[name] = -1
     record["base_color"] = record["specular"] = 1.0
     for name, value in fields.items():
         record[name] = value
@@ -122,6 +114,7 @@ def reflected(record, wi, wo, device):
     wi, wo = np.broadcast_arrays(wi, wo)
     scene = RayScene()
     scene.materials = wp.array(record, dtype=Material, device=device)
+    scene.objects = wp.zeros(1, dtype=Shape, device=device)
     outputs = [wp.zeros(len(wi), dtype=wp.vec3, device=device) for _ in range(4)]
     wp.launch(
         reflect_kernel,
@@ -252,34 +245,6 @@ def test_phong_virtual_lights_keep_energy(device):
             assert total < 0.7 + ALBEDO_TOLERANCE
             if cos_o == 1.0:
                 assert total == pytest.approx(0.7, abs=ALBEDO_TOLERANCE)
-
-
-# --- Textures ---------------------------------------------------------------------------------------------------------
-
-
-def test_texture_matches_reference(device):
-    """A ramp and noise, odd sizes, across the repeat and far outside; a half-texel shift would show."""
-    rng = np.random.default_rng(3)
-    image = rng.random((5, 7, 3)).astype(np.float32)
-    scene = RayScene()
-    records = np.zeros(2, np.dtype(Texture.numpy_dtype()))
-    records["offset"], records["width"], records["height"] = (0, 4), (2, 7), (2, 5)
-    scene.textures = wp.array(records, dtype=Texture, device=device)
-    texels = np.concatenate([np.full((4, 3), 9.0, np.float32), image.reshape(-1, 3)])
-    scene.texels = wp.array(texels, dtype=wp.vec3, device=device)
-    corners = [(0, 0), (1, 1), (1 - 1e-8, 1e-8), (-1e-9, 1 + 1e-9), (0.5 / 7, 1 - 0.5 / 5), (-3.25, 7.75)]
-    uvs = np.concatenate([corners, rng.uniform(-2, 3, (2000, 2))]).astype(np.float32)
-    colors = wp.zeros(len(uvs), dtype=wp.vec3, device=device)
-    wp.launch(
-        texture_kernel,
-        dim=len(uvs),
-        inputs=[scene, wp.array(uvs, dtype=wp.vec2, device=device)],
-        outputs=[colors],
-        device=device,
-    )
-    # uv of 3 is rounded to 2e-7, seven texels wide.
-    np.testing.assert_allclose(colors.numpy(), reference.texture(image, uvs.astype(np.float64)), atol=1e-5)
-    np.testing.assert_allclose(colors.numpy()[4], image[0, 0], atol=1e-6)
 
 
 # --- Hard cases -------------------------------------------------------------------------------------------------------

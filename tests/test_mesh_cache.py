@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from warp_ar.errors import SceneError
 from warp_ar.scene import mesh_cache
@@ -22,7 +23,16 @@ def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def write(path: Path, scale: float = 1.0) -> Path:
-    trimesh.creation.icosphere(subdivisions=1, radius=scale).export(path)
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=scale)
+    if path.suffix == ".glb":  # with a material of every field
+        picture = Image.new("RGBA", (2, 3), (1, 2, 3, 100))
+        names = ("baseColor", "metallicRoughness", "normal", "occlusion", "emissive")
+        material = trimesh.visual.material.PBRMaterial(
+            name="all", alphaMode="MASK", emissiveFactor=[0.5, 0, 0], **{f"{name}Texture": picture for name in names}
+        )
+        uv = np.abs(ball.vertices[:, :2])
+        ball.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    ball.export(path)
     return path
 
 
@@ -37,7 +47,11 @@ def test_a_kept_mesh_is_the_same(cache: Path, tmp_path: Path, monkeypatch: pytes
         for field in dataclasses.fields(expected):
             value, kept = getattr(expected, field.name), getattr(mesh, field.name)
             assert (value is None) == (kept is None)
-            if value is not None:
+            if field.name in ("materials", "notes"):
+                assert kept == value
+            elif field.name == "images":
+                assert [image.tobytes() for image in kept] == [image.tobytes() for image in value]
+            elif value is not None:
                 assert kept.dtype == value.dtype
                 np.testing.assert_array_equal(kept, value)
 

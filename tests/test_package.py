@@ -9,6 +9,7 @@ import warp_ar
 
 PUBLIC = {
     *(
+        "LAYERS",
         "PRESETS",
         "Capture",
         "Light",
@@ -41,7 +42,7 @@ PUBLIC = {
 def test_all_is_pinned_and_resolves() -> None:
     assert set(warp_ar.__all__) == PUBLIC
     for name in warp_ar.__all__:
-        assert name == "PRESETS" or getattr(warp_ar, name).__doc__
+        assert name in ("LAYERS", "PRESETS") or getattr(warp_ar, name).__doc__
 
 
 def test_import_does_not_initialise_warp() -> None:

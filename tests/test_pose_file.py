@@ -82,6 +82,20 @@ def test_poses_of_a_clip(tmp_path):
         load_poses(tmp_path / "images.txt")
 
 
+def test_poses_of_absurd_numbers(tmp_path):
+    """Whole numbers too large for a float, and quaternions whose squares are no numbers any more."""
+    (tmp_path / "poses.json").write_text(f'[{{"R": [{", ".join(["1" + 400 * "0"] * 9)}], "t": [0, 0, 1]}}]')
+    with pytest.raises(SceneError, match="pose 0: expected R, a rotation matrix"):
+        load_poses(tmp_path / "poses.json")
+    (tmp_path / "images.txt").write_text("1 1e-200 0 0 1e-200 0 0 1 1 a.png\n")
+    rotation, _ = load_poses(tmp_path / "images.txt")[0]
+    assert np.allclose(rotation, [0, -1, 0, 1, 0, 0, 0, 0, 1])
+    for huge in ("1e308 1e308 1e308 1e308", "1e999 0 0 0"):
+        (tmp_path / "images.txt").write_text(f"1 {huge} 0 0 1 1 a.png\n")
+        with pytest.raises(SceneError, match="QW QX QY QZ"):
+            load_poses(tmp_path / "images.txt")
+
+
 def test_frames_take_their_poses_in_turn(tmp_path, device):
     (tmp_path / "images.txt").write_text(COLMAP)
     scene = loads_scene(HEAD + 'file = "images.txt"\n', tmp_path / "scene.toml")

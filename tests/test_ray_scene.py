@@ -16,15 +16,14 @@ from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.scene import Pose
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.object_materials import reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import (
     HostScene,
-    linear_texture,
     make_ray_mesh,
-    reflects_diffusely,
-    reflects_glossily,
     trace_config,
 )
 from warp_ar.scene.screen_extents import EMPTY, Outline, screen_rects
+from warp_ar.scene.texture_pack import linear_texture
 
 CAMERA = scenes.Camera(width=64, height=48, fx=60.0, fy=62.0, cx=30.5, cy=24.0)
 BENT = dataclasses.replace(CAMERA, distortion=(-0.25, 0.08, 0.003, -0.002, 0.0))
@@ -204,7 +203,9 @@ def test_materials_and_textures(device, tmp_path):
     np.testing.assert_allclose(values["base_color"], [[1, 1, 1], [1, 1, 1], [0.1, 0.2, 0.3], [0.9, 0.9, 0.9]])
     assert (values["shininess"][0], values["metallic"][1], values["roughness"][1]) == (9.0, 0.25, 0.75)
     np.testing.assert_allclose(values["specular"][0], [0.1, 0.2, 0.3])
-    np.testing.assert_allclose(host.ray_scene.texels.numpy(), linear_texture(picture).reshape(-1, 3))
+    texels = host.ray_scene.texels.numpy().view(np.uint8).reshape(-1, 4)
+    np.testing.assert_array_equal(texels[:2], np.concatenate([picture[0], np.full((2, 1), 255)], axis=1))
+    assert (records(host, "textures")["levels"].tolist(), len(texels)) == ([2], 3)
     assert linear_texture(np.array([0, 255], np.uint8)).tolist() == [0.0, 1.0]
 
 

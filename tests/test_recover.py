@@ -21,12 +21,12 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.light import noise, recovery, regions
+from warp_ar.light import fit, noise, recovery, regions
 from warp_ar.light import solver as light_solver
 from warp_ar.light import surfaces as light_surfaces
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.problem import mirroring_points
-from warp_ar.scene import Pose, load_scene, loads_scene
+from warp_ar.scene import Pose, Proxy, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene, trace_config
 from warp_ar.session import Session
@@ -596,6 +596,59 @@ def test_errors_are_shared_by_what_is_near():
     half = noise.shared_errors(overlap, plane, np.arange(103) % 2 == 0)
     assert len(half) == 52
     assert half[2:] == pytest.approx(0.5 * shared[4::2], rel=0.03)
+
+
+def boxed(scene, count, side=0.01):
+    """The scene with so many boxes more, each a little farther from the ball than the last."""
+    x, y, _ = scene.probes[0].center
+    boxes = [Proxy("box", at=(x + 0.1 + 0.02 * k, y, 0.5 * side), size=(side, side, side)) for k in range(count)]
+    return dataclasses.replace(scene, proxies=(*scene.proxies, *boxes))
+
+
+def test_what_is_read_is_bounded_however_many_boxes_there_are(scene):
+    """Ten boxes are read at 25 points a face; of a hundred the largest share as many points; a plane keeps its own."""
+    bare = dataclasses.replace(scene, proxies=tuple(p for p in scene.proxies if p.shape == "plane"))
+    config = CONFIG.surfaces
+
+    def faces(count):
+        surfaces = light_surfaces.find_surfaces(boxed(bare, count))
+        on_faces = surfaces.kinds[surfaces.surface] == Kind.FACE
+        return np.count_nonzero(on_faces), np.unique(surfaces.groups[surfaces.kinds == Kind.FACE])
+
+    assert faces(10)[0] == 10 * 6 * 25
+    for count in (16, 17, 100):
+        points, groups = faces(count)
+        assert 0 < points <= config.box_points
+        # The nearest ones, which come first here; proxy 0 is the plane.
+        assert list(groups - 2) == list(range(1, 1 + config.boxes))
+
+
+def test_many_planes_share_points_as_well(scene):
+    planes = [Proxy("plane", at=(0.0, 0.0, -0.01 * k), size=(1.0, 1.0)) for k in range(40)]
+    surfaces = light_surfaces.find_surfaces(dataclasses.replace(scene, proxies=tuple(planes)))
+    on_planes = surfaces.kinds[surfaces.surface] == Kind.PLANE
+    assert np.count_nonzero(surfaces.kinds == Kind.PLANE) == CONFIG.surfaces.planes
+    # Every k-th point is left.
+    assert 0.5 * CONFIG.surfaces.plane_points < np.count_nonzero(on_planes) <= CONFIG.surfaces.plane_points + 8
+
+
+def test_equations_agree_with_their_matrix():
+    """Products that leave zeros out are those with them: surfaces without an equation among others."""
+    rng = np.random.default_rng(5)
+    light, surface, first, count = rng.random((9, 3)), np.array([0, 0, 1, 1, 1, 3, 4, 4, 4]), 5, 6
+    matrix = np.zeros((9, first + count))
+    matrix[:, :3] = light
+    matrix[np.arange(9), first + surface] = -1.0
+    equations = fit.Equations(light, surface, first, count)
+    z, weights, values = rng.random(first + count), rng.random(9), rng.random((9, 4))
+    assert equations.times(z) == pytest.approx(matrix @ z)
+    assert equations.transposed(values) == pytest.approx(matrix.T @ values)
+    assert equations.transposed(values[:, 0]) == pytest.approx(matrix.T @ values[:, 0])
+    hessian = np.eye(first + count)
+    equations.add_normal(hessian, weights)
+    assert hessian == pytest.approx(np.eye(first + count) + matrix.T @ (weights[:, None] * matrix))
+    none = fit.Equations(light[:0], surface[:0], first, count)
+    assert not none.transposed(values[:0]).any()
 
 
 TWO_SOLVERS = """

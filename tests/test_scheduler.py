@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import os
 import subprocess
 import sys
 import threading
 import types
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -320,6 +322,34 @@ def test_stages_without_a_common_input_run_side_by_side(monkeypatch: pytest.Monk
     scheduler._threads = 2  # on any machine
     assert run_count(scheduler.run()) == 2
     scheduler.close()
+
+
+def test_threads_of_a_scheduler_that_nobody_closed_keep_what_they_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is collected, its threads are told to end, and until they have, their tables stay.
+
+    A thread that wakes up when its tables are gone writes into memory of others: ``malloc(): smallbin``.
+    """
+    scheduler = Scheduler(plan_of(monkeypatch, chain("a", "b"), ("b",)), inputs("cpu"), wp.get_device("cpu"), bands=2)
+    scheduler._threads = 3
+    scheduler.run()
+    crew = scheduler._crew
+    assert crew is not None
+    tables = (crew._state, crew._stages, crew._passes, crew._calls, crew._readers, crew._system)
+    kept, collected, threads = [weakref.ref(table) for table in tables], weakref.ref(crew), crew._threads.copy()
+    told = crew._end.detach()  # as if no thread had woken up yet
+    assert told is not None
+    stop, counted = told[1], told[2][2]
+    del scheduler, crew, tables, told
+    gc.collect()
+    assert collected() is None, "threads do not keep the scheduler"
+    assert [table() is not None for table in kept] == [True] * 6
+    assert all(thread.is_alive() for thread in threads)
+    stop(kept[0](), kept[-1](), counted)
+    for thread in threads:
+        thread.join(10.0)
+        assert not thread.is_alive()
+    gc.collect()
+    assert [table() for table in kept] == [None] * 6
 
 
 def test_passes_take_part_when_they_are_due(monkeypatch: pytest.MonkeyPatch, device: str) -> None:

@@ -50,6 +50,8 @@ def test_what_cannot_be_shown_changes_nothing() -> None:
         before = session.pipeline
         with pytest.raises(UsageError, match="no preset"):
             session.change(quality="best")
+        with pytest.raises(UsageError, match="scene is str; expected a Scene"):
+            session.change(scene="desk")
         camera = dataclasses.replace(scene().camera, width=320, height=200)
         assert isinstance(camera, Camera)
         with pytest.raises(SceneError):

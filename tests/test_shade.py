@@ -66,7 +66,9 @@ def make_distant_light(models, device, radiance=1.0):
 
 def materials(*fields, device):
     records = np.zeros(len(fields), np.dtype(structs.Material.numpy_dtype()))
-    records["base_texture"] = records["specular_texture"] = -1
+    for name in records.dtype.names:
+        if name.endswith("_texture"):
+            records[name] = -1
     for record, values in zip(records, fields, strict=True):
         for name, value in values.items():
             record[name] = value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 import shutil
 import subprocess
@@ -415,6 +416,77 @@ def test_full_disk_at_the_start_leaves_what_stood_there(disk: pathlib.Path, name
     with pytest.raises(SinkError, match="No space left"):
         fill()
     assert (disk / name).read_bytes() == before
+
+
+@contextlib.contextmanager
+def file_limit(size: int) -> Iterator[None]:
+    """Let no file of this process grow beyond so many bytes: a quota where no disk can be mounted.
+
+    Python ignores SIGXFSZ, so that a write beyond the limit fails with EFBIG, as one onto a full disk does with ENOSPC.
+    """
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("limit", [0, 2_000, 30_000, 70_000, 150_000])
+@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
+def test_a_limit_of_files_leaves_whole_files_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
+    """Flat frames fit, those of noise do not in the end: a video by and by, a frame at once."""
+    noise_rows = 240 if name in ("frames", "light") else 48
+    threads = threading.active_count()
+    rng = np.random.default_rng(0)
+    sink = EnvironmentSink(tmp_path / name) if name == "light" else open_sink(tmp_path / name, fps=24)
+
+    def fill() -> None:
+        with sink:
+            for index in range(200):
+                image = np.full((noise_rows, 320, 3), index % 5, np.uint8)
+                if index >= 3:
+                    image = rng.integers(0, 256, image.shape, dtype=np.uint8)
+                sink.write(image.astype(np.float32) if name == "light" else image)
+
+    with file_limit(limit), pytest.raises(SinkError, match="File too large"):
+        fill()
+    if name in ("frames", "light"):
+        assert sink.written == len(list((tmp_path / name).iterdir()))
+        assert sink.written == (3 if limit >= 30_000 else 0) or limit == 2_000  # where some flat frames fit
+        images = [read_environment(path) if name == "light" else path for path in (tmp_path / name).iterdir()]
+        assert name == "frames" or all(image.shape == (noise_rows, 320, 3) for image in images)
+        assert name == "light" or not images or len(levels(tmp_path / name)) == sink.written
+    elif (tmp_path / name).exists():
+        assert len(levels(tmp_path / name)) == sink.written > 0
+    else:
+        assert sink.written == 0
+    assert limit < 150_000 or sink.written > 0
+    assert not list(tmp_path.rglob(".*"))
+    assert threading.active_count() <= threads
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("name", VIDEOS)
+def test_a_limit_at_the_start_leaves_what_stood_there(tmp_path: pathlib.Path, name: str) -> None:
+    with open_sink(tmp_path / name, fps=24) as sink:
+        for level in range(20):
+            sink.write(flat(level))
+    before = (tmp_path / name).read_bytes()
+    rng = np.random.default_rng(0)
+
+    def fill() -> None:
+        with open_sink(tmp_path / name, fps=24) as sink:
+            for _ in range(20):
+                sink.write(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8))
+
+    with file_limit(4096), pytest.raises(SinkError, match="File too large"):
+        fill()
+    assert (tmp_path / name).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 # --------------------------------------------------------------------------------------------------------------- errors

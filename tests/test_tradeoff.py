@@ -9,7 +9,8 @@ import pytest
 from tests.accuracy_rig import setting
 from warp_ar import tradeoff
 from warp_ar.accuracy import case_report
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.signature import is_signed
 
 pytest.importorskip("flip_evaluator")
 pytest.importorskip("matplotlib")
@@ -28,6 +29,38 @@ def test_command_writes_all_three(tmp_path, monkeypatch, capsys, device):
     methods = list(setting("expose").methods)
     assert [json.loads(line)["method"] for line in lines[: len(methods)]] == methods
     assert "expose" in capsys.readouterr().out
+    assert all(is_signed(path) for path in (tmp_path / "out").iterdir())
+
+
+def no_measurement(*_):
+    raise AssertionError("measured before its files were looked at")
+
+
+def test_nothing_of_somebody_elses_is_overwritten(tmp_path, monkeypatch, capsys, device):
+    monkeypatch.setattr(case_report, "RUNS", ("paper", "low"))
+    arguments = ["darken", "--presets", "--frames", "1", "--shrink", "8", "--device", device, "--out", str(tmp_path)]
+    (tmp_path / "presets.json").write_text("mine")
+    with monkeypatch.context() as before:
+        before.setattr(tradeoff, "measure", no_measurement)
+        assert tradeoff.main(arguments) == EXIT_FAILED
+    assert "presets.json is there, and this program did not write it" in capsys.readouterr().err
+    assert (tmp_path / "presets.json").read_text() == "mine"
+    assert tradeoff.main([*arguments, "--overwrite"]) == EXIT_DONE
+    assert "as --overwrite says" in capsys.readouterr().err
+    assert tradeoff.main(arguments) == EXIT_DONE  # its own is replaced, with a word
+    assert "presets.json is replaced: this program wrote it before" in capsys.readouterr().err
+
+
+def test_extra_lines_are_read_before_anything_is_measured(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tradeoff, "measure", no_measurement)
+    lines = tmp_path / "tradeoff.jsonl"
+    for text, message in (("[1]", "expected an object"), ("{", "line 1 cannot be read"), ("[" * 100, "nesting")):
+        lines.write_text(text + "\n")
+        assert tradeoff.main(["darken", "--extra", str(lines)]) == EXIT_USAGE
+        assert message in capsys.readouterr().err
+    lines.write_text("{}\n")
+    assert tradeoff.main(["darken", "--presets", "--extra", str(lines), "--out", str(tmp_path)]) == EXIT_USAGE
+    assert "is the same as --extra" in capsys.readouterr().err
 
 
 def test_presets_alone(tmp_path, monkeypatch, device):

@@ -60,6 +60,7 @@ from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.budget import BudgetSetting
+from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
@@ -108,6 +109,12 @@ GOOD = [
     {"type": "play", "on": True},
     {"type": "scene", "name": "torus"},
     {"type": "reset"},
+    {"type": "undo"},
+    {"type": "redo"},
+    {"type": "add", "part": "proxy", "kind": "plane"},
+    {"type": "outline", "kind": "wall", "points": [[1, 2], [3, 4], [5, 6.5], [7, 8]]},
+    {"type": "card", "radius": 0.03, "ruler": 0.097},
+    {"type": "setup", "step": "check"},
     {"type": "camera", "width": 640, "height": 480},
     {"type": "no_camera"},
     {"type": "calibrate", "step": "start"},
@@ -118,7 +125,11 @@ GOOD = [
 @pytest.mark.parametrize("message", GOOD, ids=lambda m: m["type"])
 def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
     command = parse_text(json.dumps(message))
-    values = [tuple(v) if isinstance(v, list) else v for k, v in message.items() if k != "type"]
+
+    def plain(value: Any) -> Any:
+        return tuple(map(plain, value)) if isinstance(value, list) else value
+
+    values = [plain(v) for k, v in message.items() if k != "type"]
     assert list(vars(command).values()) == values
 
 
@@ -146,6 +157,12 @@ def test_what_the_page_says_is_understood(message: dict[str, Any]) -> None:
         ('{"type": "set", "part": "light", "index": 0, "key": "at", "value": {"a": 1}}', "set: value"),
         ('{"type": "add", "part": "object", "kind": "mesh"}', "add: kind"),
         ('{"type": "add", "part": "object", "kind": "spot"}', "add: kind"),
+        ('{"type": "add", "part": "proxy", "kind": "mesh"}', "add: kind"),
+        ('{"type": "outline", "kind": "door", "points": [[0, 0], [1, 0], [1, 1], [0, 1]]}', "outline: kind"),
+        ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1]]}', "outline: points"),
+        ('{"type": "outline", "kind": "wall", "points": [[0, 0], [1, 0], [1, 1], [0, "x"]]}', "outline: points"),
+        ('{"type": "card", "radius": "large", "ruler": 0.1}', "card: radius"),
+        ('{"type": "setup", "step": "all"}', "setup: step"),
         ('{"type": "camera", "width": 100000, "height": 480}', "camera: width"),
         ('{"type": "quality", "name": "' + "x" * 65 + '"}', "quality: name"),
         ('{"type": "quality", "name": "' + "x" * 5000 + '"}', "4096 at most"),
@@ -302,15 +319,85 @@ def test_every_bundled_scene_is_told_to_the_page_without_a_path(name: str) -> No
     assert "/" not in record
 
 
-@pytest.mark.parametrize("kind", [kind for kinds in protocol.KINDS.values() for kind in kinds])
-def test_what_can_be_added_can_be_read_back(kind: str) -> None:
-    part = "object" if kind in protocol.KINDS["object"] else "light"
+@pytest.mark.parametrize(("part", "kind"), [(part, kind) for part, kinds in protocol.KINDS.items() for kind in kinds])
+def test_what_can_be_added_can_be_read_back(part: str, kind: str) -> None:
     scene = edits.add_part(page_scene(), part, kind)
     assert edits.checked(scene) == scene
     for _ in range(edits.MOST_PARTS):
         with contextlib.suppress(UsageError):
             scene = edits.add_part(scene, part, kind)
-    assert len(scene.objects if part == "object" else scene.lights) == edits.MOST_PARTS
+    lists = {"object": scene.objects, "light": scene.lights, "proxy": scene.proxies}
+    assert len(lists[part]) == edits.MOST_PARTS
+
+
+def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
+    scene = page_scene()
+    used = edits.use_card(scene, 0.031, 0.097)
+    assert (used.objects, used.lights) == (scene.objects, scene.lights)
+    assert edits.card_ruler(used) == pytest.approx(0.097)
+    assert edits.card_ruler(edits.use_card(scene, 0.031, 0.1)) == pytest.approx(0.1)
+    assert edits.card_ruler(scene) is None
+    assert used.marker.board.square_length == pytest.approx(0.97 * SHEET.board.square_length)
+    assert used.probes[0].center == pytest.approx((0.0, 0.97 * 0.114, 0.031))
+    assert any(proxy.shape == "plane" for proxy in used.proxies)
+    own = edits.set_value(used, "marker", 0, "size", 0.05)
+    assert own.marker.board is None
+    assert own.marker.size == 0.05
+    for radius, ruler, said in [(31.0, 0.1, "31000 mm; expected 5 to"), (0.03, 97.0, "97000 mm; expected 50 to 150")]:
+        with pytest.raises(UsageError, match=said):
+            edits.use_card(scene, radius, ruler)
+
+
+def test_edits_are_undone_and_done_again() -> None:
+    told: list[dict[str, Any]] = []
+    feed = Feed(Synthetic("card", size=SIZE))
+    start = Wanted(page_scene(), PRESETS["low"])
+    controls = Controls(feed, start, told.append)
+
+    def edit(**message: Any) -> None:
+        made = edits.make_edit(parse_text(json.dumps(message)), start)
+        assert made is not None
+        controls.change(*made)
+
+    seen = [controls.wanted]
+    for message in (
+        {"type": "remove", "part": "object", "index": 0},
+        {"type": "add", "part": "light", "kind": "spot"},
+        {"type": "set", "part": "proxy", "index": 0, "key": "at", "value": [0.1, 0.0, 0.0]},
+        {"type": "show", "part": "light", "index": 0, "on": False},
+        {"type": "effect", "name": "receiver", "on": False},
+        {"type": "method", "stage": "prefilter", "method": "box_mip"},
+        {"type": "card", "radius": 0.03, "ruler": 0.1},
+        {"type": "reset"},
+    ):
+        edit(**message)
+        assert controls.wanted != seen[-1]
+        seen.append(controls.wanted)
+    assert told[-1]["undo"] == "undo all edits"
+    controls.change(lambda w: dataclasses.replace(w, quality=PRESETS["high"]))  # no edit: it stays
+    for before in seen[-2::-1]:
+        controls.undo()
+        assert controls.wanted == dataclasses.replace(before, quality=PRESETS["high"])
+    assert told[-1]["undo"] is None
+    assert told[-1]["redo"] == "remove object 1"
+    controls.undo()
+    for after in seen[1:]:
+        controls.redo()
+        assert controls.wanted == dataclasses.replace(after, quality=PRESETS["high"])
+    # What is done anew forgets what was undone; a drag is one edit.
+    controls.undo()
+    for x in (0.1, 0.2, 0.3):
+        edit(type="set", part="light", index=0, key="at", value=[x, 0.0, 0.2])
+    assert told[-1]["redo"] is None
+    controls.undo()
+    assert controls.wanted == dataclasses.replace(seen[-2], quality=PRESETS["high"])
+    # An edit that cannot be built is none.
+    good = controls.wanted
+    edit(type="add", part="object", kind="box")
+    controls.give_back(good)
+    controls.undo()
+    assert controls.wanted == dataclasses.replace(seen[-3], quality=PRESETS["high"])
+    controls.close()
 
 
 # --------------------------------------------------------------------------------------------------------------- budget
@@ -343,7 +430,8 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
     with Pipeline(scene, device="cpu", quality="low") as pipeline, ThreadPoolExecutor(1) as helper:
         frame = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
         setting.look(pipeline, frame, None, helper)
-        assert told[-1] == {"type": "budget", "measuring": None, "known": False}, "nothing is measured while it is off"
+        off = {"type": "budget", "measuring": None, "remaining": None, "known": False}
+        assert told[-1] == off, "nothing is measured while it is off"
         setting.switch(50.0)
         assert setting.choose(10.0, 0.0) is None, "nothing is known yet"
         with pytest.MonkeyPatch.context() as patch:
@@ -354,6 +442,9 @@ def test_what_the_budget_offers_is_what_it_chooses(known_errors: None, tmp_path:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
         assert [m["measuring"] for m in told[1:]] == [0.0, 0.5, None]
+        # After half of it the rest takes as long again.
+        assert told[1]["remaining"] is None
+        assert 0.0 <= told[2]["remaining"] < PATIENCE
         record = json.loads(json.dumps(told[-1]))
         times = [choice["ms"] for choice in record["choices"]]
         errors = [choice["error"] for choice in record["choices"]]
@@ -843,8 +934,12 @@ def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:
         running.edit(type="no_camera")
         running.edit(type="camera", width=size[0], height=size[1])
         assert not running.host.state_message()["estimating"]
-        board = cv2.imdecode(np.frombuffer(running.host.board_picture(), np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert min(board.shape) > 2000, "a sheet of A4 at 300 dots per inch"
+        # What was calibrated can be undone.
+        running.edit(type="undo")
+        running.until(lambda: running.host.state_message()["lens"] != "calibrated")
+        running.edit(type="redo")
+        running.until(lambda: running.host.state_message()["lens"] == "calibrated")
+        assert running.host.card("a4").startswith(b"%PDF")
 
 
 def test_downloads_of_the_light_and_the_picture(tmp_path: Path) -> None:

@@ -43,6 +43,12 @@ THRESHOLD = 128
 UNCHANGED = 6.0
 
 
+FINGER = 43.5
+"""Pixels that a target of 44 has after rounding."""
+BOX = 0.006
+"""Metres: a box of the clip, whose rounded edges and label are no printed outline; clicks alone are off by 10."""
+
+
 # The command, with a cost table that does not change when that of the package is made anew.
 LIVE = """
 import faulthandler
@@ -461,6 +467,165 @@ def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
     tab.until("warpAr.scene.objects[0].rotate[2] === -20")
     page.keyboard.press(" ")
     tab.until("warpAr.state.playing === false")
+
+
+@pytest.fixture(scope="module")
+def axe() -> str:
+    """The accessibility checks of axe-core, which browsers run."""
+    package = pytest.importorskip("axe_playwright_python", reason="needs axe-core: pip install '.[test]'")
+    return (Path(package.__file__).parent / "axe.min.js").read_text()
+
+
+# Elements that fingers hit, by what they or their label measure; what is not shown is left out.
+SMALL = f"""() => [...document.querySelectorAll("button, a[href], select, summary, input")]
+  .filter((e) => e.offsetParent && !e.closest(".sr"))
+  .map((e) => [e.id || e.outerHTML, ...[e, e.closest("label") ?? e].map((one) => one.getBoundingClientRect())])
+  .filter(([, a, b]) => Math.max(a.width, b.width) < {FINGER} || Math.max(a.height, b.height) < {FINGER})
+  .map(([name]) => name)"""
+WORKS = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice")
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+def test_nothing_serious_hinders_anybody(open_tab: Callable[..., Tab], axe: str, size: Any, artefacts: Path) -> None:
+    phone = size[0] < 800
+    shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
+    for scheme in ("dark", "light"):
+        tab = open_tab(color_scheme=scheme, **shape)
+        page = tab.page
+        page.evaluate(axe)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
+        for name in ("scene", "quality", "light", "setup"):
+            page.click(f"#tab-{name}")
+            page.wait_for_timeout(300)
+            page.screenshot(path=artefacts / f"{size[0]}_{name}_{scheme}.png")
+            found = page.evaluate(f"axe.run({{runOnly: {list(WORKS)}}})")["violations"]
+            serious = [
+                (one["id"], [node["html"] for node in one["nodes"]], one["help"])
+                for one in found
+                if one["impact"] in ("serious", "critical")
+            ]
+            assert serious == [], (name, scheme)
+            if phone:
+                assert page.evaluate(SMALL) == [], (name, scheme)
+        page.context.close()
+
+
+def test_a_desk_is_set_up_by_keyboard_alone(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    tab = open_tab()
+    page = tab.page
+
+    def reach(selector: str, most: int = 80) -> None:
+        for _ in range(most):
+            if page.evaluate(f"document.activeElement.matches({selector!r})"):
+                return
+            page.keyboard.press("Tab")
+        pytest.fail(f"Tab never reaches {selector}")
+
+    # Sizes are typed; each press is an edit that can be undone.
+    reach("#tab-scene")
+    page.keyboard.press("ArrowLeft")  # the tabs go round
+    assert page.locator("#panel-setup").is_visible()
+    reach("#ball-radius")
+    page.keyboard.press("Control+a")
+    page.keyboard.type("31")
+    reach("#use-card")
+    page.keyboard.press("Enter")
+    tab.until("warpAr.scene.marker.ruler === 0.1 && warpAr.scene.probes[0].radius === 0.031")
+    assert "use the printed card" in (page.get_attribute("#undo", "title") or "")
+    page.keyboard.press("Control+z")
+    tab.until("warpAr.scene.marker.ruler === null && warpAr.scene.probes[0].radius === 0.035")
+    page.keyboard.press("Control+Shift+z")
+    tab.until("warpAr.scene.marker.ruler === 0.1")
+    page.keyboard.press("Control+z")
+    tab.until("warpAr.scene.marker.ruler === null")
+
+    # Another marker than the clip's: what is missing is said in words, and what to do.
+    reach(".own > summary")
+    page.keyboard.press("Enter")
+    reach("#marker-id")
+    page.keyboard.press("Control+a")
+    page.keyboard.type("7")
+    reach("#use-marker")
+    page.keyboard.press("Enter")
+    tab.until("warpAr.scene.marker.id === 7 && !document.getElementById('guide').hidden", "what is missing")
+    tab.until("document.getElementById('guide').textContent.includes('the picture shows DICT_4X4_50 0')", "the words")
+    page.screenshot(path=artefacts / "missing.png")
+    page.keyboard.press("Control+z")
+    tab.until("document.getElementById('track-state').classList.contains('tracked')", "the marker again")
+    tab.until("document.getElementById('guide').hidden")
+
+    # All is looked at, and said.
+    reach("#check")
+    page.keyboard.press("Enter")
+    tab.until(
+        "!document.getElementById('check').disabled"
+        " && /found|finding/.test(document.getElementById('check-note').textContent)"
+    )
+    assert page.inner_text("#check-note") == "Nothing wrong was found.", page.inner_text("#findings")
+
+    # What is deleted comes back.
+    page.keyboard.press("Home")
+    page.focus('[data-key="object 0"]')
+    page.keyboard.press("Delete")
+    tab.until("warpAr.scene.objects.length === 0")
+    page.keyboard.press("Control+z")
+    tab.until("warpAr.scene.objects.length === 1")
+
+    # A plane is pointed out with the arrow keys.
+    shapes = page.evaluate("warpAr.scene.proxies.length")
+    page.focus("#tab-scene")
+    page.keyboard.press("Enter")
+    reach("#point > summary")
+    page.keyboard.press("Enter")
+    reach('[data-point="plane"]', 3)
+    page.keyboard.press("Enter")
+    tab.until("!document.getElementById('point-note').hidden && warpAr.state.playing === false")
+    for key in ("ArrowLeft", "ArrowDown", "ArrowRight", "ArrowUp"):
+        for _ in range(8):
+            page.keyboard.press(key)
+        page.keyboard.press("Enter")
+    tab.until(f"warpAr.scene.proxies.length === {shapes + 1} && warpAr.state.playing === true")
+    page.keyboard.press("Control+z")
+    tab.until(f"warpAr.scene.proxies.length === {shapes}")
+
+
+def test_a_box_is_pointed_out_and_fitted(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    tab = open_tab()
+    page = tab.page
+    truth = page.evaluate("warpAr.scene.proxies.find(p => p.shape === 'box')")
+    place = page.evaluate("warpAr.scene.proxies.findIndex(p => p.shape === 'box')")
+    page.click(f'#proxies [data-key="proxy {place}"] .drop')
+    tab.until("!warpAr.scene.proxies.some(p => p.shape === 'box')")
+    tab.hold()
+    corners = page.evaluate(
+        "truth => Promise.all([import('/static/handles.js'), import('/static/geometry.js')]).then(([h, g]) => "
+        "h.proxyCorners(truth).map(c => g.project(warpAr.camera, warpAr.pose, c)))",
+        truth,
+    )
+    box = page.locator("#handles").bounding_box()
+    scale = box["width"] / 640
+    page.click("#point > summary")
+    page.click('[data-point="box"]')
+    tab.until("!document.getElementById('point-note').hidden")
+    off = [(3, -2), (-3, 2), (2, 3), (-2, -3)]
+    for number, (dx, dy) in zip((0, 1, 5, 6), off, strict=True):
+        x, y = corners[number][:2]
+        page.mouse.click(box["x"] + (x + dx + 0.5) * scale, box["y"] + (y + dy + 0.5) * scale)
+    tab.until("warpAr.scene.proxies.some(p => p.shape === 'box')", "the box")
+    found = page.evaluate("warpAr.scene.proxies.find(p => p.shape === 'box')")
+    page.click("#proxies li:last-child .pick")
+    page.wait_for_timeout(300)
+    page.screenshot(path=artefacts / "pointed.png")
+    assert sorted(found["size"]) == pytest.approx(sorted(truth["size"]), abs=BOX)
+    assert found["at"] == pytest.approx(truth["at"], abs=BOX)
+    # It is moved and sized like anything else, and goes.
+    page.focus('#handles [data-key^="proxy"].on')
+    page.keyboard.press("ArrowRight")
+    tab.until(f"Math.abs(warpAr.scene.proxies.at(-1).at[0] - {found['at'][0]}) > 0.002")
+    page.keyboard.press("Delete")
+    tab.until("!warpAr.scene.proxies.some(p => p.shape === 'box')")
+    page.click("#undo")
+    tab.until("warpAr.scene.proxies.some(p => p.shape === 'box')")
 
 
 def _json(values: list[float]) -> str:

@@ -22,12 +22,14 @@ if TYPE_CHECKING:
     from warp_ar.scene import Pose, Scene, bundled_scenes, dumps_scene, load_scene
     from warp_ar.session import Session
     from warp_ar.stages.quality import PRESETS, Quality
+    from warp_ar.stages.request import LAYERS
 
 _HOMES = {
     "errors": ("SceneError", "SinkError", "SourceError", "UsageError", "WarpArError"),
     "engine.graph": ("Plan", "make_plan"),
     "engine.pipeline": ("Pipeline", "Result"),
     "stages.quality": ("PRESETS", "Quality"),
+    "stages.request": ("LAYERS",),
     "scene": ("Pose", "Scene", "bundled_scenes", "dumps_scene", "load_scene"),
     "light.captured": ("Light",),
     "photo_capture": ("Capture", "capture_light"),
@@ -39,6 +41,7 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "LAYERS",
     "PRESETS",
     "Capture",
     "Frame",

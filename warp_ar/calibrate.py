@@ -3,7 +3,8 @@
 card      writes the card, or a marker or board, as a PDF or PNG that prints at true size
 camera    pictures of a ChArUco board to an OpenCV YAML file, which ``--calibration`` and a scene's ``calibration``
 read ball      frames of a scene to its mirror ball's centre, for the scene's ``[probe]``
-response  pictures at several exposures to a response curve, for the scene's ``transfer``
+response  pictures of the card's greys, or of any scene at several exposures, to a response curve, for the scene's
+          ``transfer``
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
 from warp_ar.input.checkup import source_of
+from warp_ar.input.grey_response import measure_grey_response
 from warp_ar.input.response import measure_response, write_response
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import open_source
@@ -111,11 +113,15 @@ def make_parser() -> argparse.ArgumentParser:
     option("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")
     option("--keep-radius", action="store_true", help="believe the scene's radius instead of measuring it")
     option("--write", action="store_true", help="write center and radius into the scene file; its comments stay")
-    option = add("response", "measure the response curve from pictures of one still scene", "response.txt")
-    option("pictures", nargs="+", metavar="PATH", help="pictures, in the order of --exposures")
-    option(
-        "--exposures", nargs="+", type=_fraction, required=True, metavar="S", help="seconds, such as 1/200 1/50 0.08"
-    )
+    text = "measure the response curve, from the printed card's greys or from pictures of one still scene"
+    option = add("response", text, "response.txt")
+    text = "pictures of the card under several exposures or lights; with --exposures any still scene, in their order"
+    option("pictures", nargs="+", metavar="PATH|INDEX", help=text)
+    text = "seconds, such as 1/200 1/50 0.08 (default: by the card's greys)"
+    option("--exposures", nargs="+", type=_fraction, metavar="S", help=text)
+    option("--frames", type=int, default=24, metavar="N", help="of each video or device, by the card's greys (24)")
+    text = "write the curve beside this scene, as response.txt, and into its [camera]; its comments stay"
+    option("--write", type=Path, metavar="SCENE", help=text)
     return parser
 
 
@@ -155,6 +161,25 @@ def _run_ball(options: argparse.Namespace) -> None:
             print(f"{scene.path}: [probe] has them now")
 
 
+def _run_response(options: argparse.Namespace, target: Path | None) -> None:
+    told = "sRGB: 0.2159"
+    if options.exposures is None:
+        found = measure_grey_response(_pictures(options.pictures, options.frames))
+        curve = found.curve
+        low, high = found.span
+        told += (
+            f"; +/- {2 * found.deviation[128].max():.0%}, by {found.views} pictures with codes {low:.0f} to {high:.0f}"
+        )
+    else:
+        curve = measure_response(list(_pictures(options.pictures)), options.exposures)
+    write_response(curve, options.output)
+    middle = ", ".join(f"{v:.4f}" for v in curve[128])
+    print(f"{options.output}: code 128 is {middle} of clipping ({told})")
+    if target is not None:
+        amend_scene(target, "camera", {"transfer": options.output.name})
+        print(f"{target}: [camera] names it now")
+
+
 def _check_output(options: argparse.Namespace) -> None:
     """Say what is replaced; nothing is written over what is read, or over what is somebody else's unasked."""
     pictures = [Path(path) for path in getattr(options, "pictures", ())]
@@ -164,8 +189,8 @@ def _check_output(options: argparse.Namespace) -> None:
 
 
 def _target(options: argparse.Namespace) -> Path | None:
-    """The scene file that a calibrated camera goes into, with its file beside it; None without ``--write``."""
-    if options.command != "camera" or options.write is None:
+    """The scene file that a camera or response goes into, with its file beside it; None without ``--write``."""
+    if options.command not in ("camera", "response") or options.write is None:
         return None
     path = load_scene(options.write).path
     assert path is not None
@@ -207,10 +232,7 @@ def _run(options: argparse.Namespace) -> int:
             amend_scene(target, "camera", {"calibration": options.output.name}, remove=(*INTRINSICS, "field_of_view"))
             print(f"{target}: [camera] names it now")
     elif options.command == "response":
-        curve = measure_response(list(_pictures(options.pictures)), options.exposures)
-        write_response(curve, options.output)
-        middle = ", ".join(f"{v:.4f}" for v in curve[128])
-        print(f"{options.output}: code 128 is {middle} of clipping (sRGB: 0.2159)")
+        _run_response(options, target)
     else:
         _run_ball(options)
     return EXIT_DONE

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
 from warp_ar.errors import UsageError, printable
 from warp_ar.input.checkup import FRAMES, check_up, source_of
 from warp_ar.input.finding import Finding, worst_first
-from warp_ar.scene import load_scene
+from warp_ar.scene import Scene, load_scene
+
+DEVICES = Path("/dev")
+"""Where the system lists capture devices."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -56,6 +61,25 @@ def check_machine() -> tuple[list[str], list[Finding]]:
     return told, found
 
 
+def check_access(scene: Scene, source: str | int | Path | None) -> list[Finding]:
+    """Whether the capture device that the frames come from is there and may be opened; on Linux, which lists them."""
+    index = source_of(scene, source)
+    if isinstance(index, str) and index.isdecimal():
+        index = int(index)
+    if not isinstance(index, int) or not sys.platform.startswith("linux"):
+        return []
+    device = DEVICES / f"video{index}"
+    if not device.exists():
+        numbers = sorted(int(path.name[5:]) for path in DEVICES.glob("video*") if path.name[5:].isdecimal())
+        there = f"there are {', '.join(map(str, numbers))}" if numbers else "there is none; plug one in"
+        text = f"there is no capture device {index}"
+        return [Finding("source.absent", text, f"{there}; set [source] camera, or give --source")]
+    if not os.access(device, os.R_OK | os.W_OK):
+        text = f"capture device {index} may not be opened by this user"
+        return [Finding("source.permission", text, "join its group: sudo usermod -aG video $USER, then log in anew")]
+    return []
+
+
 def _run(options: argparse.Namespace) -> int:
     if options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
@@ -64,7 +88,10 @@ def _run(options: argparse.Namespace) -> int:
     source = source_of(scene, options.source)
     if source is None:
         told.append("frames: the scene names none, so only its numbers are checked; give --source")
-    found = worst_first([*found, *check_up(scene, source, frames=options.frames)])
+    access = check_access(scene, options.source)
+    # What may not be opened is not tried: its own message would say less.
+    checked = check_up(scene, None if access else source, frames=options.frames)
+    found = worst_first([*found, *access, *checked])
     for line in told:
         print(line)
     for number, finding in enumerate(found, 1):

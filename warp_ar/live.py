@@ -39,14 +39,16 @@ from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import EnvironmentSink, NullSink, Sink, open_sink
+from warp_ar.output.sinks import NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
+from warp_ar.stages.request import LAYERS
 
 if TYPE_CHECKING:
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog
+    from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
     from warp_ar.viewer.server import Address
 
@@ -133,6 +135,13 @@ def _add_file_options(group: argparse._ArgumentGroup) -> None:
         help="replace files that this program did not write; those that it wrote are replaced anyway",
     )
     add("--save-environment", type=Path, metavar="DIR", help="write the captured light of every frame as NNNN.exr")
+    add("--save-layers", type=Path, metavar="DIR", help="write the layers of every frame as NNNN.exr of several parts")
+    add(
+        "--layers",
+        metavar="NAMES|all",
+        help=f"with --save-layers: which, separated by commas (default: all): {', '.join(LAYERS)}",
+    )
+    add("--layer-pictures", action="store_true", help="with --save-layers: those that PNG can hold, as PNG besides")
     add("--report", type=Path, metavar="FILE.json", help="write poses and timings of every frame")
 
 
@@ -190,7 +199,12 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
         reads["--light"] = [Path(options.light)]
     if source is not None:
         reads["the source"] = [Path(source)]
-    names = {"output": "--output", "report": "--report", "save_environment": "--save-environment"}
+    names = {
+        "output": "--output",
+        "report": "--report",
+        "save_environment": "--save-environment",
+        "save_layers": "--save-layers",
+    }
     writes = {option: Path(path) for name, option in names.items() if (path := getattr(options, name)) is not None}
     check_places(reads, writes)
 
@@ -282,7 +296,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
     """
     from warp_ar.session import calibrated, with_light
 
-    for name in ("save_environment", "report"):
+    for name in ("save_environment", "save_layers", "report"):
         if getattr(options, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
     if options.refine_ball:
@@ -447,22 +461,29 @@ def light_clip(options: argparse.Namespace) -> int:
     # Here, for they load Warp: the page is to be there before.
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog, print_plan
+    from warp_ar.output.side_files import SideFiles, parse_layers
+
+    if options.save_layers is None and (options.layers is not None or options.layer_pictures):
+        which = "--layer-pictures" if options.layers is None else f"--layers {options.layers}"
+        raise UsageError(f"{which} needs --save-layers DIR, the folder to write them to")
 
     scene = load_scene(options.scene)
     _check_places(options, scene)
-    outputs, replaced = ["image"], []
-    lights: EnvironmentSink | None = None
-    if options.save_environment is not None:
-        lights = EnvironmentSink(options.save_environment, overwrite=options.overwrite)
-        outputs.append("environment")
+    side = SideFiles(
+        environment=options.save_environment,
+        layers=options.save_layers,
+        names=parse_layers(options.layers),
+        pictures=options.layer_pictures,
+        overwrite=options.overwrite,
+    )
+    outputs, replaced = ["image", *side.outputs], list(side.replaced)
     if options.report is not None:
         replaced.append(_prepare_file(options.report, overwrite=options.overwrite))
         outputs.append("pose")
 
     stop = _Stop()
     with contextlib.ExitStack() as stack:
-        if lights is not None:
-            stack.enter_context(lights)
+        stack.enter_context(side)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
         _quick_check(options, session.scene)
@@ -472,24 +493,24 @@ def light_clip(options: argparse.Namespace) -> int:
         if options.output is not None:
             size = session.pipeline.size
             sink = open_sink(options.output, fps=source.fps, size=size, overwrite=options.overwrite)
-        for words in (*replaced, sink.replaced, "" if lights is None else lights.replaced):
+        for words in (*replaced, sink.replaced):
             if words:
                 say(words)
         log, evidence = RunLog(session.pipeline), _Evidence()
         try:
-            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), lights or NullSink(), sink:
-                _light_frames(options, session, log, sink, lights, stop, evidence)
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink:
+                _light_frames(options, session, log, sink, side, stop, evidence)
             if stop.code is None:
                 _check_run(log, session, evidence)
         except WarpArError as error:
             problem = _write_report(options.report, log, balls)
             also = f"; and {problem}" if problem else ""
-            raise RunError(f"{error} ({_count(log, sink, lights)}){also}") from error
+            raise RunError(f"{error} ({_count(log, sink, side)}){also}") from error
         except BaseException:
             _write_report(options.report, log, balls)
             raise
         if problem := _write_report(options.report, log, balls):
-            raise RunError(f"{problem} ({_count(log, sink, lights)})")
+            raise RunError(f"{problem} ({_count(log, sink, side)})")
     if not options.headless:
         print_plan(session.pipeline.plan, log)
         if isinstance(session.pipeline, AutoPipeline):
@@ -523,7 +544,7 @@ def _light_frames(
     session: Session,
     log: RunLog,
     sink: Sink,
-    lights: EnvironmentSink | None,
+    side: SideFiles,
     stop: _Stop,
     evidence: _Evidence,
 ) -> None:
@@ -548,8 +569,7 @@ def _light_frames(
             start = time.perf_counter()
             sink.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3
-            if lights is not None and result.environment is not None:
-                lights.write(result.environment)
+            side.write(frame.image, result, session.scene)
             log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
             progress.update(bar, advance=1, fps=log.fps)
             if log.count == MARKER_PATIENCE:
@@ -558,10 +578,10 @@ def _light_frames(
                 return
 
 
-def _count(log: RunLog, sink: Sink, lights: EnvironmentSink | None) -> str:
+def _count(log: RunLog, sink: Sink, side: SideFiles) -> str:
     """What there is of a run that failed."""
     frames = f"{log.count} frames were lit" if isinstance(sink, NullSink) else f"{sink.written} frames were written"
-    return frames if lights is None else f"{frames}, and {lights.written} environments"
+    return frames + side.written
 
 
 def _write_report(path: Path | None, log: RunLog, balls: dict[str, Any]) -> str:

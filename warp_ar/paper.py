@@ -7,11 +7,14 @@ plot, from bundled clips, the preset ``paper`` beside ours and the truth.
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import cv2
+import numpy.typing as npt
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
@@ -22,10 +25,15 @@ from warp_ar.accuracy.report import MIN_COLUMNS
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
 from warp_ar.device import resolve_device
 from warp_ar.errors import UsageError, WarpArError
+from warp_ar.output.own_files import OwnFiles
+from warp_ar.signature import COMMENT, software_exif
 
 READINGS = "readings"
 QUALITY = 88
 """Of WebP."""
+ENDINGS = (".webp", ".svg", "a.svg", "b.svg")
+"""Of a figure's files: its picture, and one plot or two."""
+PAGE = "figures.md"
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -38,6 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     add("--out", type=Path, metavar="DIR", help="write figureN.webp, figureN.svg and figures.md here")
+    add("--overwrite", action="store_true", help="also replace files that this program did not write")
     return parser
 
 
@@ -66,19 +75,30 @@ def print_table(console: Console, title: str, head: Sequence[str], rows: Sequenc
     console.print(table)
 
 
-def write_figure(figure: PaperFigure, out: Path) -> str:
-    """Write a figure's picture and plots; returns its section of the Markdown page."""
+def open_out(options: argparse.Namespace, figures: Sequence[str]) -> OwnFiles:
+    """The folder that is written to, looked at before anything is made."""
+    made = [f"figure{name}{ending}" for name in figures if name != READINGS for ending in ENDINGS]
+    return OwnFiles(options.out, [*made, PAGE], overwrite=options.overwrite)
+
+
+def encode_webp(picture: npt.NDArray[Any]) -> bytes:
+    """A WebP with this program's signature of an RGB picture, uint8 (height, width, 3)."""
+    data = io.BytesIO()
+    Image.fromarray(picture).save(data, "WEBP", quality=QUALITY, exif=software_exif())
+    return data.getvalue()
+
+
+def write_figure(figure: PaperFigure, out: OwnFiles, folder: str) -> str:
+    """Write a figure's picture and plots; returns its section of the Markdown page, which links into ``folder``."""
     name = f"figure{figure.number}"
-    path = out / f"{name}.webp"
-    if not cv2.imwrite(str(path), figure.picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, QUALITY]):
-        raise WarpArError(f"--out {out}: cannot write {path.name}")
-    parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({out.name}/{name}.webp)"]
+    out.write(f"{name}.webp", encode_webp(figure.picture))
+    parts = [f"## Figure {figure.number}: {figure.title}", figure.text, f"![{figure.title}]({folder}/{name}.webp)"]
     below = "; below each its FLIP to the truth" if "truth" in figure.labels and figure.number not in (5, 6) else ""
     parts += [f"From left to right: {', '.join(figure.labels)}{below}.", as_markdown(figure.head, figure.rows)]
     for index, plot in enumerate(figure.plots):
         file = f"{name}{'ab'[index] if len(figure.plots) > 1 else ''}.svg"
-        (out / file).write_text(stand_alone(plot), encoding="utf-8")
-        parts.append(f"![{figure.head[-1]}]({out.name}/{file})")
+        out.write(file, f"{COMMENT}\n{stand_alone(plot)}")
+        parts.append(f"![{figure.head[-1]}]({folder}/{file})")
     return "\n\n".join(parts)
 
 
@@ -109,8 +129,7 @@ def make_all(options: argparse.Namespace) -> int:
     context = Context(str(resolve_device(options.device)), options.frames, options.shrink)
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
+    out = None if options.out is None else open_out(options, names)
     sections = []
     units = sum(5.0 if name == READINGS else 1.0 for name in names)
     with WorkProgress(console, units) as progress:
@@ -124,10 +143,10 @@ def make_all(options: argparse.Namespace) -> int:
             figure = FIGURES[int(name)](context)
             progress.advance(f"figure {name}", 1.0)
             print_table(console, f"Figure {name}: {figure.title}", figure.head, figure.rows)
-            if options.out is not None:
-                sections.append(write_figure(figure, options.out))
-    if options.out is not None:
-        (options.out / "figures.md").write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+            if out is not None:
+                sections.append(write_figure(figure, out, options.out.name))
+    if out is not None:
+        out.write(PAGE, "\n\n".join([COMMENT, *sections]) + "\n")
         console.print(f"written to {options.out}", highlight=False)
     return EXIT_DONE
 

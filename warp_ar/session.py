@@ -101,7 +101,7 @@ class Session:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name, a value of one's own, or ``auto``: the least error within a budget.
             budget_ms: Milliseconds per frame for ``auto``; None means 33.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, layers of ``warp_ar.LAYERS``.
             loop: Start a clip again when it ends.
             refine_ball: Look for the mirror balls first, in the source's first frames, which takes some seconds; what
                 was found is in ``ball_fits``.
@@ -179,11 +179,14 @@ class Session:
             quality: A preset's name or a value; None leaves it.
 
         Raises:
-            UsageError: The session keeps to a budget, or the quality is none or cannot run here.
-            SceneError: The scene's camera does not fit the source.
+            UsageError: The session keeps to a budget, ``scene`` is no scene, or the quality is none or cannot run
+                here. What is refused changes nothing: frames go on as they were.
+            SceneError: The scene's camera does not fit the source, or a file that it names cannot be used.
         """
         if self._switcher is None:
             raise UsageError(f"a session of quality {AUTO!r} chooses for itself; open another one")
+        if scene is not None and not isinstance(scene, Scene):
+            raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, such as load_scene returns")
         target = dataclasses.replace(
             self._target,
             scene=self._target.scene if scene is None else scene,
@@ -214,7 +217,7 @@ class Session:
 
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
-        kept = pipeline.device.is_cpu or "environment" not in pipeline.plan.request.outputs
+        kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)

@@ -1,7 +1,8 @@
 """How this program signs the files that it writes, and knows them again.
 
-A PNG says it in its text, an OpenEXR and an HDR in their headers, a video in its comment, a report or a calibration in
-its first key, a response in its first line.
+A PNG says it in its text, an OpenEXR and an HDR in their headers, a WebP in its EXIF, a video in its comment, a report
+or a calibration in its first key, a page, a chart or a text in a comment at its start, a response in its first line, a
+glTF as its generator, a USD in text among its own data.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import struct
 import zlib
 
 import av
+from PIL import Image
 
 from warp_ar.files import kind_of
 
@@ -24,8 +26,12 @@ _HEAD = 4096
 
 # What stands before it in text: JSON's first key (OpenCV's JSON and YAML say their version first), a comment.
 _LEADS = rb"""\s*\{\s*"program":\s*"|%YAML[: ][\d.]+\s*(?:---\s*)?program: "?|""" + (
-    rb"""<\?xml version="1.0"\?>\s*<opencv_storage>\s*<program>"?|# """
+    rb"""<\?xml version="1.0"\?>\s*<opencv_storage>\s*<program>"?|# |(?:<!doctype html>\s*)?<!-- """
 )
+COMMENT = f"<!-- {PROGRAM} -->"
+"""What stands at the start of a chart or a text in Markdown, and behind the document type of a page."""
+_SOFTWARE_TAG = 0x0131
+"""Of EXIF."""
 
 
 def sign_png(data: bytes) -> bytes:
@@ -33,6 +39,25 @@ def sign_png(data: bytes) -> bytes:
     body = b"tEXtSoftware\0" + PROGRAM.encode()
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     return data[:33] + chunk + data[33:]
+
+
+def software_exif() -> bytes:
+    """EXIF with the signature as its ``Software``, for a WebP."""
+    exif = Image.Exif()
+    exif[_SOFTWARE_TAG] = PROGRAM
+    return exif.tobytes()
+
+
+def _is_signed_webp(path: str | os.PathLike[str]) -> bool:
+    """Whether a WebP's chunks, of which EXIF is among the last, hold the signature."""
+    with open(path, "rb") as stream:
+        stream.seek(12)
+        while len(head := stream.read(8)) == 8:
+            kind, size = head[:4], int.from_bytes(head[4:], "little")
+            if kind == b"EXIF":
+                return PROGRAM.encode() + b"\0" in stream.read(min(size, _HEAD))
+            stream.seek(size + size % 2, os.SEEK_CUR)
+    return False
 
 
 def is_signed(path: str | os.PathLike[str]) -> bool:
@@ -47,8 +72,14 @@ def is_signed(path: str | os.PathLike[str]) -> bool:
     name = PROGRAM.encode()
     if head.startswith(b"\x89PNG"):
         return b"tEXtSoftware\0" + name in head
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return _is_signed_webp(path)
     if head.startswith(b"%PDF-"):
         return head.split(b"\n", 3)[2:3] == [b"% " + name]
+    if head.startswith(b"#usda "):
+        return b'string program = "' + name + b'"' in head
+    if head.startswith(b"glTF"):
+        return b'"generator":"' + name + b'"' in head
     if head.startswith(b"#?RADIANCE\n"):
         return head.split(b"\n", 2)[1:2] == [b"SOFTWARE=" + name]
     if head.startswith(b"\x76\x2f\x31\x01"):

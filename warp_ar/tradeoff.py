@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -31,6 +32,8 @@ from warp_ar.accuracy.runs import Clock
 from warp_ar.command_line import EXIT_DONE, Parser, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
+from warp_ar.files import parse_json, read_text
+from warp_ar.output.own_files import OwnFiles
 
 DEFAULT_FRAMES = 12
 
@@ -68,6 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="DIR",
         help="write tradeoff.jsonl, cost_table.json and tradeoff.html here (or presets.json)",
     )
+    add("--overwrite", action="store_true", help="also replace files that this program did not write")
     add("--extra", type=Path, metavar="FILE", help="JSON lines of python -m bench precision, for the page")
     return parser
 
@@ -119,23 +123,48 @@ def measure(options: argparse.Namespace, device: str, clock: Clock, console: Con
     return reports
 
 
-def write(options: argparse.Namespace, device: str, clock: Clock, reports: Sequence[CaseReport]) -> None:
+def read_extra(path: Path | None) -> list[dict[str, Any]]:
+    """JSON lines of a bench.
+
+    Raises:
+        UsageError: The file cannot be read as such.
+    """
+    if path is None:
+        return []
+    lines = read_text(path, UsageError, f"--extra {path}", expected="JSON lines").splitlines()
+    found = [parse_json(line, f"--extra {path}: line {k}", UsageError) for k, line in enumerate(lines, 1) if line]
+    if not all(isinstance(record, dict) for record in found):
+        raise UsageError(f"--extra {path}: expected an object on each line, as python -m bench prints them")
+    return found
+
+
+def open_out(options: argparse.Namespace) -> OwnFiles:
+    """The folder that is written to, looked at before anything is measured."""
+    names = ("tradeoff.jsonl", *(("presets.json",) if options.presets else ("cost_table.json", "tradeoff.html")))
+    reads = {} if options.extra is None else {"--extra": [options.extra]}
+    return OwnFiles(options.out, names, overwrite=options.overwrite, reads=reads)
+
+
+def write(
+    options: argparse.Namespace,
+    out: OwnFiles,
+    extra: Sequence[dict[str, Any]],
+    device: str,
+    clock: Clock,
+    reports: Sequence[CaseReport],
+) -> None:
     """Write what was measured: JSON lines, the cost table and the page, or the list of presets."""
-    out: Path = options.out
-    out.mkdir(parents=True, exist_ok=True)
     lines = (json.dumps(record) for report in reports for record in records(report, device))
-    (out / "tradeoff.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    out.write("tradeoff.jsonl", "\n".join(lines) + "\n")
     if options.presets:
-        presets = make_preset_list(reports, device)
-        (out / "presets.json").write_text(json.dumps(presets, indent=1) + "\n", encoding="utf-8")
+        out.write("presets.json", json.dumps(make_preset_list(reports, device), indent=1) + "\n")
         return
     table = make_cost_table(reports, device)
-    (out / "cost_table.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    out.write("cost_table.json", json.dumps(table, indent=1) + "\n")
     whole = options.stage is None
     figures = list(make_figures(device, options.frames, options.truth, options.shrink, clock)) if whole else []
-    extra = [json.loads(line) for line in options.extra.read_text().splitlines()] if options.extra else []
     made = table["made"] | {"clock": "processor time" if options.processor_time else "time"}
-    (out / "tradeoff.html").write_text(tradeoff_page.render(reports, figures, made, extra), encoding="utf-8")
+    out.write("tradeoff.html", tradeoff_page.render(reports, figures, made, extra))
 
 
 def tradeoff(options: argparse.Namespace) -> int:
@@ -147,11 +176,13 @@ def tradeoff(options: argparse.Namespace) -> int:
     clock: Clock = WORK if options.processor_time else time.perf_counter
     console = Console()
     console.width = max(console.width, MIN_COLUMNS)
+    extra = read_extra(options.extra)
+    out = None if options.out is None else open_out(options)
     reports = measure(options, str(device), clock, console)
     for setting, methods in make_cost_table(reports, str(device))["dominated"].items():
         console.print(f"dominated in every case: {setting} {', '.join(methods)}", highlight=False)
-    if options.out is not None:
-        write(options, str(device), clock, reports)
+    if out is not None:
+        write(options, out, extra, str(device), clock, reports)
         console.print(f"written to {options.out}", highlight=False)
     return EXIT_DONE
 

@@ -40,6 +40,8 @@ TRACK, SOURCE, PIPELINE = "track", "source", "pipeline"
 """What is no stage of a plan: finding the marker, reading frames, and the frame's way as a whole."""
 
 _RAYS = ("visibility", "shade", "relight", "environment_shadow", "near_field", "mirror_ball")
+_GEOMETRY = ("visibility", "surfaces", "coverage", "motion")
+"""Stages that read no radiance."""
 CONCERNS: dict[int, tuple[str, ...]] = {
     1: ("unwrap", "recover", "mirror_ball", "declip"),
     2: ("unwrap", "declip"),
@@ -49,7 +51,7 @@ CONCERNS: dict[int, tuple[str, ...]] = {
         *("key_lights", "irradiance", "prefilter", "environment_samples"),
     ),
     5: ("unwrap", "recover", "irradiance", "prefilter", *_RAYS, "declip"),
-    6: (*(stage for stage in METHODS if stage != "visibility"), PIPELINE),
+    6: (*(stage for stage in METHODS if stage not in _GEOMETRY), PIPELINE),
     7: ("bracket", "accumulate", "recover", "expose", PIPELINE),
     8: ("prefilter", "shade", "environment_shadow", "near_field", "mirror_ball"),
     9: ("relight", "shade", "mirror_ball"),

@@ -41,13 +41,13 @@ from warp_ar.stages.base import Arrays, ArraySpec, Pass, Stage, Wiring
 from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.recover import Recover
-from warp_ar.stages.request import Request
+from warp_ar.stages.request import LAYERS, Request
 from warp_ar.stages.shared.settled import PUBLISHED
 
 SIZE = (48, 36)
 """Columns and rows of a frame: a few rows per band, and compiled code is the same at any size."""
 ENVIRONMENT_HEIGHT = 16
-MAY_BE_INFINITE = ("lamps.distance",)
+MAY_BE_INFINITE = ("lamps.distance", "depth")
 """Outputs that are documented to be infinite where there is nothing, or nothing near."""
 
 
@@ -150,11 +150,12 @@ def request_for(stage: str, method: str) -> Request | None:
         return dataclasses.replace(request, scene=with_sized_lights(request.scene), quality=quality)
     methods = {} if method == "default" else {stage: method}
     # Some stages run only where another one is on its best method, some only without a change of exposure, one only
-    # where the frames alternate between exposure times.
+    # where the frames alternate between exposure times, some only where layers are asked for.
     best = {one.name: list(one.methods)[-1] for one in STAGES if len(one.methods) > 1}
-    for others, scale, times in itertools.product(({}, best), (0.7, 1.0), ((), BRACKET)):
+    ways = itertools.product(((), tuple(LAYERS)), ({}, best), (0.7, 1.0), ((), BRACKET))
+    for layers, others, scale, times in ways:
         quality = make_quality(**{**others, **methods})
-        request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment"), times)
+        request = Request(make_scene(exposure=Exposure(scale)), quality, SIZE, ("image", "environment", *layers), times)
         if stage in plan_names(make_plan(request)):
             return request
     return None
@@ -218,7 +219,7 @@ class Rig:
             request.scene,
             device=device,
             quality=request.quality,
-            outputs=("image", "environment"),
+            outputs=(*dict.fromkeys(("image", "environment", *request.outputs)),),
             bands=bands,
             exposures=request.exposures,
         )

@@ -32,8 +32,8 @@ MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environmen
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
 GUARDED = ("accumulate", "fill", "irradiance", "prefilter", "environment_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
-SIGNED = ("irradiance_sh", "mirrored")
-FRAME_READERS = ("unwrap", "sphere_map", "summed_area", "visibility")
+SIGNED = ("irradiance_sh", "mirrored", "layer_mirror_ball", "normals", "position", "motion", "coverage")
+FRAME_READERS = ("unwrap", "sphere_map", "summed_area", "visibility", "surfaces", "coverage", "motion")
 MAP_READERS = [
     (stage, method) for stage, method in STAGE_METHODS if stage not in FRAME_READERS and method != "sphere_mip"
 ]

@@ -54,14 +54,19 @@ def attempt(case: Case, folder: pathlib.Path) -> dict[str, Any]:
     return {"outcome": "read"}
 
 
-def main(start: int, damages: int) -> None:
-    """Try all inputs from number ``start`` on, with so many damaged copies of each file."""
+def limit_memory() -> None:
+    """Let this process have `MEMORY` more than it has."""
     import trimesh  # noqa: F401
 
     import warp_ar.scene.mesh_files  # noqa: F401  loaded before memory is limited, as is all that it loads
 
     used = int(pathlib.Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
+
+
+def main(start: int, damages: int) -> None:
+    """Try all inputs from number ``start`` on, with so many damaged copies of each file."""
+    limit_memory()
     results = os.fdopen(os.dup(1), "w", buffering=1)
     # Libraries write to both: what counts is on the copy.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

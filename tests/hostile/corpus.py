@@ -13,10 +13,12 @@ import numpy as np
 
 from warp_ar.input.sources import FrameFolder, Synthetic, open_source
 from warp_ar.kernels.color import decode_table
+from warp_ar.light.captured import Light, find_emitters
 from warp_ar.output.sinks import open_sink, read_environment, write_environment
 from warp_ar.scene import load_calibration, load_scene
 from warp_ar.scene.exif import read_exif
 from warp_ar.scene.mesh_files import load_mesh, load_texture
+from warp_ar.scene.pose_file import load_poses
 from warp_ar.scene.shapes import torus_mesh
 
 SCENE = """schema = 1
@@ -150,6 +152,22 @@ def _environment(path: pathlib.Path) -> None:
     write_environment(path, picture().astype(np.float32))
 
 
+def _poses(path: pathlib.Path) -> None:
+    turned = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    if path.suffix == ".json":
+        path.write_text(json.dumps([{"R": turned, "t": [0.1, 0.2, 1.0 + 0.1 * k]} for k in range(3)]))
+    else:
+        lines = [f"{k} 0.707 0.0 0.0 0.707 0.1 0.2 1.{k} 1 {k}.png\n10.5 20.5 -1\n" for k in range(3)]
+        path.write_text("# Image list\n" + "".join(lines))
+
+
+def _light(path: pathlib.Path) -> None:
+    radiance = np.full((8, 16, 3), 0.25, np.float32)
+    radiance[1, 3] = 50.0
+    emitters = find_emitters(radiance, (radiance > 1.0).astype(np.float32), 0.1)
+    Light(radiance, np.ones((8, 16), np.float32), emitters, 0.9, 0.01, 0.2).save(path)
+
+
 def _material(path: pathlib.Path) -> None:
     _mesh(path.parent / "a.obj")
 
@@ -192,6 +210,9 @@ READERS = (
     Reader("photograph with EXIF", "a.jpg", read_exif, _photograph),
     Reader("photograph with EXIF, TIFF", "a.tiff", read_exif, _photograph),
     Reader("environment, EXR", "a.exr", read_environment, _environment),
+    Reader("captured light, EXR", "light.exr", Light.load, _light),
+    Reader("poses, JSON", "poses.json", load_poses, _poses),
+    Reader("poses, COLMAP", "images.txt", load_poses, _poses),
 )
 
 assert Synthetic.NAMES  # the scene's source is one of them

@@ -10,11 +10,12 @@ import subprocess
 import sys
 
 from tests.hostile.cases import all_cases
+from tests.hostile.corpus import READERS
+from tests.hostile.mutate import EXAMPLES, HELD, ROW, Worker, mutate_all
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FILE = ROOT / "docs" / "hostile-inputs.md"
 BEGIN, END = "<!-- table -->", "<!-- /table -->"
-HELD = ("read", "refused")
 MOST_DEATHS = 5
 """Processes that may die of an input before the rest is given up."""
 
@@ -40,6 +41,22 @@ def attack() -> list[Outcome]:
     return outcomes
 
 
+def mutate(examples: int = EXAMPLES) -> list[Outcome]:
+    """Hand so many mutations of each file to its reader."""
+    outcomes: list[Outcome] = []
+    worker = Worker()
+    try:
+        for number, reader in enumerate(READERS):
+
+            def note(data: bytes, result: dict[str, str], name: str = reader.name) -> None:
+                outcomes.append((ROW, f"{name}, {len(data)} bytes", result["outcome"], result.get("message", "")))
+
+            mutate_all(worker, number, note, examples)
+    finally:
+        worker.close()
+    return outcomes
+
+
 def make_table(outcomes: list[Outcome]) -> str:
     """One line per reader and sink, and the sum."""
     rows: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
@@ -56,6 +73,7 @@ def make_table(outcomes: list[Outcome]) -> str:
 def tried() -> dict[str, int]:
     """How many inputs each row of the table has."""
     counts = collections.Counter(case.row for case in all_cases())
+    counts[ROW] = EXAMPLES * len(READERS)
     return {**counts, "all": counts.total()}
 
 
@@ -67,7 +85,7 @@ def tried_in_docs() -> dict[str, int]:
 
 def main() -> None:
     """Attack, and write the table."""
-    outcomes = attack()
+    outcomes = [*attack(), *mutate()]
     text = FILE.read_text()
     before, rest = text.split(BEGIN)
     FILE.write_text(f"{before}{BEGIN}\n{make_table(outcomes)}\n{END}{rest.split(END)[1]}")

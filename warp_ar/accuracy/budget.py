@@ -7,15 +7,15 @@ so they are measured here (``warp_ar.accuracy.costs``), on the first frame that 
 taken. Costs and load are told apart by when they change: what differs just after other settings are shown is theirs,
 what differs later is the load's.
 
-**Choice.** The settings are the best of the Pareto front whose cost times the load is at most ``AIM`` budget, to go up
-``RAISE`` budget. Settings that were timed cost what they took; others what the costs say, times the ratio in which the
-timed settings that are most like them departed from it.
+**Choice.** The settings are the best of the Pareto front whose cost times the load is at most ``AIM`` budget. Settings
+that were timed cost what they took; others what the costs say, times the ratio in which the timed settings that are
+most like them departed from it.
 
-**Steadiness.** Nothing is decided before ``WINDOW`` frames ran as they are, and their median counts, or that of up to
-``LONG_WINDOW`` frames where the budget is not exceeded by much. Over it, the choice is made anew at once. Under it,
-only what errs less by ``GAIN`` is worth a change, and only after it would have fit for ``PATIENCE``. After the first
-choice a setting moves at most one method in ``SETTING_SECONDS``, and all move until they are where they were to go, or
-the budget is exceeded; of a mixed move that would not fit, what saves goes first.
+**Steadiness.** One band: frames that take more than the budget have the choice made anew, and so does room for what
+errs less within ``RAISE`` budget; between the two nothing changes. The median of ``WINDOW`` frames counts, or that of
+the last ``ALARM_WINDOW`` where it is far over the budget, and settings are held for ``HELD_SECONDS``. A setting moves
+by one method at a time, and all move until they are where they were to go, or the budget is exceeded; of a mixed move
+that would not fit, what saves goes first.
 
 **Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
 frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
@@ -66,23 +66,20 @@ from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 
 AIM = 0.9
 """Share of the budget that is planned for at first, and when there is too much to do."""
-RAISE = 0.8
+RAISE = 0.7
 """Share that what errs less must fit into before it is tried: apart from ``AIM``, so that noise moves nothing."""
-WINDOW = 9
-"""Frames whose median tells what a frame takes, at the earliest."""
-LONG_WINDOW = 27
-"""Frames whose median tells it well: within 3 % where times scatter by a tenth."""
+WINDOW = 27
+"""Frames whose median tells what a frame takes: within 3 % where times scatter by a tenth."""
+ALARM_WINDOW = 9
+"""Frames whose median is enough above ``ALARM``."""
 ALARM = 1.15
-"""Share of the budget above which the short window is enough, for noise alone hardly gets there; and the ratio to what
-was expected of new settings from which on the difference is taken to be theirs."""
+"""Share of the budget that noise alone hardly gets the short window above."""
+HELD_SECONDS = 0.5
+"""Shortest time for which settings are held."""
 SETTLE = 2
 """Frames after a change that are not counted."""
-GAIN = 0.03
-"""Share of the predicted error, or over the budget of the time, that a change must save."""
-PATIENCE = 2.0
-"""Seconds for which every frame must leave room for what errs less before it is tried."""
-SETTING_SECONDS = 0.5
-"""Shortest time between two methods of one setting."""
+SURPRISE = 1.15
+"""Ratio to what was expected of new settings from which on the difference is taken to be theirs."""
 MEMORY = 60.0
 """Seconds for which what settings took when they were shown is held against them: a moment's load may have been in it.
 What they took alone is known for good."""
@@ -146,11 +143,10 @@ class Controller:
         self._timed: dict[frozenset[tuple[str, str]], _Timed] = {}
         self._predicted: list[float] | None = None
         self._factor: float | None = None
-        self._times: collections.deque[float] = collections.deque(maxlen=LONG_WINDOW)
+        self._times: collections.deque[float] = collections.deque(maxlen=WINDOW)
         self._skip = SETTLE
         self._new = False
-        self._moved: dict[str, float] = {}
-        self._better_since: float | None = None
+        self._held_since = -HELD_SECONDS
         self._chosen = running is None
         self.fits = True
         """False: frames take longer than the budget, and no settings are known to take less."""
@@ -235,7 +231,7 @@ class Controller:
         """Whether the present settings may be shown, now that they have been timed; if not, those before are back."""
         # The first choice may be any: it must be the best still. Later ones lead to it by way of what saves something.
         fits = self.expected_ms <= AIM * self.budget_ms
-        saves = self.expected_ms < (1.0 - GAIN) * self.expected(self._before)
+        saves = self.expected_ms < self.expected(self._before)
         if fits or (saves if self._chosen else dict(self._best(AIM).settings) == self.settings):
             self._chosen = True
             return True
@@ -246,9 +242,8 @@ class Controller:
 
     def shown(self, now: float) -> None:
         """Frames are lit by the present settings from now on."""
-        for setting, method in self.settings.items():
-            if method != self._before[setting]:
-                self._moved[setting] = now
+        if self.settings != self._before:
+            self._held_since = now
         self._before = self.settings
         self._chosen = True
         self.restart()
@@ -267,10 +262,12 @@ class Controller:
             self._skip -= 1
             return False
         self._times.append(milliseconds)
-        if len(self._times) < WINDOW:
+        if len(self._times) < ALARM_WINDOW:
             return False
-        latest = statistics.median(list(self._times)[-WINDOW:])
+        latest = statistics.median(list(self._times)[-ALARM_WINDOW:])
         alarm = latest > ALARM * self.budget_ms
+        if len(self._times) < WINDOW and not alarm:
+            return False
         self.measured_ms = latest if alarm else statistics.median(self._times)
         self._tell_apart(self.measured_ms, now)
         over = self.measured_ms > self.budget_ms
@@ -278,23 +275,16 @@ class Controller:
         if over or not self._chosen:
             self._target = dict(self._best(AIM).settings)
             self.fits = not over or self._saves(self._target)
-        elif self._target == self.settings:
-            better = self._best(RAISE)
-            if better.error >= (1.0 - GAIN) * self.expected_error:
-                self._better_since = None
-            elif self._better_since is None:
-                self._better_since = now
-            elif now - self._better_since >= PATIENCE:
-                self._target = dict(better.settings)
-        step = self._step(now) if self._chosen else self._target
+        elif self._target == self.settings and (better := self._best(RAISE)).error < self.expected_error:
+            self._target = dict(better.settings)
+        if self._chosen and now - self._held_since < HELD_SECONDS:
+            return False
+        step = self._step() if self._chosen else self._target
         self._chosen = self._chosen or step == self.settings
         if step == self.settings:
-            if now - max(self._moved.values(), default=-SETTING_SECONDS) >= SETTING_SECONDS:
-                self._target = self.settings  # no way there fits
+            self._target = self.settings  # no way there fits
             return False
-        for setting, method in step.items():
-            if method != self.settings[setting]:
-                self._moved[setting] = now
+        self._held_since = now
         self._change(dict(step))
         return True
 
@@ -304,7 +294,7 @@ class Controller:
             if timed.shown is not None and now > timed.until:
                 timed.shown = self._predicted = None
         surprise = max(measured, 1e-3) / max(self.expected_ms, 1e-3)
-        if self._new and self._factor is not None and not 1.0 / ALARM < surprise < ALARM:
+        if self._new and self._factor is not None and not 1.0 / SURPRISE < surprise < SURPRISE:
             timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
             timed.shown, timed.until = measured / self._factor, now + MEMORY
             self._predicted = None
@@ -314,7 +304,7 @@ class Controller:
 
     def _change(self, settings: dict[str, str]) -> None:
         self._before, self.settings = self.settings, settings
-        self._better_since, self._new = None, True
+        self._new = True
         self.restart()
 
     def restart(self) -> None:
@@ -323,17 +313,17 @@ class Controller:
         self._skip = SETTLE
 
     def _saves(self, settings: Mapping[str, str]) -> bool:
-        """Whether settings should take less than the present ones by what is worth a change."""
-        return self._cost(settings) < (1.0 - GAIN) * self._cost(self.settings)
+        """Whether settings should take less than the present ones."""
+        return self._cost(settings) < self._cost(self.settings)
 
-    def _step(self, now: float) -> dict[str, str]:
+    def _step(self) -> dict[str, str]:
         """At most one method of every setting toward the target."""
         moves: dict[str, str] = {}
         savings: dict[str, str] = {}
         for setting, method in self._target.items():
             methods = self._methods[setting]
             place, aim = methods.index(self.settings[setting]), methods.index(method)
-            if place == aim or now - self._moved.get(setting, -SETTING_SECONDS) < SETTING_SECONDS:
+            if place == aim:
                 continue
             moves[setting] = methods[place + (1 if aim > place else -1)]
             if aim < place:

@@ -60,7 +60,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "edge_samples": ("samples per pixel along the outlines of virtual objects, and of shadows of virtual light", {}),
     "light_shadow": (
         "shadows of virtual lights",
-        {"hard": "as if every lamp were a point (the paper)", "soft": "as wide as the lamp"},
+        {"hard": "as if every light were a point (the paper)", "soft": "as wide as the light"},
     ),
 }
 _CHOICES = tuple(stage for stage in STAGES if len(stage.methods) > 1)

@@ -19,6 +19,7 @@ from rich.table import Table
 from warp_ar.accuracy.case_report import CaseReport
 from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.runs import BASE
+from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import PRESETS
 
 MIN_COLUMNS = 110
@@ -54,6 +55,7 @@ def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any
         kept = {row.method for row in rows if not row.dominated}
         dominated[setting.name] = [method for method in by_method if method not in kept]
     return {
+        "program": PROGRAM,
         "made": _made(reports, device) | {"base": BASE.name},
         "errors": errors,
         "stage_errors": stage_errors,
@@ -64,6 +66,7 @@ def make_cost_table(reports: Sequence[CaseReport], device: str) -> dict[str, Any
 def make_preset_list(reports: Sequence[CaseReport], device: str) -> dict[str, Any]:
     """FLIP per changed pixel of every preset's whole picture, by case."""
     return {
+        "program": PROGRAM,
         "made": _made(reports, device),
         "errors": {
             report.case.name: {whole.label: round(whole.flip, 4) for whole in report.wholes if whole.label in PRESETS}
@@ -140,13 +143,15 @@ def print_report(report: CaseReport, console: Console) -> None:
 
 def records(report: CaseReport, device: str) -> Iterator[dict[str, Any]]:
     """One plain record per method and per whole, ready for JSON lines."""
+    signed = {"program": PROGRAM}  # first, as a file is known by its first key
     common = {"device": device_name(device), "warp": wp.__version__}
     for row in report.rows:
         error = {} if row.stage_error is None else dataclasses.asdict(row.stage_error)
         plain = {key: value for key, value in dataclasses.asdict(row).items() if key != "stage_error"}
-        yield {"kind": "method", **plain, **error, **common}
+        yield {**signed, "kind": "method", **plain, **error, **common}
     for whole in report.wholes:
         yield {
+            **signed,
             "kind": "whole",
             "case": report.case.name,
             "quality": whole.label,

@@ -20,6 +20,7 @@ from warp_ar.accuracy.figures import Figure
 from warp_ar.accuracy.metrics import flip_map
 from warp_ar.accuracy.pictures import Box, bounding_box, crop, error_colors
 from warp_ar.accuracy.sweep import Row
+from warp_ar.signature import COMMENT
 
 QUALITY = 82
 """Of WebP, for all pictures."""
@@ -354,7 +355,7 @@ def render(
     marks = "".join(f"<span>{mark * mark:.2g}</span>" for mark in np.linspace(0.1, 0.9, 5))
     lines = [line for line in extra if str(line.get("case", "")).startswith("precision")]
     parts = [
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">',
+        f'<!doctype html>{COMMENT}<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width,initial-scale=1"><title>What accuracy costs</title>',
         f"<style>{_STYLE}</style></head><body><main><h1>What accuracy costs</h1>",
         '<p class="lead">Every stage has methods, from the paper\'s way to brute force. Here is what each takes and '

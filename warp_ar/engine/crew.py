@@ -121,6 +121,8 @@ class Crew:
         self._threads: list[threading.Thread] = []
         self._count = threads
         self._names = [stage.name for stage, _ in steps]
+        if len(steps) > bands.MOST_STAGES:
+            raise ValueError(f"{len(steps)} stages; native threads run at most {bands.MOST_STAGES}")
         self._places = {name: place for place, name in enumerate(self._names)}
         self._rows: dict[int, int] = {}  # of the pass table, by the pass's id
         self._tiles = False
@@ -199,7 +201,7 @@ class Crew:
             assert note.record is not None
             packed = _Packed(note.record())
             size = ctypes.sizeof(packed.arguments)
-            if size > bands.ARGUMENT_ROOM:
+            if size > bands.ARGUMENT_ROOM or ctypes.sizeof(packed.bounds) > bands.BOUNDS_ROOM:
                 return None
             self._packed.append(packed)
             bounds = packed.bounds
@@ -302,7 +304,10 @@ class Crew:
         self._state[0, bands.STATE.index("open")] = len(self._names)
         self._state[0, bands.STATE.index("failed")] = 0
         if len(self._threads) < len(self._helpers):
-            self._threads = [threading.Thread(target=helper.call, daemon=True) for helper in self._helpers]
+            # A crew may be collected without having been closed: what a thread reads until it has returned is its own
+            # to keep. The callback, which would keep the crew, is called during frames alone.
+            read = (self._state, self._stages, self._passes, self._calls, self._readers, self._system)
+            self._threads = [threading.Thread(target=_serve, args=(one, read), daemon=True) for one in self._helpers]
             for thread in self._threads:
                 thread.start()
         if self._tiles:
@@ -325,6 +330,17 @@ class Crew:
         self._packed.clear()
         self._host_steps.clear()
         del self._called, self._decide, self._finish, self._caller, self._helpers
+
+
+def _serve(helper: _Packed, read: tuple[Any, ...]) -> None:
+    """A thread's life.
+
+    Args:
+        helper: The launch of ``serve_kernel``.
+        read: All that it reads besides, held until it returns.
+    """
+    helper.call()
+    del read
 
 
 def _stop(state: _Table, system: _System, count: int) -> None:

@@ -35,7 +35,7 @@ class Demand:
         """Look at one frame.
 
         Args:
-            reach: What of the frame virtual things can reach.
+            reach: What of the frame virtual objects and lights can reach.
 
         Returns:
             Reasons of the stages that rest, by name, and names of those that run to clear their arrays.

@@ -64,6 +64,7 @@ class FrameInputs:
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
         self.host_scene = HostScene(scene, device)
+        self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
         self.block = FrameBlock(device, len(scene.lights), len(scene.objects))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
@@ -73,6 +74,7 @@ class FrameInputs:
         """Linear value of each code, (256, 3)."""
         self.saturation = SaturationLevels()
         """Codes at which channels saturate, as frames have told so far."""
+        self._saturation_is_known = False
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
@@ -149,9 +151,15 @@ class FrameInputs:
         for name in touched:
             self._arrays.touch(name)
 
+    def fix_saturation(self, levels: npt.NDArray[np.int64]) -> None:
+        """Take codes at which channels saturate, (3,), as known: frames are no longer asked."""
+        self.saturation.levels = np.asarray(levels)
+        self._saturation_is_known = True
+        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels))
+
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""
-        if not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
+        if self._saturation_is_known or not self._probes or frame.pose is None or isinstance(frame.image, wp.array):
             return
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
@@ -169,7 +177,7 @@ class FrameInputs:
             yield "objects"
 
     def _move(self, pose: Pose) -> bool:
-        """Put the camera at ``pose`` and find what of the screen virtual things can reach; whether it moved."""
+        """Put the camera at ``pose``, find what virtual objects and lights can reach; whether it moved."""
         params = self._params
         position, rotation = params["camera_position"], params["world_from_camera"]
         before = position.tobytes(), rotation.tobytes()
@@ -200,7 +208,7 @@ class FrameInputs:
         return self.rects[name][:2]
 
     def reach(self) -> Reach:
-        """What of this frame virtual things can reach."""
+        """What of this frame virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
         shines = bool(self.block.host("lights")["intensity"].any())

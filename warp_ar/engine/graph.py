@@ -56,7 +56,7 @@ def make_plan(request: Request) -> Plan:
 
     # ``image`` without a producer is the frame itself.
     produced = {name for _, wiring in wired for name in wiring.writes}
-    wanted = {("frame" if name == "image" and name not in produced else name) for name in request.outputs}
+    wanted = {("frame" if name == "image" and name not in produced else name) for name in request.resources}
     unknown = wanted - produced - set(INPUTS)
     if unknown:
         raise ValueError(f"outputs: nothing in this scene produces {', '.join(sorted(unknown))}")

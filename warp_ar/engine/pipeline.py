@@ -23,6 +23,7 @@ from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
+from warp_ar.engine.layers import LayerArrays, check_outputs, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
@@ -34,6 +35,7 @@ from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
+from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.stages.request import Request
 
@@ -106,6 +108,7 @@ class Pipeline:
         bands: int | None = None,
         profile: bool = False,
         synchronous: bool = False,
+        emitters: bool = False,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -115,7 +118,8 @@ class Pipeline:
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, and layers by the names of
+                ``warp_ar.LAYERS``, such as ``depth``; what none of them needs does not run.
             exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
                 the others tell what clips in it, and what is too dark.
             shown: Which: seconds; None means the longest.
@@ -123,6 +127,7 @@ class Pipeline:
             profile: On CUDA wait for every frame and time each stage on the device.
             synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
                 that light then takes effect some frames later.
+            emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -132,6 +137,7 @@ class Pipeline:
         scene = _read_scene(scene)
         for exposure in exposures:
             _check_number("exposures", exposure, above=0.0)
+        check_outputs(outputs)
         self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
@@ -141,7 +147,7 @@ class Pipeline:
         self.bracket = plan_bracket(exposures, shown)
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous))
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
         self._begun = 0
@@ -258,6 +264,68 @@ class Pipeline:
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
+    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+
+        Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+
+        Args:
+            first: Number of the next frame in its clip.
+            saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
+                all frames to come.
+
+        Raises:
+            UsageError: The scene's light is that of a mirror ball in the frames.
+        """
+        self._check_usable()
+        self._finish()
+        if self.plan.features.observed:
+            raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
+        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._lit_time = math.inf  # no frame came before
+        self._shown = None
+        if self._tracker is not None:
+            self._tracker.reset()
+        if saturation is not None:
+            self.inputs.fix_saturation(saturation)
+        self._scheduler.restart()
+
+    def start_clock(self, seconds: float) -> None:
+        """Have animations begin at a time before the first frame; left out, they begin with it.
+
+        Args:
+            seconds: On the clock of ``time_seconds``.
+
+        Raises:
+            UsageError: A frame has been lit, the pipeline is closed, or the time is not finite.
+        """
+        self._check_usable()
+        _check_number("seconds", seconds)
+        if self._begun:
+            raise UsageError("start_clock comes before the first frame")
+        self._start_time = self._last_time = seconds
+        self._lit_time = math.inf  # no frame came before
+
+    def take_light(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
+        """Light the frames to come by another environment than the captured one that the scene names.
+
+        Args:
+            radiance: Linear RGB in the scene's axes, float32 (height, 2 height, 3), of the quality's
+                ``environment_height``; it is kept, not copied.
+            emitters: Where its emitters are: the array ``emitters`` of a pipeline that found them, copied.
+
+        Raises:
+            UsageError: The scene names no captured light, or the map has another size.
+        """
+        self._check_usable()
+        self._finish()
+        stage = self._scheduler.stage("captured")
+        if not isinstance(stage, Captured):
+            raise UsageError("take_light needs a scene with a captured light that some stage reads")
+        stage.replace(radiance, emitters)
+        self._arrays.touch("captured_light")
+
     def __call__(
         self,
         image: npt.NDArray[np.uint8] | Any,
@@ -366,6 +434,8 @@ class Pipeline:
     def _keep(self, rendered: Rendered) -> Rendered:
         """Have the picture outlast the next frame."""
         lit, light = rendered.image_array, rendered.environment_array
+        if rendered.layers is not None:
+            rendered = dataclasses.replace(rendered, layers=rendered.layers.to_host())
         if not isinstance(lit, wp.array):
             return dataclasses.replace(rendered, image=lit)
         if self.inputs.transfers is not None:
@@ -411,7 +481,17 @@ class Pipeline:
             self._light.known = True
         # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
-        return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3)
+        layers = self._layers_of(frame.image if frame.lost else None)
+        return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3, layers)
+
+    def _layers_of(self, unlit: Any = None) -> LayerArrays | None:
+        """The layers that were asked for; those of a frame that passes as it came are neutral."""
+        request = self.plan.request
+        if not request.asks_for_layers:
+            return None
+        if unlit is not None:
+            return neutral_layers(request, unlit, self.inputs.decode)
+        return layer_arrays(request, self._arrays)
 
     def _take_short(
         self, image: Any, host_image: Image | None, exposure: int | None, now: float, pose: Pose | None
@@ -431,5 +511,6 @@ class Pipeline:
             timings["unwrap"] = StageTiming((time.perf_counter() - start) * 1e3, False)
         self._last_time = now
         shown = bright if self._shown is None else self._shown
-        rendered = self._keep(Rendered(shown, self._light.environment, timings))
+        layers = self._layers_of(bright if self._shown is None else None)
+        rendered = self._keep(Rendered(shown, self._light.environment, timings, layers=layers))
         return Result(pose, state, rendered.at_once(), shown=False)

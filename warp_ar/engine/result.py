@@ -14,6 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.device import exclusive
+from warp_ar.engine.layers import LayerArrays
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Image, Picture
 from warp_ar.input.tracking import TrackState
@@ -32,6 +33,8 @@ class Rendered:
     stages: Mapping[str, StageTiming]
     render_ms: float = 0.0
     """Of the host: running the stages on CPU, launching them on CUDA."""
+    layers: LayerArrays | None = None
+    """The layers that were asked for, on the device or kept; None: none were."""
     image: Picture | Image | None = None
     """The picture, or that it is on its way to the host, where it was sent ahead."""
     environment: npt.NDArray[np.float32] | None = None
@@ -104,6 +107,31 @@ class Result:
             return rendered.environment
         with exclusive(rendered.environment_array.device):
             return np.array(rendered.environment_array.numpy())
+
+    @property
+    def layer_arrays(self) -> Mapping[str, Any]:
+        """The layers that were asked for, by name, where they lie; on the device valid until the next call."""
+        layers = self._rendered.result().layers
+        return {} if layers is None else layers.arrays
+
+    @functools.cached_property
+    def _host_layers(self) -> LayerArrays:
+        layers = self._rendered.result().layers
+        return LayerArrays({}) if layers is None else layers.to_host()
+
+    @property
+    def layers(self) -> Mapping[str, npt.NDArray[Any]]:
+        """The layers that were asked for as NumPy arrays of their own, by the names of ``warp_ar.LAYERS``.
+
+        float32 (height, width[, components]); ``ids`` int32. Read them before the next call, as ``image``.
+        """
+        return self._host_layers.arrays
+
+    @property
+    def exposure_scale(self) -> float:
+        """Factor on the radiance of the layers' composition in the picture; known where a layer was asked for."""
+        scale = self._host_layers.scale
+        return 1.0 if scale is None else float(scale[0])
 
     def _picture(self) -> Any:
         """The lit frame where it lies: on the device, or on the host if it was sent ahead or passed as it came."""

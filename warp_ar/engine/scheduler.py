@@ -96,7 +96,7 @@ class Scheduler:
         """Seconds by which stages are timed on the host."""
         self._build()
         self._culling = culling
-        self._demand = Demand([stage for stage, _ in self._stages], plan.request.outputs)
+        self._demand = Demand([stage for stage, _ in self._stages], plan.request.resources)
         self._unneeded: Mapping[str, str] = {}
         """Why stages can change no pixel of this frame."""
         self._passes = {stage.name: passes for stage, passes in self._stages}
@@ -130,9 +130,22 @@ class Scheduler:
         """The native threads that it has; None until it is prepared, and on CUDA."""
         return self._crew
 
+    def stage(self, name: str) -> Stage | None:
+        """The stage of that name, where it is part of the plan."""
+        return next((stage for stage, _ in self._stages if stage.name == name), None)
+
     def forget(self) -> None:
         """Make every stage run again in the next frame."""
         self._seen.clear()
+
+    def restart(self) -> None:
+        """Make every stage run again in the next frame, from what it remembers at first: nothing."""
+        self.forget()
+        with wp.ScopedDevice(self.device), exclusive(self.device):
+            for stage, _ in self._stages:
+                for name in self._remembered(stage):
+                    self.arrays[name].fill_(self._fills[name])
+                    self.arrays.touch(name)
 
     def continue_from(self, other: Scheduler) -> None:
         """Let stages go on from what the same stages of another plan remember, where it fits."""

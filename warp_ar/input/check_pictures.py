@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import cv2
@@ -70,16 +70,22 @@ class Look:
 
 def take_look(scene: Scene, source: Source, frames: int) -> Look:
     """Look at a source's first frames."""
+    shown = (
+        frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
+    )
     camera = scene.camera.scaled_to(*source.size)
-    tracker = Tracker(scene.marker, camera, steady=False)
+    return look_at(scene.marker, camera, ((frame.image, frame.time) for frame in shown))
+
+
+def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:
+    """Look at frames: RGB pictures of the camera's size, each with its time in seconds."""
+    tracker = Tracker(marker, camera, steady=False)
     images, views, errors = [], [], []
-    for frame in itertools.islice(source, frames):
-        if frame.exposure_time not in (None, *source.exposures[:1]):
-            continue
-        images.append(frame.image)
-        track = tracker.track(frame.image, frame.time)
+    for image, seconds in frames:
+        images.append(image)
+        track = tracker.track(image, seconds)
         if track.state is TrackState.TRACKED and track.pose is not None:
-            views.append((frame.image, track.pose))
+            views.append((image, track.pose))
             errors.append(track.reprojection_error)
     return Look(camera, tuple(images), tuple(views), tuple(errors), decode_table(camera.transfer))
 
@@ -89,7 +95,7 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
     if not look.images:
         return [Finding("source.empty", "the source has no frames", "check [source]")]
     if not look.views:
-        return [_why_unseen(scene.marker, look)]
+        return [why_unseen(scene.marker, look)]
     found = []
     share = len(look.views) / len(look.images)
     if share < RARE:
@@ -127,7 +133,7 @@ def _marker_side(marker: Marker, camera: Camera, pose: Pose) -> float:
     return float(np.median([np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in quads]))
 
 
-def _why_unseen(marker: Marker, look: Look) -> Finding:
+def why_unseen(marker: Marker, look: Look) -> Finding:
     """What the pictures show instead of the marker."""
     image = look.images[len(look.images) // 2]
     wanted = f"{marker.dictionary} {marker.board or f'id {marker.id}'}"
@@ -148,8 +154,9 @@ def _why_unseen(marker: Marker, look: Look) -> Finding:
         numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
         text = f"no {wanted} in {len(look.images)} frames; the picture shows {name} {numbers}"
         return Finding("marker.other", text, "print the card that [marker] names, or write what is printed")
-    text = f"no {wanted} in {len(look.images)} frames; the whole card with its white margin must be in the picture"
-    return Finding("marker.unseen", text, "show the whole card, flat, sharp and lit; check [marker]")
+    whole = "the whole card with its white margin" if marker.board else "the whole black square with its white margin"
+    text = f"no {wanted} in {len(look.images)} frames; {whole} must be in the picture"
+    return Finding("marker.unseen", text, "show all of it, flat, sharp and lit; check [marker]")
 
 
 def _gray(image: Image) -> Image:

@@ -9,7 +9,9 @@ from typing import Any, Final
 from warp_ar.errors import SceneError, SourceError
 from warp_ar.input.ball_solve import find_outlines
 from warp_ar.input.check_ball import LOST, check_balls
-from warp_ar.input.check_pictures import check_pictures, take_look
+from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_print import check_print
+from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.finding import Finding, worst_first
 from warp_ar.input.sources import open_source
@@ -17,6 +19,8 @@ from warp_ar.scene import Camera, Pose, Scene
 
 FRAMES: Final = 120
 """Frames that are looked at."""
+FEW_VIEWS: Final = 5
+"""Views in which paper and modelled shapes are looked for."""
 QUICK_FRAMES: Final = 12
 """Frames that the quick half looks at."""
 
@@ -58,7 +62,25 @@ def _check_source(
         return [Finding("source.unreadable", str(error), "check [source], or give --source")]
     except SceneError as error:
         return [Finding("camera.aspect", str(error), "python -m warp_ar.calibrate camera PICTURES")]
+    return _check_look(scene, look, views, before)
+
+
+def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
+    """What is wrong with a set-up whose frames were looked at already, the worst first.
+
+    Args:
+        scene: The scene.
+        look: What its frames show.
+        views: In how many frames the ball is looked for, each about half a second.
+    """
+    found = check_scene(scene)
+    return worst_first([*found, *_check_look(scene, look, views, found)])
+
+
+def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
     found = check_pictures(scene, look)
+    few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
+    found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.
     if any(finding.name.startswith("units.") for finding in before):
         return found

@@ -11,7 +11,7 @@ from typing import Any
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, or only guessed."""
+    """A fault of the set-up, or a guess."""
 
     name: str
     """Which check found it, such as ``probe.radius``."""

@@ -49,6 +49,11 @@ def ball_center(radius: float) -> tuple[float, float, float]:
     return (*BALL_PLACE, radius)
 
 
+def board_top(height: float) -> float:
+    """How far the board's middle lies below the upper edge of paper of a height; metres."""
+    return _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2
+
+
 def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image) -> Image:
     """The whole page.
 
@@ -62,7 +67,7 @@ def draw_sheet(size: tuple[float, float], pixels_per_metre: float, board: Image)
     """
     width, height = size
     page = np.full((round(height * pixels_per_metre), round(width * pixels_per_metre)), 255, np.uint8)
-    origin = np.array([width / 2, _TOP + BALL_PLACE[1] + (height - _LETTER_HEIGHT) / 2])
+    origin = np.array([width / 2, board_top(height)])
 
     def pixel(x: float, y: float) -> tuple[int, int]:
         """Column and row of a point of the board's frame."""

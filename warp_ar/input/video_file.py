@@ -123,8 +123,14 @@ class VideoFile(RecordedSource):
                 previous = seconds
                 yield Frame(index, seconds, image)
 
-    def _pictures(self, container: Any) -> Generator[tuple[Image, float | None], None, None]:
-        """Every picture with its time stamp in seconds; whatever precedes damage comes before the error."""
+    def _pictures(self, container: Any, first: int | None = None) -> Generator[tuple[Image, float | None], None, None]:
+        """Every picture with its time stamp in seconds; whatever precedes damage comes before the error.
+
+        Args:
+            container: Of the file.
+            first: Time stamp, in ticks of the stream, from which on pictures are wanted, where the container stands
+                somewhere before it; None: all are, from the start.
+        """
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         to_rgb = functools.partial(_rgb_from_video, VideoReformatter())
@@ -145,10 +151,11 @@ class VideoFile(RecordedSource):
             except (av.FFmpegError, OSError, ValueError) as error:
                 damage = reason(error)
             for picture in pictures:
-                yield to_rgb(picture), picture.time
+                if first is None or picture.pts >= first:
+                    yield to_rgb(picture), picture.time
                 count += 1
         # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
-        if not damage and "mp4" in container.format.name and packets < stream.frames:
+        if not damage and first is None and "mp4" in container.format.name and packets < stream.frames:
             damage = f"the file is cut off: its header promises {stream.frames} frames"
         if damage:
             # Threads and reordering hold frames back; those before the damage are still good.

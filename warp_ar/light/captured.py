@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import numbers
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from warp_ar.errors import SceneError, SinkError, reason
-from warp_ar.files import is_file, limits, too_much, write_whole
+from warp_ar.exr_file import write_exr
+from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -95,7 +97,7 @@ class Light:
         channels = {"RGB": np.ascontiguousarray(self.radiance), "confidence": np.ascontiguousarray(self.confidence)}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lambda part: OpenEXR.File(header, channels).write(str(part)))
+            write_whole(path, lambda part: write_exr(part, OpenEXR.File(header, channels)))
         except (RuntimeError, OSError) as error:
             raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
@@ -121,13 +123,16 @@ class Light:
         # Maps in the wild hold negative pixels, infinities and NaN.
         radiance = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6, neginf=0.0), 0.0, 1e6)
         confidence = channels.get("confidence", np.ones((height, width), np.float32))
+        if confidence.shape != (height, width):
+            size = "x".join(map(str, confidence.shape[::-1]))
+            raise SceneError(f"{path}: its channel confidence is {size}; expected {width}x{height}, as the light is")
         return cls(
             radiance,
             np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32),
             _parse_emitters(path, header.get("emitters", "[]")),
-            float(header.get("whiteLevel", 1.0)),
-            float(header.get("exposure", 0.0)) or None,
-            float(header.get("lowerBound", 0.0)),
+            _attribute(path, header, "whiteLevel", 1.0),
+            _attribute(path, header, "exposure", 0.0) or None,
+            _attribute(path, header, "lowerBound", 0.0),
         )
 
     def resampled(self, height: int, rotation: Array | None = None) -> Map:
@@ -240,10 +245,19 @@ def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Map]]:
         raise SceneError(f"{path} cannot be read as OpenEXR: {reason(error)}") from error
 
 
+def _attribute(path: Path, header: dict[str, Any], name: str, default: float) -> float:
+    value = header.get(name, default)
+    number = float(value) if isinstance(value, numbers.Real) else math.nan
+    if not 0.0 <= number < math.inf:
+        raise SceneError(f"{path}: its attribute {name} is {str(value)[:40]!r}; expected a finite number, 0 or more")
+    return number
+
+
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
+    label = f"{path}: its attribute emitters"
+    entries = parse_json(str(text), label, SceneError)
     try:
-        entries = json.loads(str(text))
-        return tuple(
+        emitters = tuple(
             CapturedEmitter(
                 _triple(entry["direction"]),
                 float(entry["solid_angle"]),
@@ -255,5 +269,11 @@ def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:
             )
             for entry in entries
         )
-    except (ValueError, TypeError, KeyError) as error:
-        raise SceneError(f"{path}: its attribute emitters is damaged: {reason(error)}") from error
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise SceneError(f"{label} is damaged: {reason(error)}") from error
+    for emitter in emitters:
+        given = [*emitter.direction, emitter.solid_angle, *emitter.power, *emitter.low, *emitter.origin]
+        given += [*(emitter.high or ()), emitter.distance or 0.0]
+        if not all(map(math.isfinite, given)):
+            raise SceneError(f"{label} is damaged: it holds a number that is not finite")
+    return emitters

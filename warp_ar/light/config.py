@@ -25,6 +25,16 @@ class SurfaceConfig:
 
     grid: float = 0.06
     """Metres between points on planes."""
+    planes: int = 8
+    """Planes that are read: costs grow no further with the scene's number of proxies. Those share"""
+    plane_points: int = 2000
+    """points,"""
+    boxes: int = 16
+    """and so many boxes share"""
+    box_points: int = 1536
+    """points,"""
+    face_steps: int = 5
+    """at most this many in each of a face's two directions."""
     noise: tuple[float, ...] = (0.02, 0.04, 0.12, 0.04)
     """Relative standard deviation of one equation, by kind, where points scatter so much or are too few to tell."""
     least_noise: float = 0.015

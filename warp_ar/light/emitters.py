@@ -38,8 +38,8 @@ class EmitterSearch:
         free = fit.z > 0.0
         added = columns[fit.rows] / self.problem.light[fit.rows, self.c][:, None]
         weighted = fit.weights[:, None] * added
-        pull = weighted.T @ (fit.target - fit.matrix @ fit.z)
-        overlap = fit.matrix[:, free].T @ weighted
+        pull = weighted.T @ (fit.target - fit.equations.times(fit.z))
+        overlap = fit.equations.transposed(weighted)[free]
         own = (added * weighted).sum(axis=0)
         own -= (overlap * np.linalg.solve(fit.hessian[np.ix_(free, free)], overlap)).sum(axis=0)
         return np.asarray(np.where(pull > 0.0, pull**2 / np.maximum(own, 1e-9), 0.0), np.float64)

@@ -19,6 +19,57 @@ Array = NDArray[np.float64]
 LEAST = CONFIG.priors.least
 
 
+class Equations:
+    """Left sides of equations, by what is in them: light, which all have in common, and one surface each.
+
+    An equation is light of parts and candidates less 1 / reflectance of its surface, so that with many surfaces nearly
+    all of a matrix would be zeros. What is kept is the light and the number of the surface: products take time in
+    proportion to equations, and not to equations times surfaces.
+    """
+
+    def __init__(self, light: Array, surface: NDArray[np.int64], first: int, count: int) -> None:
+        """Keep both.
+
+        Args:
+            light: Of parts and candidates, divided by pi times the radiance shown, (rows, parts and candidates).
+            surface: Of each row, ascending, (rows,).
+            first: Place of the first surface among the unknowns.
+            count: Of surfaces.
+        """
+        self.light, self.surface, self.first, self.count = light, surface, first, count
+        self._present, self._starts = np.unique(surface, return_index=True)
+
+    @property
+    def unknowns(self) -> int:
+        """How many there are."""
+        return self.first + self.count
+
+    def times(self, z: Array) -> Array:
+        """Left sides of unknowns ``z``, (rows,)."""
+        return np.asarray(self.light @ z[: self.light.shape[1]] - z[self.first + self.surface], np.float64)
+
+    def transposed(self, values: Array) -> Array:
+        """Product of the transposed matrix with ``values`` (rows, ...), (unknowns, ...)."""
+        product = np.zeros((self.unknowns, *values.shape[1:]))
+        if len(values):
+            product[: self.light.shape[1]] = self.light.T @ values
+            product[self.first + self._present] = -np.add.reduceat(values, self._starts, axis=0)
+        return product
+
+    def add_normal(self, hessian: Array, weights: Array) -> None:
+        """Add the transposed matrix times ``weights`` (rows,) times the matrix to ``hessian`` (unknowns, unknowns)."""
+        if not len(weights):
+            return
+        bright = self.light.shape[1]
+        weighted = weights[:, None] * self.light
+        hessian[:bright, :bright] += self.light.T @ weighted
+        places = self.first + self._present
+        across = np.add.reduceat(weighted, self._starts, axis=0)
+        hessian[places, :bright] -= across
+        hessian[:bright, places] -= across.T
+        hessian[places, places] += np.add.reduceat(weights, self._starts)
+
+
 @dataclasses.dataclass
 class Fit:
     """A solution and the quadratic problem that it solves."""
@@ -29,8 +80,8 @@ class Fit:
     """Twice a negative log likelihood."""
     rows: NDArray[np.int64]
     """Points that have an equation."""
-    matrix: Array
-    """Left sides, divided by pi times the radiance shown, (rows, unknowns)."""
+    equations: Equations
+    """Left sides."""
     target: Array
     """Right sides, (rows,)."""
     weights: Array
@@ -52,16 +103,15 @@ def fit_channel(
         centre: Draws parts and candidates to itself instead of to means.
         other: Unknowns of a channel that is known better: surfaces are of about that reflectance.
     """
-    return _Channel(problem, c, len(z), centre, other).solve(z, iterations)
+    return _Channel(problem, c, centre, other).solve(z, iterations)
 
 
 class _Channel:
     """One channel's equations and priors, as matrices."""
 
-    def __init__(self, problem: Problem, c: int, unknowns: int, centre: Array | None, other: Array | None) -> None:
+    def __init__(self, problem: Problem, c: int, centre: Array | None, other: Array | None) -> None:
         self.problem, self.centre = problem, centre
-        parts, mean_at, u_at = problem.parts, problem.first_mean, problem.first_surface
-        count = len(problem.kinds)
+        u_at, count = problem.first_surface, len(problem.kinds)
         self.usable = np.bincount(problem.surface[problem.exact[:, c]], minlength=count) >= 4
         known = problem.kind == Kind.CARD
         self.rows = rows = np.flatnonzero(
@@ -71,10 +121,8 @@ class _Channel:
         )
         self.surface, self.exact = problem.surface[rows], problem.exact[rows, c]
         light = problem.light[rows, c]
-        self.matrix = np.zeros((len(rows), unknowns))
-        self.matrix[:, :parts] = problem.columns[c][rows] / light[:, None]
-        self.matrix[:, parts:mean_at] = problem.candidate_columns[c][rows] / light[:, None]
-        self.matrix[np.arange(len(rows)), u_at + self.surface] = -1.0
+        sources = np.concatenate([problem.columns[c][rows], problem.candidate_columns[c][rows]], axis=1)
+        self.equations = Equations(sources / light[:, None], self.surface, u_at, count)
         self.target = -problem.captured[rows, c] / light
         surfaces = CONFIG.surfaces
         self.prior_u = np.where(
@@ -85,26 +133,21 @@ class _Channel:
             self.prior_u, self.spread_u = other[-count:], np.array(surfaces.hue_spread)[problem.kinds]
         self.sigma = np.hypot(problem.noise[self.surface], surfaces.mirror_trust * problem.mirrored_share[rows])
         self.shared = problem.shared[rows]
-        self._set_priors(unknowns)
+        self._set_priors()
 
-    def _set_priors(self, unknowns: int) -> None:
-        """Left and right sides of what parts, means and tied reflectances deviate from."""
+    def _set_priors(self) -> None:
+        """Left and right sides of what parts and means deviate from."""
         problem = self.problem
         mean_at, u_at = problem.first_mean, problem.first_surface
-        self.prior = np.zeros((mean_at + problem.components + 1 + len(problem.ties), unknowns))
-        self.prior_target = np.zeros(len(self.prior))
-        own = np.arange(mean_at + problem.components + 1)
-        self.first_tie = len(own)
-        self.prior[own, own] = 1.0
+        self.prior = np.eye(u_at)
+        self.prior_target = np.zeros(u_at)
         if self.centre is None:
             free = np.flatnonzero(~problem.is_surface)
             self.prior[free, mean_at + problem.component[free]] = -1.0
             self.prior[mean_at : mean_at + problem.components, u_at - 1] = -problem.expected
         else:
             self.prior_target[:mean_at] = self.centre
-        for row, (a, b) in enumerate(problem.ties, start=self.first_tie):
-            self.prior[row, u_at + a], self.prior[row, u_at + b] = 1.0, -1.0
-        self.deviation = np.ones(len(self.prior))
+        self.deviation = np.ones(u_at)
 
     def solve(self, z: Array, iterations: int) -> Fit:
         """Reweight and solve in turn."""
@@ -121,17 +164,19 @@ class _Channel:
                 break
         u = np.maximum(z[u_at:], 1e-3)
         z[u_at:] = u
-        relative = (self.matrix @ z - self.target) / (u[self.surface] * self.sigma)
+        relative = (self.equations.times(z) - self.target) / (u[self.surface] * self.sigma)
         relative[~self.exact & (relative > 0.0)] = 0.0
         cost = float((4.0 * np.log1p(0.25 * relative**2) / self.shared).sum())
-        cost += float((((self.prior @ z - self.prior_target) / self.deviation) ** 2).sum())
+        cost += float((((self.prior @ z[:u_at] - self.prior_target) / self.deviation) ** 2).sum())
+        a, b = self.problem.ties.T
+        cost += float((self.tie_weight * (u[a] - u[b]) ** 2).sum())
         cost += float(((np.log(u / self.prior_u) / self.spread_u) ** 2).sum())
-        return Fit(z, cost, self.rows, self.matrix, self.target, weights, hessian)
+        return Fit(z, cost, self.rows, self.equations, self.target, weights, hessian)
 
     def _guess_reflectances(self, z: Array) -> None:
         """What the start's light makes of surfaces that were left open."""
         problem, u_at = self.problem, self.problem.first_surface
-        ratio = self.matrix[:, : problem.first_mean] @ z[: problem.first_mean] - self.target
+        ratio = self.equations.light @ z[: problem.first_mean] - self.target
         z[u_at:] = self.prior_u
         for k in np.flatnonzero(self.usable & (problem.kinds != Kind.CARD)):
             z[u_at + k] = max(float(np.median(ratio[self.exact & (self.surface == k)])), 1e-3)
@@ -150,8 +195,8 @@ class _Channel:
             deviation[parts:mean_at] = priors.hue * np.maximum(self.centre[parts:], 0.01)
         deviation[mean_at : u_at - 1] = priors.spread * np.maximum(problem.expected * z[u_at - 1], LEAST)
         deviation[u_at - 1] = 3.0 * max(z[u_at - 1], LEAST)
-        for row, (a, b) in enumerate(problem.ties, start=self.first_tie):
-            deviation[row] = CONFIG.surfaces.tie * 0.5 * (u[a] + u[b])
+        a, b = problem.ties.T
+        self.tie_weight = 1.0 / (CONFIG.surfaces.tie * 0.5 * (u[a] + u[b])) ** 2
 
     def _quadratic(self, z: Array) -> tuple[Array, Array, Array]:
         """Hessian, gradient and the equations' weights about the last estimate."""
@@ -159,28 +204,32 @@ class _Channel:
         mean_at, u_at = problem.first_mean, problem.first_surface
         u = np.maximum(z[u_at:], 1e-3)
         diagonal = np.arange(u_at, len(z))
+        hessian, gradient = np.zeros((len(z), len(z))), np.zeros(len(z))
         scaled = self.prior / self.deviation[:, None]
-        hessian = scaled.T @ scaled
-        gradient = scaled.T @ (self.prior_target / self.deviation)
+        hessian[:u_at, :u_at] = scaled.T @ scaled
+        gradient[:u_at] = scaled.T @ (self.prior_target / self.deviation)
+        a, b = u_at + problem.ties.T
+        hessian[a, b] = hessian[b, a] = -self.tie_weight
+        own_ties = np.concatenate([a, b]) - u_at
+        hessian[diagonal, diagonal] = np.bincount(own_ties, np.tile(self.tie_weight, 2), minlength=count)
         # Log-normal prior of 1 / reflectance, about the last estimate.
         hessian[diagonal, diagonal] += 1.0 / (u * self.spread_u) ** 2
         gradient[u_at:] += np.maximum(1.0 + np.log(self.prior_u / u), 0.2) / (u * self.spread_u**2)
-        relative = (self.matrix @ z - self.target) / (u[self.surface] * self.sigma)
+        off = self.equations.times(z) - self.target
+        relative = off / (u[self.surface] * self.sigma)
         weights = 1.0 / (1.0 + 0.25 * relative**2) / ((u[self.surface] * self.sigma) ** 2 * self.shared)
         weights[~self.exact & (relative > 0.0)] = 0.0
-        weighted = weights[:, None] * self.matrix
-        hessian += self.matrix.T @ weighted
-        gradient += weighted.T @ self.target
+        self.equations.add_normal(hessian, weights)
+        gradient += self.equations.transposed(weights * self.target)
         # Deviations are relative: what they are relative to must not shrink for their sake.
-        squared = weights * (self.matrix @ z - self.target) ** 2
-        gradient[u_at:] += np.bincount(self.surface, squared, minlength=count) / u
+        gradient[u_at:] += np.bincount(self.surface, weights * off**2, minlength=count) / u
         if self.centre is None:
             means = z[mean_at : u_at - 1]
-            off = (scaled @ z) ** 2
+            strayed = (scaled @ z[:u_at]) ** 2
             about = np.maximum(means[problem.component], LEAST)
-            within = np.where(problem.is_surface | (about <= LEAST), 0.0, off[: problem.parts])
+            within = np.where(problem.is_surface | (about <= LEAST), 0.0, strayed[: problem.parts])
             sums = np.bincount(problem.component, within, minlength=problem.components)
             gradient[mean_at : u_at - 1] += sums / np.maximum(means, LEAST)
             wide = problem.expected * z[u_at - 1] > LEAST
-            gradient[u_at - 1] += (off[mean_at : u_at - 1] * wide).sum() / max(z[u_at - 1], LEAST)
+            gradient[u_at - 1] += (strayed[mean_at : u_at - 1] * wide).sum() / max(z[u_at - 1], LEAST)
         return hessian, gradient, weights

@@ -83,12 +83,10 @@ class Problem:
         through_balls = self._aim_transfer(cells, transfer, mirrored, surfaces, clipped)
         self._sum_light(through_balls)
         self.candidate_columns = np.zeros((3, len(self.index), 0))
-        self.ties = [
-            (a, b)
-            for a in range(len(self.kinds))
-            for b in range(a)
-            if self.kinds[a] == Kind.FACE and self.kinds[b] == Kind.FACE and self.groups[a] == self.groups[b]
-        ]
+        faces = self.kinds == Kind.FACE
+        one_box = faces & faces[:, None] & (self.groups == self.groups[:, None])
+        self.ties = np.argwhere(np.tril(one_box, -1))
+        """Pairs of faces of one box, whose reflectances are alike, (pairs, 2)."""
 
     def _read_cells(self, cells: NDArray[Any]) -> Array:
         """The map's side; returns the share of each cell that clips in any channel, (m,)."""
@@ -285,7 +283,8 @@ class Problem:
             near = patch[:, 0] > 0.0
             block = np.stack([column * (self.lost[near, c].max() > LOST) for c in range(3)])
         else:
-            block = np.stack([self.transfer @ (patch[:, c] * self.missing[:, c]) for c in range(3)])
+            inside = np.flatnonzero(patch.any(axis=1))
+            block = (self.transfer[:, inside] @ (patch * self.missing)[inside]).T
         self.candidates.append(candidate)
         self.candidate_columns = np.concatenate([self.candidate_columns, block[:, :, None]], axis=2)
 

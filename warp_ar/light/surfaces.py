@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from warp_ar.input.marker_pattern import printed_cells
 from warp_ar.kernels.recover import SurfacePoint
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.scene import Scene
+from warp_ar.scene import Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -63,7 +64,8 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 
     On the card: the centres of all cells, and its quiet zone. On planes: rings around each ball, where its shadow and
     reflection fall, and a grid around the origin; not on the card (whose size beyond the quiet zone is not known) and
-    not under boxes. On boxes: 5 x 5 per face.
+    not under boxes. On boxes: 5 x 5 per face. Where there are many, the ones that look largest from the ball share a
+    number of points (``SurfaceConfig.planes``, ``boxes``): the others hide light, and nothing is read off them.
 
     Args:
         scene: What is modelled.
@@ -71,52 +73,95 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
     """
     found = _Collector()
     cells, white, side, outline = printed_cells(scene.marker)
-    z, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]
+    if scene.has_marker:
+        z, x = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+        paper = [*cells[white], *_quiet_zone(low, high, side)]
+        found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
+        found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
+    if card_only:
+        return found.result()
+    config = CONFIG.surfaces
+    planes, boxes = _largest(scene, "plane", config.planes), _largest(scene, "box", config.boxes)
+    on_planes = {number: _plane_points(scene, scene.proxies[number], low, high) for number in planes}
+    every = max(1, -(-sum(map(len, on_planes.values())) // config.plane_points))
+    steps = int(np.clip(math.isqrt(config.box_points // (6 * max(len(boxes), 1))), 1, config.face_steps))
+    for number, proxy in enumerate(scene.proxies):
+        if number in planes:
+            rotation = rotation_matrix(proxy.rotate)
+            points = list(on_planes[number][::every])
+            found.add(points, rotation[:, 2], rotation[:, 0], 0.004, Kind.PLANE, 2 + number)
+        elif number in boxes:
+            _add_box(found, proxy, steps, 2 + number)
+    return found.result()
+
+
+def _largest(scene: Scene, shape: str, most: int) -> set[int]:
+    """Numbers of the ``most`` proxies of a shape that look largest from the first ball."""
+    own = [number for number, proxy in enumerate(scene.proxies) if proxy.shape == shape]
+    if len(own) <= most:
+        return set(own)
+    center = np.array(scene.probes[0].center)
+
+    def apparent_size(number: int) -> float:
+        proxy = scene.proxies[number]
+        away = float(np.linalg.norm(np.array(proxy.at) - center))
+        return float(np.linalg.norm(proxy.size)) / max(away, 1e-6)
+
+    return set(sorted(own, key=apparent_size, reverse=True)[:most])
+
+
+def _quiet_zone(low: Array, high: Array, side: float) -> Array:
+    """Points on the paper around the print, half a cell beside it, (32, 3)."""
     along = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
     corners = np.array([[low[0], high[1]], high, [high[0], low[1]], low]) + 0.5 * side * np.array(
         [[-1, 1], [1, 1], [1, -1], [-1, -1]]
     )
     ring = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    paper = [*cells[white], *np.column_stack([ring, np.zeros(len(ring))])]
-    if scene.has_marker:
-        found.add(paper, z, x, 0.3 * side, Kind.CARD, 0)
-        found.add(list(cells[~white]), z, x, 0.3 * side, Kind.INK, 1)
-    if card_only:
-        return found.result()
+    return np.column_stack([ring, np.zeros(len(ring))])
+
+
+def _plane_points(scene: Scene, plane: Proxy, low: Array, high: Array) -> Array:
+    """Points on a plane, off the card and off boxes, (n, 3).
+
+    Args:
+        scene: What else is modelled.
+        plane: The plane.
+        low: Least x and y of the marker's print, metres, (2,).
+        high: Greatest, (2,).
+    """
+    rotation, at = rotation_matrix(plane.rotate), np.array(plane.at)
+    half = 0.5 * np.array(plane.size)
+    places = [np.stack(np.meshgrid(*2 * [np.arange(-0.45, 0.451, CONFIG.surfaces.grid)]), -1).reshape(-1, 2)]
+    turn = np.arange(24) * np.pi / 12
+    for probe in scene.probes:
+        middle = (rotation.T @ (np.array(probe.center) - at))[:2]
+        radii = probe.radius * np.geomspace(0.6, 7.0, 11)
+        rings = radii[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+        places.append(middle + rings.reshape(-1, 2))
+    local = np.concatenate(places)
+    local = local[(np.abs(local) < half).all(axis=1)]
+    points: Array = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
     margin = 0.3 * float((high - low).max())
-    for number, proxy in enumerate(scene.proxies):
-        rotation, at = rotation_matrix(proxy.rotate), np.array(proxy.at)
-        if proxy.shape == "plane":
-            half = 0.5 * np.array(proxy.size)
-            places = [np.stack(np.meshgrid(*2 * [np.arange(-0.45, 0.451, CONFIG.surfaces.grid)]), -1).reshape(-1, 2)]
-            turn = np.arange(24) * np.pi / 12
-            for probe in scene.probes:
-                middle = (rotation.T @ (np.array(probe.center) - at))[:2]
-                radii = probe.radius * np.geomspace(0.6, 7.0, 11)
-                rings = radii[:, None, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
-                places.append(middle + rings.reshape(-1, 2))
-            local = np.concatenate(places)
-            local = local[(np.abs(local) < half).all(axis=1)]
-            points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
-            flat = np.abs(points[:, 2]) < 0.02
-            card = flat & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
-            card &= scene.has_marker
-            points = points[~card & ~_in_boxes(scene, points)]
-            found.add(list(points), rotation[:, 2], rotation[:, 0], 0.004, Kind.PLANE, 2 + number)
-        elif proxy.shape == "box":
-            half = 0.5 * np.array(proxy.size)
-            steps = (np.arange(5) + 0.5) / 2.5 - 1.0
-            for axis in range(3):
-                u, v = (axis + 1) % 3, (axis + 2) % 3
-                for sign in (-1.0, 1.0):
-                    face = np.zeros((25, 3))
-                    face[:, axis] = sign * half[axis]
-                    face[:, u], face[:, v] = np.repeat(steps, 5) * half[u], np.tile(steps, 5) * half[v]
-                    size = 0.12 * float(min(half[u], half[v]))
-                    face_points = list(at + face @ rotation.T)
-                    found.add(face_points, sign * rotation[:, axis], rotation[:, u], size, Kind.FACE, 2 + number)
-    return found.result()
+    flat = np.abs(points[:, 2]) < 0.02
+    card = flat & (points[:, :2] > low - margin).all(axis=1) & (points[:, :2] < high + margin).all(axis=1)
+    card &= scene.has_marker
+    return points[~card & ~_in_boxes(scene, points)]
+
+
+def _add_box(found: _Collector, box: Proxy, steps: int, group: int) -> None:
+    """Points on a box's faces, ``steps`` x ``steps`` on each."""
+    rotation, at = rotation_matrix(box.rotate), np.array(box.at)
+    half = 0.5 * np.array(box.size)
+    middles = (np.arange(steps) + 0.5) / (0.5 * steps) - 1.0
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for sign in (-1.0, 1.0):
+            face = np.zeros((steps**2, 3))
+            face[:, axis] = sign * half[axis]
+            face[:, u], face[:, v] = np.repeat(middles, steps) * half[u], np.tile(middles, steps) * half[v]
+            size = 0.12 * float(min(half[u], half[v]))
+            found.add(list(at + face @ rotation.T), sign * rotation[:, axis], rotation[:, u], size, Kind.FACE, group)
 
 
 def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:

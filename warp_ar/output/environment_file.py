@@ -23,6 +23,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, too_much, write_whole
 from warp_ar.light.captured import REC_709
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
@@ -136,16 +137,12 @@ def write_environment(
             data = encode_hdr(picture, described)
         else:
             image = OpenEXR.File(_header(axes, layout, info), {"RGB": np.ascontiguousarray(picture)})
-            data = functools.partial(_write_exr, image)
+            data = functools.partial(write_exr, image=image)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, data)
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-
-
-def _write_exr(image: OpenEXR.File, path: pathlib.Path) -> None:
-    image.write(str(path))
 
 
 def _header(axes: str, layout: str, info: EnvironmentInfo) -> dict[str, Any]:

@@ -51,13 +51,18 @@ class FolderSink(ThreadedSink):
             what = "a file" if kind == "file" else kind
             raise SinkError(f"{self._path} is {what}; name a folder, or a video ending in {', '.join(VIDEO_SUFFIXES)}")
         make_folder(self._path)
-        self._earlier = earlier_frames(self._path, self._suffix, overwrite=overwrite)
-        if self._earlier:
-            self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
+        self._earlier: list[pathlib.Path] = []
+        self._find_earlier(self._path, self._suffix, overwrite=overwrite)
         self.description = f"{self._path} (numbered frames)"
         super().__init__(FOLDER_THREADS)
 
-    def write(self, image: npt.NDArray[Any]) -> None:
+    def _find_earlier(self, folder: pathlib.Path, suffix: str, *, overwrite: bool) -> None:
+        """Note the numbered frames that the first new one replaces; raises SinkError where they may not go."""
+        self._earlier += earlier_frames(folder, suffix, overwrite=overwrite)
+        if self._earlier:
+            self.replaced = f"{self._path}: {len(self._earlier)} numbered frames of an earlier run are replaced"
+
+    def write(self, image: Any) -> None:
         """Take the next frame; the first one clears away those of an earlier run."""
         self._check(image)
         earlier, self._earlier = self._earlier, []

@@ -82,16 +82,16 @@ class ThreadedSink(Sink):
         self._count = 0
         self._counting = threading.Lock()
 
-    def _check(self, image: npt.NDArray[Any]) -> None:
-        """Raise SinkError if the array is of a kind that cannot be written."""
+    def _check(self, image: Any) -> None:
+        """Raise SinkError if the frame is of a kind that cannot be written."""
         check_image(image)
 
     @abstractmethod
-    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+    def _store(self, index: int, image: Any) -> None:
         """Encode and write one frame; runs on a thread, and raises SinkError."""
 
-    def write(self, image: npt.NDArray[Any]) -> None:
-        """Take the next frame; it is copied and stored on a thread."""
+    def write(self, image: Any) -> None:
+        """Take the next frame, an array or whatever else has a shape and copies itself; it is stored on a thread."""
         if self._closed:
             raise SinkError(f"{self.description} is closed; open another one to write to")
         self._check(image)
@@ -105,7 +105,7 @@ class ThreadedSink(Sink):
         self._pending.append(self._executor.submit(self._keep, self._count, image.copy()))
         self._count += 1
 
-    def _keep(self, index: int, image: npt.NDArray[Any]) -> None:
+    def _keep(self, index: int, image: Any) -> None:
         self._store(index, image)
         with self._counting:
             self.written += 1

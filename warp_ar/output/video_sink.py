@@ -107,7 +107,7 @@ class VideoSink(ThreadedSink):
         context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         self._container.start_encoding()
-        self._converter = _rgb_to_yuv(width, height, 1 / self._rate)
+        self._converter = rgb_to_yuv(width, height, 1 / self._rate)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
@@ -162,7 +162,7 @@ def _count_frames(path: pathlib.Path) -> int:
         return 0
 
 
-def _rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:
+def rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:
     """Filter from rgb24 to yuv420p as an H.264 stream means it unless it says otherwise.
 
     BT.709, limited range, and chroma sited at the left one of each pair of columns: the plain converter puts it between

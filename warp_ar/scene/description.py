@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.geometry import Mesh, rotation_matrix
 
 Vec3: TypeAlias = tuple[float, float, float]
 RGB: TypeAlias = tuple[float, float, float]
@@ -292,7 +292,12 @@ class MirrorMaterial:
     """Reflectance, the same at every angle."""
 
 
-Material: TypeAlias = PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial
+@dataclasses.dataclass(frozen=True)
+class FileMaterial:
+    """The materials that the mesh's file brings; matt white where it brings none."""
+
+
+Material: TypeAlias = FileMaterial | PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,7 +307,7 @@ class Object:
     shape: Literal["mesh", "sphere", "box", "torus"]
     """Spheres, boxes and tori are centred at their origin; a torus lies around its z axis."""
     file: Path | None = None
-    """Mesh file; a texture that it brings is multiplied by the material's first colour."""
+    """Mesh file; under another material than its own its textures of the base colour multiply the first colour."""
     radius: float = 0.0
     """Radius of a sphere in metres."""
     size: Vec3 = (0.0, 0.0, 0.0)
@@ -317,10 +322,12 @@ class Object:
     """Degrees about the fixed x, then y, then z axis."""
     scale: float = 1.0
     """Factor on all lengths of the shape."""
-    material: Material = LambertMaterial()
+    material: Material = FileMaterial()
     """How it reflects light."""
     animate: Animation | None = None
     """How it moves."""
+    mesh: Mesh | None = dataclasses.field(default=None, repr=False)
+    """A mesh in memory instead of a file; a scene file cannot say it. See ``Object.of``."""
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""

@@ -1,7 +1,7 @@
 """Triangle meshes, their vertex normals, and rotations.
 
-A mesh is in its own coordinates as a file has them, in metres; no axis is flipped. glTF is y-up, the world of a scene
-is z-up: a glTF model is stood upright with ``rotate = [90, 0, 0]``.
+A mesh is in its own coordinates as a file has them, in metres. glTF says that +Y is up: such a mesh is turned to +Z
+when it is read, so that it stands on the receiver. The other formats say nothing, and are left as they are.
 
 References:
     [TW98] Thuermer and Wuethrich, "Computing Vertex Normals from Polygonal Facets", J. of Graphics Tools 3(1), 1998.
@@ -12,10 +12,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from warp_ar.scene.mesh_materials import MeshMaterial
 
 FloatArray = npt.NDArray[np.float32]
 IntArray = npt.NDArray[np.int32]
@@ -38,8 +41,28 @@ class Mesh:
     """Unit vertex normals, (n, 3)."""
     uvs: FloatArray | None = None
     """Texture coordinates, (n, 2): u to the right, v up the picture, (0, 0) at its bottom left corner; they repeat."""
-    texture: ByteArray | None = None
-    """Base colour, (h, w, 3) RGB, sRGB-encoded, row 0 at the top (v = 1)."""
+    uvs_second: FloatArray | None = None
+    """Second set of texture coordinates, (n, 2)."""
+    colors: FloatArray | None = None
+    """Factor of the base colour and of alpha, (n, 4), linear."""
+    tangents: FloatArray | None = None
+    """Where u grows, (n, 4): a unit vector across the normal, and 1 or -1 for the side that v grows to."""
+    triangle_materials: IntArray | None = None
+    """Which of ``materials`` each triangle has, (m,); None: all the first."""
+    materials: tuple[MeshMaterial, ...] = ()
+    """The file's own; none: it says nothing of how it looks."""
+    images: tuple[ByteArray, ...] = ()
+    """Pictures that the materials name, each (h, w, 4) RGBA, row 0 at the top (v = 1)."""
+    notes: tuple[str, ...] = ()
+    """What the file holds and is not shown, by name."""
+
+    @property
+    def texture(self) -> ByteArray | None:
+        """Base colour of the first material that has a picture of it, (h, w, 3) RGB, sRGB-encoded."""
+        for material in self.materials:
+            if material.base is not None:
+                return self.images[material.base.image][..., :3]
+        return None
 
     @property
     def bounds(self) -> FloatArray:
@@ -66,14 +89,22 @@ def rotation_matrix(rotate: Sequence[float]) -> npt.NDArray[np.float64]:
     )
 
 
-def make_mesh(vertices: Any, faces: Any, normals: Any, uvs: Any = None, texture: ByteArray | None = None) -> Mesh:
-    """A mesh of single-precision arrays that lie tightly in memory."""
+def make_mesh(vertices: Any, faces: Any, normals: Any, uvs: Any = None, **others: Any) -> Mesh:
+    """A mesh of single-precision arrays that lie tightly in memory; ``others`` are further fields of ``Mesh``."""
+
+    def single(values: Any) -> FloatArray | None:
+        return None if values is None else np.ascontiguousarray(values, dtype=np.float32)
+
+    for name in ("uvs_second", "colors", "tangents"):
+        others[name] = single(others.get(name))
+    if others.get("triangle_materials") is not None:
+        others["triangle_materials"] = np.ascontiguousarray(others["triangle_materials"], dtype=np.int32)
     return Mesh(
         np.ascontiguousarray(vertices, dtype=np.float32),
         np.ascontiguousarray(faces, dtype=np.int32),
         np.ascontiguousarray(normals, dtype=np.float32),
-        None if uvs is None else np.ascontiguousarray(uvs, dtype=np.float32),
-        texture,
+        single(uvs),
+        **others,
     )
 
 
@@ -93,11 +124,8 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
     """
     points = np.asarray(vertices, dtype=np.float64)
     corners = np.asarray(faces, dtype=np.int64)
-    order = np.lexsort(points.T)
-    fresh = np.any(np.diff(points[order], axis=0, prepend=np.nan) != 0.0, axis=1)
-    place = np.empty(len(points), dtype=np.int64)
-    place[order] = np.cumsum(fresh) - 1
-    count = int(fresh.sum())
+    place = _places(points)
+    count = int(place.max(initial=-1)) + 1
 
     a, b, c = (points[corners[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -118,3 +146,133 @@ def smooth_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> FloatArray:
     normals = np.where(length > 1e-6, total / np.maximum(length, 1e-6), fallback)  # an angle's sum of 1e-6 is rounding
     result: FloatArray = normals[place].astype(np.float32)
     return result
+
+
+def _places(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Number of each point's position, the same for points at one position, (n,)."""
+    order = np.lexsort(points.T)
+    fresh = np.any(np.diff(points[order], axis=0, prepend=np.nan) != 0.0, axis=1)
+    place = np.empty(len(points), dtype=np.int64)
+    place[order] = np.cumsum(fresh) - 1
+    return place
+
+
+def creased_normals(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, crease: float
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """Normals that are smooth but for edges where the surface turns by more than an angle.
+
+    The corners that meet at a position are joined across every edge that turns less; each group takes the mean of its
+    triangles' normals, weighted by the corners' angles as in :func:`smooth_normals`. A box comes out flat, a ball
+    round, a cylinder's rim sharp.
+
+    Args:
+        vertices: Positions, (n, 3).
+        faces: Vertex indices, (m, 3).
+        crease: Angle in degrees from which on an edge is sharp.
+
+    Returns:
+        The vertex that each corner was, (3 m,), and its unit normal, (3 m, 3); corner k of face f is 3 f + k.
+    """
+    points = np.asarray(vertices, dtype=np.float64)
+    corners = np.asarray(faces, dtype=np.int64)
+    sides = points[corners]
+    edges = np.roll(sides, -1, axis=1) - sides
+    cross = np.cross(edges[:, 0], -edges[:, 2])
+    area = np.linalg.norm(cross, axis=1)
+    solid = area > _ZERO_AREA * (edges**2).sum(axis=2).max(axis=1)
+    unit = np.where(solid[:, None], cross / np.where(solid, area, 1.0)[:, None], 0.0)
+
+    place = _places(points)[corners]
+    following = np.roll(place, -1, axis=1)
+    ends = np.sort(np.stack([place.ravel(), following.ravel()], axis=1), axis=1)
+    order = np.lexsort(ends.T)
+    same = (ends[order][1:] == ends[order][:-1]).all(axis=1)
+    first, second = order[:-1][same], order[1:][same]
+    smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > math.cos(math.radians(crease))
+    # Two triangles that are wound alike run along their edge in opposite ways.
+    first, second = first[smooth], second[smooth]
+    forward = place.ravel()[first] != place.ravel()[second]
+
+    def after(corner: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return corner - corner % 3 + (corner + 1) % 3
+
+    start = np.where(forward, after(second), second)
+    stop = np.where(forward, second, after(second))
+    group = _joined(3 * len(corners), np.concatenate([first, after(first)]), np.concatenate([start, stop]))
+
+    lengths = np.linalg.norm(edges, axis=2)
+    cosine = -(edges * np.roll(edges, 1, axis=1)).sum(axis=2)
+    angle = np.arctan2(area[:, None], cosine) * (lengths > 0.0)
+    total = np.stack(
+        [np.bincount(group, (angle * unit[:, axis, None]).ravel(), 3 * len(corners)) for axis in range(3)], axis=-1
+    )[group]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    own = np.repeat(unit, 3, axis=0)
+    fallback = np.where((own**2).sum(axis=1, keepdims=True) > 0.5, own, [0.0, 0.0, 1.0])
+    normals: FloatArray = np.where(length > 1e-6, total / np.maximum(length, 1e-6), fallback).astype(np.float32)
+    return corners.ravel(), normals
+
+
+def _joined(count: int, first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Least member of the group that each of ``count`` items is in, where pairs belong together."""
+    label = np.arange(count)
+    while True:
+        lowest = np.minimum(label[first], label[second])
+        fresh = label.copy()
+        np.minimum.at(fresh, first, lowest)
+        np.minimum.at(fresh, second, lowest)
+        np.minimum.at(fresh, label[first], lowest)
+        np.minimum.at(fresh, label[second], lowest)
+        fresh = fresh[fresh]
+        if np.array_equal(fresh, label):
+            return label
+        label = fresh
+
+
+def tangent_frames(
+    vertices: npt.ArrayLike, faces: npt.ArrayLike, normals: npt.ArrayLike, uvs: npt.ArrayLike
+) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    """Tangents for normal maps where a file has none: where u grows, averaged over a vertex's triangles by angle.
+
+    With edges p1, p2 and their differences of texture coordinates (u1, v1), (u2, v2), the surface's derivative by u is
+    (v2 p1 - v1 p2) / (u1 v2 - u2 v1). A vertex whose triangles carry the picture and its mirror image has a frame for
+    each. A triangle whose texture coordinates span no area has no say; a vertex of none takes any direction.
+
+    Args:
+        vertices: Positions, (n, 3).
+        faces: Vertex indices, (m, 3).
+        normals: Unit vertex normals, (n, 3).
+        uvs: Texture coordinates, (n, 2), v up.
+
+    Returns:
+        The vertex that each corner was, (3 m,), and its frame as ``Mesh.tangents`` has it, (3 m, 4).
+    """
+    points, texture = np.asarray(vertices, dtype=np.float64), np.asarray(uvs, dtype=np.float64)
+    corners = np.asarray(faces, dtype=np.int64)
+    p, t = points[corners], texture[corners]
+    p1, p2, t1, t2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    area = t1[:, 0] * t2[:, 1] - t2[:, 0] * t1[:, 1]
+    side = np.where(area < 0.0, -1.0, 1.0)
+    along = side[:, None] * (t2[:, 1:] * p1 - t1[:, 1:] * p2)
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    along = np.where((length > 0.0) & np.isfinite(length), along / np.where(length > 0.0, length, 1.0), 0.0)
+    along[area == 0.0] = 0.0
+
+    edges = np.roll(p, -1, axis=1) - p
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(p1, p2), axis=1)[:, None], -(edges * np.roll(edges, 1, axis=1)).sum(axis=2)
+    )
+    key = 2 * corners + (side < 0.0)[:, None]
+    total = np.stack(
+        [np.bincount(key.ravel(), (angle * along[:, axis, None]).ravel(), 2 * len(points)) for axis in range(3)],
+        axis=-1,
+    )[key.ravel()]
+    normal = np.asarray(normals, dtype=np.float64)[corners.ravel()]
+    flat = total - (total * normal).sum(axis=1, keepdims=True) * normal
+    size = np.linalg.norm(flat, axis=1, keepdims=True)
+    other = np.cross(normal, np.where(np.abs(normal[:, :1]) < 0.5, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    unit = np.where(size > 1e-6, flat / np.maximum(size, 1e-6), other)
+    frames: FloatArray = np.concatenate([unit, np.repeat(side, 3)[:, None]], axis=1).astype(np.float32)
+    return corners.ravel(), frames

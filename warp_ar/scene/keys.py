@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Final
 
 from warp_ar.scene.description import (
+    FileMaterial,
     LambertMaterial,
     Material,
     MetallicRoughnessMaterial,
@@ -13,6 +14,8 @@ from warp_ar.scene.description import (
     PhongMaterial,
 )
 
+IN_MEMORY: Final = (("object", "mesh"),)
+"""Section and field of what only a scene in memory can have."""
 INTRINSICS: Final = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
 PROXY_KEYS: Final = {"plane": ("size",), "box": ("size",), "mesh": ("file",)}
 OBJECT_KEYS: Final = {
@@ -31,6 +34,7 @@ MATERIALS: Final[dict[str, type[Material]]] = {
     "metallic_roughness": MetallicRoughnessMaterial,
     "lambert": LambertMaterial,
     "mirror": MirrorMaterial,
+    "file": FileMaterial,
 }
 
 

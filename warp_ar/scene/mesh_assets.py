@@ -12,6 +12,7 @@ import re
 import struct
 from pathlib import Path
 from typing import Any, Final, NoReturn
+from urllib.parse import unquote
 
 from warp_ar.errors import SceneError
 from warp_ar.files import is_file, limits, parse_json, read_bytes, too_much
@@ -98,8 +99,8 @@ def _check_count(path: Path, count: int) -> None:
         raise SceneError(too_much(f"{path}", count, "vertices or faces", "mesh_elements"))
 
 
-def check_gltf(path: Path, data: bytes, assets: Assets) -> None:
-    """Look through a glTF or GLB file: sizes of accessors, buffers, and the textures that colour it.
+def read_gltf(path: Path, data: bytes, assets: Assets) -> tuple[dict[str, Any], list[bytes]]:
+    """Header and buffers of a glTF or GLB file, looked through: sizes of accessors, buffers, and pictures.
 
     Raises:
         SceneError: Something is missing, too large or no picture.
@@ -116,62 +117,73 @@ def check_gltf(path: Path, data: bytes, assets: Assets) -> None:
         ) from error
     header = parse_json(text, f"{label}: its header", SceneError)
     if not isinstance(header, dict):
-        _fail(path, "its header is no JSON object")
-    for accessor in _list(path, header, "accessors"):
+        fail(path, "its header is no JSON object")
+    for accessor in objects(path, header, "accessors"):
         count = accessor.get("count", 0)
         if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-            _fail(path, f"an accessor has the count {str(count)[:40]!r}, which is no whole number")
+            fail(path, f"an accessor has the count {str(count)[:40]!r}, which is no whole number")
         _check_count(path, count)
     buffers = [
-        _uri_bytes(path, item["uri"], assets) if "uri" in item else binary for item in _list(path, header, "buffers")
+        _uri_bytes(path, item["uri"], assets) if "uri" in item else binary for item in objects(path, header, "buffers")
     ]
-    for index in sorted(_coloring(path, header)):
-        images = _list(path, header, "images")
-        if not 0 <= index < len(images):
-            _fail(path, f"a texture names image {index}; there are {len(images)}, counted from 0")
-        check_picture(
-            _image_bytes(path, header, images[index], buffers, assets), SceneError, f"{path}: its image {index}"
-        )
+    return header, buffers
 
 
-def _fail(path: Path, what: str) -> NoReturn:
+def fail(path: Path, what: str) -> NoReturn:
+    """Raise SceneError: a file cannot be read because of ``what``."""
     raise SceneError(f"{path}: the mesh cannot be read: {what}")
 
 
 def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes]:
     """JSON and binary chunk."""
     if len(data) < 20 or data[:4] != b"glTF":
-        _fail(path, "no GLB file, or cut off")
+        fail(path, "no GLB file, or cut off")
     parts: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<II", data, at)
         if at + 8 + length > len(data):
-            _fail(path, f"cut off: a part of {length:,} bytes starts at byte {at:,} of {len(data):,}")
+            fail(path, f"cut off: a part of {length:,} bytes starts at byte {at:,} of {len(data):,}")
         parts.setdefault(kind, data[at + 8 : at + 8 + length])
         at += 8 + length
     if _GLB_JSON not in parts:
-        _fail(path, "it holds no header")
+        fail(path, "it holds no header")
     return parts[_GLB_JSON], parts.get(_GLB_BINARY, b"")
 
 
-def _list(path: Path, header: dict[str, Any], key: str) -> list[dict[str, Any]]:
+def objects(path: Path, header: dict[str, Any], key: str) -> list[dict[str, Any]]:
     """A list of objects of the header; empty where there is none."""
     value = header.get(key, [])
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        _fail(path, f"{key} is no list of objects")
+        fail(path, f"{key} is no list of objects")
     return value
 
 
 def _uri_bytes(path: Path, uri: object, assets: Assets) -> bytes:
     if not isinstance(uri, str):
-        _fail(path, f"a URI is {str(uri)[:40]!r}, no text")
+        fail(path, f"a URI is {str(uri)[:40]!r}, no text")
     if "base64," not in uri:
-        return assets.get(uri)
+        if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", uri):
+            fail(path, f"the URI {uri[:60]!r} is not beside it; nothing is fetched: save the file there")
+        return assets.get(unquote(uri))
     try:
         return base64.b64decode(uri.partition("base64,")[2])
     except binascii.Error as error:
         raise SceneError(f"{path}: the mesh cannot be read: a URI holds no base64 ({error})") from error
+
+
+def image_bytes(path: Path, header: dict[str, Any], index: object, buffers: list[bytes], assets: Assets) -> bytes:
+    """File of a picture that a glTF file holds or names.
+
+    Raises:
+        SceneError: There is none, or it must not be decoded.
+    """
+    images = objects(path, header, "images")
+    if not isinstance(index, int) or not 0 <= index < len(images):
+        fail(path, f"a texture names image {str(index)[:20]}; there are {len(images)}, counted from 0")
+    data = _image_bytes(path, header, images[index], buffers, assets)
+    check_picture(data, SceneError, f"{path}: its image {index}")
+    return data
 
 
 def _image_bytes(
@@ -179,31 +191,11 @@ def _image_bytes(
 ) -> bytes:
     if "bufferView" not in image:
         return _uri_bytes(path, image.get("uri"), assets)
-    views = _list(path, header, "bufferViews")
+    views = objects(path, header, "bufferViews")
     index = image["bufferView"]
     view = views[index] if isinstance(index, int) and 0 <= index < len(views) else {}
     number, start, length = (view.get(key, 0) for key in ("buffer", "byteOffset", "byteLength"))
     sound = all(isinstance(value, int) and value >= 0 for value in (number, start, length))
     if not sound or number >= len(buffers) or length < 1 or start + length > len(buffers[number]):
-        _fail(path, f"an image lies at {str(index)[:20]}, where no buffer reaches")
+        fail(path, f"an image lies at {str(index)[:20]}, where no buffer reaches")
     return bytes(buffers[number][start : start + length])
-
-
-def _coloring(path: Path, header: dict[str, Any]) -> set[int]:
-    """Numbers of the images that give surfaces their colour."""
-    textures = _list(path, header, "textures")
-    found = set()
-    for material in _list(path, header, "materials"):
-        reference = (material.get("pbrMetallicRoughness") or {}) if isinstance(material, dict) else {}
-        reference = reference.get("baseColorTexture") if isinstance(reference, dict) else None
-        index = reference.get("index") if isinstance(reference, dict) else None
-        if index is None:
-            continue
-        if not isinstance(index, int) or not 0 <= index < len(textures):
-            _fail(path, f"a material names texture {str(index)[:20]}; there are {len(textures)}, counted from 0")
-        source = textures[index].get("source")
-        if source is not None:
-            if not isinstance(source, int):
-                _fail(path, f"texture {index} names image {str(source)[:20]!r}")
-            found.add(source)
-    return found

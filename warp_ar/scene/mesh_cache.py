@@ -11,12 +11,25 @@ import hashlib
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warp_ar.cache_folder import cache_folder
-from warp_ar.scene import geometry, mesh_files
+from warp_ar.scene import (
+    geometry,
+    gltf,
+    gltf_arrays,
+    gltf_materials,
+    mesh_assets,
+    mesh_files,
+    mesh_materials,
+    mesh_parts,
+    mtl,
+)
 
+_CODE = (geometry, gltf, gltf_arrays, gltf_materials, mesh_assets, mesh_files, mesh_materials, mesh_parts, mtl)
+"""What decides how a file is read."""
 WHOLE = (".ply", ".stl", ".off", ".glb")
 """Formats without files beside them."""
 MOST_BYTES = 256 << 20
@@ -32,18 +45,34 @@ def load_kept_mesh(path: Path) -> geometry.Mesh:
     try:
         if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
             return mesh_files.load_mesh(path)
-        code = b"".join(Path(str(module.__file__)).read_bytes() for module in (geometry, mesh_files))
+        code = b"".join(Path(str(module.__file__)).read_bytes() for module in _CODE)
         key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
     except OSError:
         return mesh_files.load_mesh(path)  # which says what is wrong
     kept = cache_folder() / "meshes" / f"{key}{path.suffix.lower()}.npz"
-    with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile), np.load(kept) as values:
-        return geometry.Mesh(**{name: values[name] for name in values.files})
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile), np.load(kept) as values:
+        return _unpacked({name: values[name] for name in values.files})
     mesh = mesh_files.load_mesh(path)
-    values = {field.name: getattr(mesh, field.name) for field in dataclasses.fields(mesh)}
     part = kept.with_suffix(f".{os.getpid()}.npz")
     with contextlib.suppress(OSError):  # a disk that is full or read-only only costs the time again
         kept.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(part, **{name: value for name, value in values.items() if value is not None})
+        np.savez(part, **_packed(mesh))
         part.replace(kept)
     return mesh
+
+
+def _packed(mesh: geometry.Mesh) -> dict[str, Any]:
+    """A mesh as arrays by name."""
+    values = {field.name: getattr(mesh, field.name) for field in dataclasses.fields(mesh)}
+    values["materials"] = np.array(mesh_materials.dump_materials(mesh.materials))
+    values["notes"] = np.array(list(mesh.notes), dtype=str)
+    values |= {f"image_{index}": image for index, image in enumerate(values.pop("images"))}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _unpacked(values: dict[str, Any]) -> geometry.Mesh:
+    """A mesh of what ``_packed`` made."""
+    images = tuple(values.pop(f"image_{index}") for index in range(sum(name.startswith("image_") for name in values)))
+    materials = mesh_materials.parse_materials(str(values.pop("materials")))
+    notes = tuple(map(str, values.pop("notes")))
+    return geometry.Mesh(**values, images=images, materials=materials, notes=notes)

@@ -1,8 +1,7 @@
-"""Meshes and textures from files, through trimesh and OpenCV."""
+"""Meshes and textures from files: glTF by ``scene.gltf``, other formats through trimesh, pictures through OpenCV."""
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import logging
 import struct
@@ -18,8 +17,12 @@ import numpy.typing as npt
 from warp_ar.errors import SceneError
 from warp_ar.files import is_file, read_bytes
 from warp_ar.pictures import read_picture
-from warp_ar.scene.geometry import Mesh, make_mesh, smooth_normals
-from warp_ar.scene.mesh_assets import Assets, check_counts, check_gltf
+from warp_ar.scene.geometry import Mesh, creased_normals, smooth_normals
+from warp_ar.scene.gltf import load_gltf
+from warp_ar.scene.mesh_assets import Assets, check_counts
+from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
+from warp_ar.scene.mtl import read_library_material
 
 FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
@@ -27,8 +30,9 @@ ByteArray = npt.NDArray[np.uint8]
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 """Mesh files that :func:`load_mesh` reads."""
 
-# The square of a position, and what a scene's scale may do to it, stay in single precision.
-_LARGEST: Final = 1e12
+CREASE: Final = 40.0
+"""Degrees: where a file of a drawing format (OBJ, STL, OFF) has no normals, an edge that turns more is sharp."""
+_DRAWN: Final = (".obj", ".stl", ".off")
 
 # What trimesh and Pillow have been seen to raise on damaged files; its readers do not document it.
 _LOADER_ERRORS: Final = (
@@ -74,22 +78,22 @@ def load_texture(path: str | Path) -> ByteArray:
 
 
 def load_mesh(path: str | Path) -> Mesh:
-    """Read a mesh file: PLY, OBJ (with its MTL's texture), glTF or GLB, STL, OFF.
+    """Read a mesh file: PLY, OBJ with its MTL, glTF or GLB, STL, OFF.
 
-    All parts of a file are joined, placed as its scene graph says. Vertex normals are the file's, or
-    :func:`smooth_normals` where it has none. Several textures are stacked into one; only pictures count, a material's
-    plain colour is the scene's to say.
+    All parts of a file are joined, placed as its scene graph says; every triangle keeps its material. Vertex normals
+    are the file's. Where it has none they are flat (glTF says so), smooth but for edges that turn more than ``CREASE``
+    (OBJ, STL, OFF), or :func:`smooth_normals` (PLY, the format of scans).
 
     Args:
         path: The file; its suffix tells the format.
 
     Returns:
-        The mesh, in the file's own axes and units.
+        The mesh in the file's own units; of glTF turned from +Y up to +Z up, of others in the file's own axes.
 
     Raises:
         SceneError: The file or a texture that it names is missing, damaged or of another format, or the mesh holds no
             triangle, a vertex that is not finite, or a face with an index out of range. An OBJ without its MTL file is
-            a mesh without texture.
+            a mesh without materials.
     """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
@@ -97,129 +101,126 @@ def load_mesh(path: str | Path) -> Mesh:
     if not is_file(path):
         raise SceneError(f"{path}: no such mesh file")
     data = read_bytes(path, "mesh_bytes", SceneError)
-    assets = Assets(path, library_first=path.suffix.lower() == ".obj")
+    suffix = path.suffix.lower()
+    assets = Assets(path, library_first=suffix == ".obj")
     check_counts(path, data)
-    if path.suffix.lower() in (".glb", ".gltf"):
-        check_gltf(path, data, assets)
-    import trimesh  # here, since it takes half a second and most scenes need no file
-
+    images: list[ByteArray] = []
+    notes: list[str] = []
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=path.suffix[1:].lower(), resolver=assets, process=False)
-        parts = [part for node in scene.graph.nodes_geometry if (part := _read_part(path, scene, node)) is not None]
+        if suffix in (".glb", ".gltf"):
+            contents = load_gltf(path, data, assets)
+            parts, images, notes = contents.parts, contents.images, contents.notes
+        else:
+            parts = _read_parts(path, data, assets, images, notes)
+        if not parts:
+            raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
+        return join_parts(f"{path}", parts, images, notes)
     except SceneError:
         raise
     except _LOADER_ERRORS as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
-    # What else than a colour a glTF file may name, such as normals, is not read.
-    if path.suffix.lower() == ".obj" and assets.problem is not None:
+
+
+def _read_parts(path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str]) -> list[MeshPart]:
+    """Parts of a file that trimesh reads."""
+    import trimesh  # here, since it takes half a second and most scenes need no file
+
+    suffix = path.suffix.lower()
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], resolver=assets, process=False)
+    if suffix == ".obj" and assets.problem is not None:
         raise assets.problem
+    crease = CREASE if suffix in _DRAWN else None
+    return _scene_parts(f"{path}", scene, images, notes, crease, assets)
+
+
+def mesh_from_trimesh(source: Any) -> Mesh:
+    """The mesh of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours or materials.
+
+    Args:
+        source: The object; its axes and units stay as they are.
+
+    Raises:
+        SceneError: It holds no triangle, a vertex that is not finite, or a face with an index out of range.
+    """
+    import trimesh
+
+    if not isinstance(source, trimesh.Trimesh | trimesh.Scene):
+        raise SceneError(f"a mesh is {type(source).__name__}; a trimesh.Trimesh or trimesh.Scene is needed")
+    label = "a mesh in memory"
+    scene = source if isinstance(source, trimesh.Scene) else trimesh.Scene(source)
+    images: list[ByteArray] = []
+    notes: list[str] = []
+    try:
+        parts = _scene_parts(label, scene, images, notes, CREASE, None)
+    except SceneError:
+        raise
+    except _LOADER_ERRORS as error:
+        raise SceneError(f"{label} cannot be taken ({type(error).__name__}: {' '.join(str(error).split())})") from error
     if not parts:
-        raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
-    return _join(path, parts)
+        raise SceneError(f"{label} holds no triangle")
+    return join_parts(label, parts, images, notes)
 
 
-@dataclasses.dataclass
-class _Part:
-    """One geometry of a file, already in the file's world."""
+def _scene_parts(
+    label: str, scene: Any, images: list[ByteArray], notes: list[str], crease: float | None, assets: Assets | None
+) -> list[MeshPart]:
+    """Parts of a scene of trimesh, in its world."""
+    known: dict[int, MeshMaterial | None] = {}
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not (np.abs(transform) < LARGEST).all():
+            raise SceneError(f"{label}: node {node!r} has a transform that is not finite")
+        if np.asarray(getattr(geometry, "faces", ()), dtype=np.int64).size == 0:
+            continue
+        source = getattr(geometry.visual, "material", None)
+        if id(source) not in known:
+            known[id(source)] = read_library_material(label, source, images, notes, assets)
+        moved = _read_part(label, geometry, known[id(source)], crease).moved(np.asarray(transform, dtype=np.float64))
+        if moved is not None:
+            parts.append(moved)
+    return parts
 
-    vertices: npt.NDArray[np.float64]
-    faces: npt.NDArray[np.int64]
-    normals: FloatArray
-    uvs: npt.NDArray[np.float64] | None
-    image: Any  # a Pillow picture; parts that share a material share the object
 
-
-def _read_part(path: Path, scene: Any, node: str) -> _Part | None:
-    """Geometry at a node of a scene graph; None where it has no triangles or is scaled to nothing."""
-    transform, name = scene.graph[node]
-    geometry = scene.geometry[name]
-    faces = np.asarray(getattr(geometry, "faces", ()), dtype=np.int64)
-    linear = np.asarray(transform, dtype=np.float64)[:3, :3]
-    if not (np.abs(transform) < _LARGEST).all():
-        raise SceneError(f"{path}: node {node!r} has a transform that is not finite")
-    determinant = np.linalg.det(linear)
-    if faces.size == 0 or determinant == 0.0:
-        return None
+def _read_part(label: str, geometry: Any, material: MeshMaterial | None, crease: float | None) -> MeshPart:
+    """Triangles of a mesh of trimesh, with its normals, texture coordinates and colours."""
+    faces = np.asarray(geometry.faces, dtype=np.int64)
     vertices = np.asarray(geometry.vertices, dtype=np.float64)
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        wrong = int(faces.max() if faces.max() >= len(vertices) else faces.min())
-        raise SceneError(f"{path}: a face has vertex index {wrong}; there are {len(vertices)} vertices, counted from 0")
-    finite = (np.abs(vertices) < _LARGEST).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise SceneError(
-            f"{path}: vertex {row} is {vertices[row].tolist()}; positions must be finite, below {_LARGEST:g}"
-        )
-    vertices = vertices @ linear.T + np.asarray(transform, dtype=np.float64)[:3, 3]
-    if determinant < 0.0:
-        faces = faces[:, ::-1]
-    computed = smooth_normals(vertices, faces)
-    normals = computed
     # trimesh computes normals when asked; only its cache tells whether the file had them.
-    if "vertex_normals" in geometry._cache:
-        given = np.asarray(geometry.vertex_normals, dtype=np.float64) @ np.linalg.inv(linear)
-        length = np.linalg.norm(given, axis=1, keepdims=True)
-        usable = np.isfinite(length) & (length > 0.0)
-        normals = np.where(usable, given / np.where(usable, length, 1.0), computed).astype(np.float32)
-    uvs = getattr(geometry.visual, "uv", None)
+    given = "vertex_normals" in geometry._cache
+    normals = np.asarray(geometry.vertex_normals, dtype=np.float64) if given else None
+    visual = geometry.visual
+    uvs = getattr(visual, "uv", None)
     if uvs is not None:
         uvs = np.asarray(uvs, dtype=np.float64)[:, :2]
-        uvs = uvs if len(uvs) == len(vertices) and np.isfinite(uvs).all() else None
-    material = getattr(geometry.visual, "material", None)
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    # Where a file has coordinates but no texture, trimesh makes a grey one up; only pictures from files have a format.
-    if uvs is None or getattr(image, "format", None) is None:
-        image = None
-    return _Part(vertices, faces, normals, uvs, image)
-
-
-def _join(path: Path, parts: list[_Part]) -> Mesh:
-    """One mesh of all parts, their textures stacked where there are several."""
-    images = list({id(part.image): part.image for part in parts if part.image is not None}.values())
-    textured = bool(images)
-    plain = any(part.image is None for part in parts)
-    texture = None
-    if textured:
-        try:
-            tiles = [np.asarray(image.convert("RGB"), dtype=np.uint8) for image in images]
-        except _LOADER_ERRORS as error:
-            raise SceneError(f"{path}: a texture of the mesh cannot be read ({error})") from error
-        if plain:
-            tiles.append(np.full((1, 1, 3), 255, dtype=np.uint8))
-        if len(tiles) > 1:
-            _stack_uvs(path, parts, images, tiles)
-        texture = _stack(tiles)
-    keep_uvs = textured or all(part.uvs is not None for part in parts)
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    return make_mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
-        np.concatenate([part.normals for part in parts]),
-        np.concatenate([part.uvs for part in parts if part.uvs is not None]) if keep_uvs else None,
-        texture,
+    colors = None
+    kind = getattr(visual, "kind", None) if getattr(visual, "defined", False) else None
+    if kind in ("vertex", "face"):
+        values = linear_color(np.asarray(visual.vertex_colors if kind == "vertex" else visual.face_colors))
+        if kind == "face" and len(values) == len(faces) and faces.max(initial=-1) < len(vertices):
+            # A colour for each triangle: its corners are its own.
+            corners = faces.ravel()
+            normals = _corner_normals(vertices, faces, crease) if normals is None else normals[corners]
+            vertices, values = vertices[corners], np.repeat(values, 3, axis=0)
+            uvs = None if uvs is None or len(uvs) <= corners.max(initial=-1) else uvs[corners]
+            faces = np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
+        colors = values if len(values) == len(vertices) else None
+    return MeshPart.checked(
+        label, vertices, faces, normals, uvs=(uvs, None), colors=colors, material=material, crease=crease
     )
 
 
-def _stack(tiles: list[ByteArray]) -> ByteArray:
-    """Pictures one above the other, left-aligned."""
-    width = max(tile.shape[1] for tile in tiles)
-    return np.concatenate([np.pad(tile, ((0, 0), (0, width - tile.shape[1]), (0, 0))) for tile in tiles])
+def _corner_normals(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int64], crease: float | None) -> Any:
+    """Normals of every corner of a mesh whose triangles are about to get corners of their own."""
+    if crease is not None:
+        return creased_normals(vertices, faces, crease)[1]
+    return smooth_normals(vertices, faces)[faces.ravel()]
 
 
-def _stack_uvs(path: Path, parts: list[_Part], images: list[Any], tiles: list[ByteArray]) -> None:
-    """Move the parts' texture coordinates to where :func:`_stack` puts their pictures; parts without get the last."""
-    width, height = max(tile.shape[1] for tile in tiles), sum(tile.shape[0] for tile in tiles)
-    tops = np.cumsum([0, *(tile.shape[0] for tile in tiles)])
-    for part in parts:
-        index = len(tiles) - 1 if part.image is None else next(i for i, im in enumerate(images) if im is part.image)
-        h, w = tiles[index].shape[:2]
-        uvs = np.full((len(part.vertices), 2), 0.5) if part.image is None or part.uvs is None else part.uvs
-        if uvs.min() < -1e-3 or uvs.max() > 1.0 + 1e-3:
-            raise SceneError(
-                f"{path}: several textures, one of which repeats; bake them into one or use one object for each"
-            )
-        # Texel centres of the tile's border are the limits, so that bilinear reads bring in nothing of a neighbour.
-        column = np.clip(uvs[:, 0] * w, 0.5, w - 0.5)
-        row = np.clip((1.0 - uvs[:, 1]) * h, 0.5, h - 0.5) + tops[index]
-        part.uvs = np.stack([column / width, 1.0 - row / height], axis=-1)
+def linear_color(colors: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Linear RGBA of (n, 3 or 4) colours of 8 bits, sRGB-encoded as programs write them; PLY's alpha is not used."""
+    rgb = colors[:, :3] / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([linear, np.ones((len(rgb), 1))], axis=1)

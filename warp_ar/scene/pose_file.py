@@ -1,4 +1,4 @@
-"""Camera poses from files: COLMAP's ``images.txt``, or JSON; one per frame."""
+"""Camera poses from files: COLMAP's images, OpenTrackIO samples, USD, or JSON of R and t; one per frame."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from warp_ar.errors import SceneError
 from warp_ar.files import parse_json, read_text
+from warp_ar.scene.camera_paths import USD_SUFFIXES, read_colmap_binary, read_track, read_usd
 from warp_ar.scene.description import Vec3
 from warp_ar.scene.geometry import rotation_matrix
 
@@ -22,7 +23,7 @@ TURNED = 1e-3
 
 def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> tuple[float, ...]:
     """Rotation matrix, 9 numbers row by row, of a quaternion of any length, w first as COLMAP has it."""
-    n = math.sqrt(w * w + x * x + y * y + z * z)
+    n = math.hypot(w, x, y, z)  # squares of tiny numbers would be 0
     w, x, y, z = w / n, x / n, y / n, z / n
     return (
         *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -52,21 +53,39 @@ def pose_of_position(position: Sequence[float], rotate: Sequence[float]) -> RawP
 def load_poses(path: Path) -> tuple[RawPose, ...]:
     """Poses of a clip's frames in order.
 
-    COLMAP's ``images.txt`` has them by name: they are put in order of name, as frames of a folder are. JSON holds a
-    list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's ``solvePnP`` gives.
+    COLMAP's ``images.txt`` and ``images.bin`` have them by name: they are put in order of name, as frames of a folder
+    are. JSON holds a list of objects with ``R`` (9 numbers or 3 rows) and ``t``, ``camera_from_world`` as OpenCV's
+    ``solvePnP`` gives, or OpenTrackIO samples, which may also stand one on each line of a ``.jsonl``. USD holds one
+    camera, whose frames are those from its start to its end.
 
     Raises:
         SceneError: The file cannot be used.
     """
-    text = read_text(path, SceneError, expected="COLMAP's images.txt, or JSON")
-    poses = _read_json(path, text) if path.suffix.lower() == ".json" else _read_colmap(path, text)
+    suffix = path.suffix.lower()
+    poses: tuple[RawPose, ...]
+    if suffix in USD_SUFFIXES:
+        poses = read_usd(path)
+    elif suffix == ".bin":
+        images = sorted(read_colmap_binary(path))
+        poses = tuple((rotation_of_quaternion(*quaternion), shift) for _, quaternion, shift in images)
+    else:
+        text = read_text(path, SceneError, expected="COLMAP's images.txt, or JSON")
+        if suffix == ".jsonl":
+            lines = (line for line in text.splitlines() if line.strip())
+            poses = read_track(path, [parse_json(line, str(path), SceneError) for line in lines])
+        else:
+            poses = _read_json(path, text) if suffix == ".json" else _read_colmap(path, text)
     if not poses:
-        raise SceneError(f"{path}: holds no pose; expected COLMAP's images.txt or a JSON list of R and t")
+        raise SceneError(f"{path}: holds no pose; expected COLMAP's images, OpenTrackIO samples, or a list of R and t")
     return poses
 
 
 def _read_json(path: Path, text: str) -> tuple[RawPose, ...]:
     entries = parse_json(text, str(path), SceneError)
+    if isinstance(entries, dict) and "transforms" in entries:
+        entries = [entries]
+    if isinstance(entries, list) and entries and isinstance(entries[0], dict) and "transforms" in entries[0]:
+        return read_track(path, entries)
     if not isinstance(entries, list):
         raise SceneError(
             f'{path}: expected a list of poses such as {{"R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "t": [0, 0, 1]}}'
@@ -80,7 +99,7 @@ def _json_pose(label: str, entry: Any) -> RawPose:
     try:
         rotation = np.array(entry["R"], float).reshape(-1)
         translation = np.array(entry["t"], float).reshape(-1)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rotation = translation = np.zeros(0)
     finite = np.isfinite(rotation).all() and np.isfinite(translation).all()
     if len(rotation) != 9 or len(translation) != 3 or not finite or not check_rotation(rotation.tolist()):
@@ -99,7 +118,8 @@ def _read_colmap(path: Path, text: str) -> tuple[RawPose, ...]:
         words = line.split(maxsplit=9)
         try:
             w, x, y, z, *shift = map(float, words[1:8])
-            if len(words) < 10 or not all(map(math.isfinite, (w, x, y, z, *shift))) or w == x == y == z == 0.0:
+            length = math.hypot(w, x, y, z)
+            if len(words) < 10 or not 0.0 < length < math.inf or not all(map(math.isfinite, shift)):
                 raise ValueError
         except ValueError:
             raise SceneError(

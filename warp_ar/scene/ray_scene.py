@@ -6,13 +6,11 @@ Positions are metres in the world, angles of the device's records radians, colou
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -23,10 +21,18 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh, rotation_matrix
-from warp_ar.scene.mesh_cache import load_kept_mesh
-from warp_ar.scene.mesh_files import load_texture
+from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.object_materials import (
+    file_mesh,
+    is_detailed,
+    look_of,
+    mesh_of,
+    reflects_diffusely,
+    reflects_glossily,
+)
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
+from warp_ar.scene.texture_pack import DECODE, TexturePack, mask_cutoff
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,6 +45,7 @@ BVH_CONSTRUCTOR: Final = "sah"
 BVH_LEAF_SIZE: Final = 1
 """Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
 _SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
+_ALPHA: Final = {"opaque": structs.OPAQUE, "mask": structs.MASKED, "blend": structs.BLENDED}
 _LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
 _MODELS: Final[dict[type, int]] = {
     scenes.LambertMaterial: structs.LAMBERT,
@@ -67,52 +74,18 @@ def has_sized_lights(scene: scenes.Scene) -> bool:
 
 
 def trace_config(scene: scenes.Scene) -> TraceConfig:
-    """Which kinds of shape the rays of ``scene`` can meet."""
+    """Which kinds of shape the rays of ``scene`` can meet, and whether triangles must be asked for more."""
+    looks = [look_of(item) for item in scene.objects]
     return TraceConfig(
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
         proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
+        detail=any(look.holed or look.bumpy for look in looks),
     )
 
 
-def _is_black(color: scenes.Color) -> bool:
-    return not isinstance(color, Path) and not any(color)
-
-
-def reflects_diffusely(material: scenes.Material) -> bool:
-    """Whether a material shows the environment's irradiance."""
-    match material:
-        case scenes.LambertMaterial():
-            return not _is_black(material.base_color)
-        case scenes.PhongMaterial():
-            return not _is_black(material.diffuse)
-        case scenes.MetallicRoughnessMaterial():
-            return material.metallic < 1.0 and not _is_black(material.base_color)
-    return False
-
-
-def reflects_glossily(material: scenes.Material) -> bool:
-    """Whether a material shows the environment's prefiltered light."""
-    match material:
-        case scenes.PhongMaterial():
-            return not _is_black(material.specular)
-        case scenes.MirrorMaterial():
-            return not _is_black(material.base_color)
-        case scenes.MetallicRoughnessMaterial():
-            return True
-    return False
-
-
-def material_model(material: scenes.Material) -> int:
+def material_model(material: MeshMaterial) -> int:
     """Model of ``structs.Material`` that a material becomes."""
-    return _MODELS[type(material)]
-
-
-def has_textures(scene: scenes.Scene) -> bool:
-    """Whether any virtual object may have a texture: meshes bring their own, which only reading them tells."""
-    return any(
-        item.shape == "mesh" or any(isinstance(value, Path) for value in vars(item.material).values())
-        for item in scene.objects
-    )
+    return _MODELS[type(material.surface)]
 
 
 def skeleton(scene: scenes.Scene) -> Any:
@@ -123,8 +96,8 @@ def skeleton(scene: scenes.Scene) -> Any:
             _mesh_key(item),
             type(item.material),
             tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
-            reflects_diffusely(item.material),
-            reflects_glossily(item.material),
+            any(map(reflects_diffusely, look_of(item).materials)),
+            any(map(reflects_glossily, look_of(item).materials)),
         )
         for item in scene.objects
     )
@@ -187,41 +160,6 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
 
 
-def linear_texture(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-    """Linear RGB of an sRGB-encoded picture (IEC 61966-2-1), (h, w, 3)."""
-    code = np.arange(256) / 255.0
-    table = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
-    return table[texture]
-
-
-class _Textures:
-    """Textures packed one after another; equal files are packed once."""
-
-    def __init__(self) -> None:
-        self.records: list[tuple[int, int, int]] = []
-        self.texels: list[npt.NDArray[np.float32]] = []
-        self._known: dict[tuple[Path | None, int], int] = {}
-        self._size = 0
-
-    def add(self, color: scenes.Color, mesh: Mesh | None) -> tuple[tuple[float, float, float], int]:
-        """Constant factor and texture index of a colour, multiplied by the mesh's own texture if there is one."""
-        path = color if isinstance(color, Path) else None
-        factor = (1.0, 1.0, 1.0) if isinstance(color, Path) else color
-        own = None if mesh is None else mesh.texture
-        if path is None and own is None:
-            return factor, -1
-        key = (path, id(own) if own is not None else 0)
-        if key not in self._known:
-            pictures = [linear_texture(p) for p in (None if path is None else load_texture(path), own) if p is not None]
-            height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
-            fitted = [cv2.resize(p, (width, height), interpolation=cv2.INTER_LINEAR) for p in pictures]
-            self._known[key] = len(self.records)
-            self.records.append((self._size, width, height))
-            self.texels.append(functools.reduce(np.multiply, fitted).reshape(-1, 3))
-            self._size += width * height
-        return factor, self._known[key]
-
-
 class HostScene:
     """The host's side of a scene: owns what the device's ``RayScene`` points to, and moves what is animated."""
 
@@ -234,7 +172,7 @@ class HostScene:
         self.scene = scene
         self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
         self._corners = 0
-        textures = _Textures()
+        textures = TexturePack()
         self._objects = self._shape_records(scene.objects, device)
         self._proxies = self._shape_records(scene.proxies, device)
         self._textures = textures
@@ -252,18 +190,53 @@ class HostScene:
         self.write_lights(np.zeros_like(self._lights), 0.0)
 
         records = np.zeros(len(textures.records), _dtype(structs.Texture))
-        for record, (offset, width, height) in zip(records, textures.records, strict=True):
-            record["offset"], record["width"], record["height"] = offset, width, height
+        for record, values in zip(records, textures.records, strict=True):
+            for name, value in values.items():
+                record[name] = value
         ray_scene = structs.RayScene()
         ray_scene.objects = wp.array(self._objects, dtype=structs.Shape, device=device)
         ray_scene.proxies = wp.array(self._proxies, dtype=structs.Shape, device=device)
         ray_scene.materials = wp.array(materials, dtype=structs.Material, device=device)
         ray_scene.textures = wp.array(records, dtype=structs.Texture, device=device)
-        meshes = [mesh for _, mesh, _ in self._meshes.values()]
-        ray_scene.texels = _vectors(textures.texels, 3, wp.vec3, device)
-        ray_scene.vertex_normals = _vectors([mesh.normals for mesh in meshes], 3, wp.vec3, device)
-        ray_scene.vertex_uvs = _vectors([mesh.uvs for mesh in meshes], 2, wp.vec2, device)
+        texels = np.concatenate([np.zeros(0, np.uint32), *textures.texels])
+        textures.texels.clear()
+        ray_scene.texels = wp.array(texels, dtype=wp.uint32, device=device)
+        ray_scene.decode_table = wp.array(DECODE, dtype=wp.float32, device=device)
+        ray_scene.pixel_spread = 1.0 / max(scene.camera.fx, scene.camera.fy)
+        self._add_corners(ray_scene, device)
         self.ray_scene = ray_scene
+
+    def _add_corners(self, ray_scene: Any, device: Any) -> None:
+        """What the corners and triangles of all meshes hold; what no mesh calls for stays empty."""
+        meshes = list(self._meshes.values())
+        rays = [mesh for _, mesh, _ in meshes]
+        ray_scene.vertex_normals = _vectors([mesh.normals for mesh in rays], 3, wp.vec3, device)
+        ray_scene.vertex_uvs = _vectors([mesh.uvs for mesh in rays], 2, wp.vec2, device)
+        if not is_detailed(self.scene):
+            return
+        fields = (
+            ("vertex_uvs_second", "uvs_second", (0.0, 0.0), wp.vec2),
+            ("vertex_colors", "colors", (1.0, 1.0, 1.0, 1.0), wp.vec4),
+            ("vertex_tangents", "tangents", (1.0, 0.0, 0.0, 1.0), wp.vec4),
+        )
+        for name, own, default, dtype in fields:
+            values = [getattr(mesh, own) for mesh, _, _ in meshes]
+            if any(value is not None for value in values):
+                parts = [
+                    np.tile(np.array(default, np.float32), (3 * len(mesh.faces), 1))
+                    if value is None
+                    else value[mesh.faces].reshape(-1, len(default))
+                    for (mesh, _, _), value in zip(meshes, values, strict=True)
+                ]
+                setattr(ray_scene, name, _vectors(parts, len(default), dtype, device))
+        numbers = [
+            np.zeros(len(mesh.faces), np.int32) if mesh.triangle_materials is None else mesh.triangle_materials
+            for mesh, _, _ in meshes
+        ]
+        numbers = [np.zeros(0, np.int32), *numbers]
+        ray_scene.triangle_materials = wp.array(np.concatenate(numbers), dtype=wp.int32, device=device)
+        densities = [texture_density(mesh) for mesh, _, _ in meshes]
+        ray_scene.triangle_density = _vectors(densities, 2, wp.vec2, device)
 
     def update(self, scene: scenes.Scene) -> None:
         """Take the numbers of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
@@ -276,7 +249,10 @@ class HostScene:
         self._lights_edited = True
 
     def _place_objects(self) -> None:
-        self._objects["material"] = np.arange(len(self.scene.objects))
+        looks = [look_of(item) for item in self.scene.objects]
+        counts = [len(look.materials) for look in looks]
+        self._objects["material"] = np.cumsum([0, *counts])[:-1]
+        self._objects["holed"] = [look.holed for look in looks]
         # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
         self._centers = [
             record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
@@ -284,9 +260,10 @@ class HostScene:
         ]
 
     def _material_records(self) -> npt.NDArray[Any]:
-        records = np.zeros(len(self.scene.objects), _dtype(structs.Material))
-        for record, item in zip(records, self.scene.objects, strict=True):
-            self._fill_material(record, item, self._textures)
+        materials = [(item, material) for item in self.scene.objects for material in look_of(item).materials]
+        records = np.zeros(len(materials), _dtype(structs.Material))
+        for record, (item, material) in zip(records, materials, strict=True):
+            self._fill_material(record, item, material)
         return records
 
     def _shape_records(self, items: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
@@ -313,34 +290,45 @@ class HostScene:
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
-            mesh = load_kept_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
+            mesh = key if isinstance(key, Mesh) else file_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
             ray_mesh = make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
         return self._meshes[key]
 
-    def _fill_material(self, record: Any, item: scenes.Object, textures: _Textures) -> None:
-        """Write the material of an object into a record of ``structs.Material``."""
-        key = _mesh_key(item)
-        mesh = None if key is None else self._meshes[key][0]
-        material = item.material
-        first = material.diffuse if isinstance(material, scenes.PhongMaterial) else material.base_color
-        colors = (first, material.specular) if isinstance(material, scenes.PhongMaterial) else (first,)
-        if mesh is not None and mesh.uvs is None:
-            for color in colors:
-                if isinstance(color, Path):
-                    raise SceneError(
-                        f"{item.file}: the mesh has no texture coordinates for the texture {color}; "
-                        "unwrap it, or give the material a plain colour"
-                    )
-        record["base_color"], record["base_texture"] = textures.add(first, mesh)
-        record["specular_texture"] = -1
+    def _fill_material(self, record: Any, item: scenes.Object, material: MeshMaterial) -> None:
+        """Write a material of an object into a record of ``structs.Material``."""
+        mesh = mesh_of(item)
+        surface = material.surface
+        assert not isinstance(surface, scenes.FileMaterial)
+        first = surface.diffuse if isinstance(surface, scenes.PhongMaterial) else surface.base_color
+        specular = surface.specular if isinstance(surface, scenes.PhongMaterial) else (0.0, 0.0, 0.0)
+        for color in (first, specular):
+            if isinstance(color, Path) and mesh is not None and mesh.uvs is None:
+                raise SceneError(
+                    f"{item.file}: the mesh has no texture coordinates for the texture {color}; "
+                    "unwrap it, or give the material a plain colour"
+                )
+        images = () if mesh is None else mesh.images
+        add = self._textures.add
+        cutoff = mask_cutoff(material)
         record["model"] = material_model(material)
-        if isinstance(material, scenes.PhongMaterial):
-            record["shininess"] = material.shininess
-            record["specular"], record["specular_texture"] = textures.add(material.specular, None)
-        elif isinstance(material, scenes.MetallicRoughnessMaterial):
-            record["metallic"], record["roughness"] = material.metallic, material.roughness
+        record["base_color"], path = _factor(first)
+        record["base_texture"] = add(material.base, images, encoded=True, cutoff=cutoff, path=path)
+        record["specular"], path = _factor(specular)
+        record["specular_texture"] = add(material.specular, images, encoded=True, path=path)
+        if isinstance(surface, scenes.PhongMaterial):
+            record["shininess"] = surface.shininess
+        elif isinstance(surface, scenes.MetallicRoughnessMaterial):
+            record["metallic"], record["roughness"] = surface.metallic, surface.roughness
+        record["alpha_mode"] = _ALPHA[material.alpha]
+        record["opacity"], record["cutoff"] = material.opacity, material.cutoff
+        record["single_sided"], record["unlit"] = not material.double_sided, material.unlit
+        record["emission"] = material.emission
+        for name in ("metallic_roughness", "normal", "occlusion"):
+            record[f"{name}_texture"] = add(getattr(material, name), images, encoded=False)
+        record["emissive_texture"] = add(material.emissive, images, encoded=True)
+        record["normal_scale"], record["occlusion_strength"] = material.normal_scale, material.occlusion_strength
 
     def write_objects(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
         """Write the virtual objects as they stand ``seconds`` after the first frame.
@@ -433,11 +421,29 @@ def _dtype(struct: Any) -> Any:
 def _mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
     """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
     if item.shape == "mesh":
-        return item.file
+        return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
     if isinstance(item, scenes.Object) and item.shape == "torus":
         outer = item.scale * (item.major_radius + item.minor_radius)
         return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
     return None
+
+
+def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:
+    """Texture coordinates of both sets per unit of length on each triangle, (m, 2): square roots of ratios of areas."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    found = np.zeros((len(mesh.faces), 2))
+    for index, uvs in enumerate((mesh.uvs, mesh.uvs_second)):
+        if uvs is not None:
+            u, v = uvs[mesh.faces].astype(np.float64).transpose(2, 0, 1)
+            spanned = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+            found[:, index] = np.sqrt(np.abs(spanned) / np.where(area > 0.0, area, np.inf))
+    return found.astype(np.float32)
+
+
+def _factor(color: scenes.Color) -> tuple[tuple[float, float, float], Path | None]:
+    """Constant factor of a colour, and its picture."""
+    return ((1.0, 1.0, 1.0), color) if isinstance(color, Path) else (color, None)
 
 
 def _vectors(parts: Iterable[npt.NDArray[np.float32]], length: int, dtype: Any, device: Any) -> Any:

@@ -33,6 +33,7 @@ from warp_ar.scene.description import (
     CharucoBoard,
     Color,
     Exposure,
+    FileMaterial,
     GridBoard,
     LambertMaterial,
     Light,
@@ -50,7 +51,7 @@ from warp_ar.scene.description import (
     Vec3,
 )
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.keys import IN_MEMORY, INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
 from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
@@ -384,6 +385,8 @@ def _read_material(parent: _Table) -> Material:
     model = table.choice("model", MATERIALS)
     kind = MATERIALS[model]
     table.only("model", keys_of(kind), known[1:])
+    if kind is FileMaterial:
+        return FileMaterial()
     if kind is PhongMaterial:
         return PhongMaterial(
             diffuse=table.reflectance("diffuse", PhongMaterial.diffuse),
@@ -481,7 +484,7 @@ def _read_pose(table: _Table) -> PoseSpec:
         if key != way and key not in others:
             table.fail(key, f"not used with {way}; {_POSES}")
     if way == "file":
-        path = table.file("file", "poses: COLMAP's images.txt, or JSON")
+        path = table.file("file", "poses: COLMAP's images, OpenTrackIO, USD, or JSON")
         return PoseSpec(load_poses(path), path)
     if way == "position":
         rotate = table.vec3("rotate", (0.0, 0.0, 0.0), unit="degrees")
@@ -634,7 +637,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
         marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
-        objects=many("object", keys_of(Object), _read_object),
+        objects=many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], _read_object),
         lights=many("light", keys_of(Light), _read_light),
         captured=None if captured is None else _read_captured(_Table(label, folder, *captured, keys_of(CapturedLight))),
         pose=one("pose", _POSE_KEYS, _read_pose),

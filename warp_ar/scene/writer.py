@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from warp_ar.errors import SceneError
 from warp_ar.scene.description import Animation, Board, CapturedLight, Light, Object, PoseSpec, Probe, Scene, SourceSpec
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 
@@ -53,6 +54,8 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     for proxy in scene.proxies:
         lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
     for item in scene.objects:
+        if item.mesh is not None:
+            raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
         model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
         lines += ["", "[[object]]", *table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
         lines += animation(item)

@@ -33,6 +33,10 @@ _ORDER = (
     "composite.Composite",
     "declip.Declip",
     "expose.Expose",
+    "separate.Separate",
+    "surfaces.Surfaces",
+    "coverage.Coverage",
+    "motion.Motion",
 )
 """Module and class of every stage: a new one is registered here."""
 

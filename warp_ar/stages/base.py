@@ -49,7 +49,7 @@ class ArraySpec:
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What of a frame virtual things can reach, known on the host before any stage runs."""
+    """What of a frame virtual objects and lights can reach, known on the host before any stage runs."""
 
     objects: bool = True
     """A virtual object may be in the picture."""
@@ -152,6 +152,7 @@ class Arrays(Mapping[str, Any]):
 
 NO_BALL = "the scene has no mirror ball, so the environment is unknown"
 NO_OBJECT = "the scene has no virtual object"
+NOT_ASKED = "none of its layers is asked for"
 """Reasons that several stages give."""
 
 

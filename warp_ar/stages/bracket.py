@@ -1,4 +1,4 @@
-"""Frames of several exposures tell of lamps that the longest one clips."""
+"""Frames of several exposures tell of light that the longest one clips."""
 
 from __future__ import annotations
 

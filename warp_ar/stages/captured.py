@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
+from warp_ar.errors import UsageError
+from warp_ar.kernels.structs import Emitter
 from warp_ar.light.captured import Light
+from warp_ar.light.config import CONFIG
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -33,12 +38,15 @@ class Captured(Stage):
         """Needs a file."""
         if features.request.scene.captured is None:
             return LeftOut("the scene names no captured light")
-        return Wiring(("captured_light",), ("environment",))
+        return Wiring(("captured_light",), ("environment", "emitters") if features.emitters else ("environment",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
-        """The map."""
+        """The map, and its emitters where their places are given."""
         height = self.request.quality.environment_height
-        return {"environment": ArraySpec((height, 2 * height), wp.vec3)}
+        specs = {"environment": ArraySpec((height, 2 * height), wp.vec3)}
+        if self.features.emitters:
+            specs["emitters"] = ArraySpec((CONFIG.search.most,), Emitter)
+        return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Copy what was read; reading it is done here, once."""
@@ -46,9 +54,28 @@ class Captured(Stage):
         assert spec is not None
         light = Light.load(spec.file)
         turn = rotation_matrix(spec.rotate)
-        radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
+        self._radiance = spec.scale * light.resampled(self.request.quality.environment_height, turn)
+
+        self._emitters = np.zeros(CONFIG.search.most, np.dtype(Emitter.numpy_dtype()))
 
         def copy(rows: Rows | None) -> None:
-            arrays["environment"].assign(radiance)
+            arrays["environment"].assign(self._radiance)
+            if self.features.emitters:
+                arrays["emitters"].assign(self._emitters)
 
         return [Pass(copy, on_host=True)]
+
+    def replace(self, radiance: npt.NDArray[np.float32], emitters: npt.NDArray[Any] | None = None) -> None:
+        """Light the frames to come by another map, at the quality's size and in the scene's axes.
+
+        Args:
+            radiance: Linear RGB, float32 (height, 2 height, 3); it is not copied.
+            emitters: Records of ``Emitter``, as many as ``Recover`` writes; None: none are known.
+
+        Raises:
+            UsageError: It is of another size.
+        """
+        if radiance.shape != self._radiance.shape:
+            raise UsageError(f"light is {radiance.shape}; this pipeline's environment is {self._radiance.shape}")
+        self._radiance = radiance
+        self._emitters = np.zeros_like(self._emitters) if emitters is None else emitters

@@ -35,8 +35,8 @@ class EnvironmentSamples(Stage):
         """Read the environment, write samples."""
         if not features.environment:
             return LeftOut(NO_BALL)
-        lamps = ("emitters",) if features.emitters else ()
-        return Wiring(("environment", *lamps), ("environment_samples",))
+        emitters = ("emitters",) if features.emitters else ()
+        return Wiring(("environment", *emitters), ("environment_samples",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The samples, and the sums that are inverted to draw them; for the reference a small map's texels as well."""

@@ -12,15 +12,8 @@ from typing import Literal
 from warp_ar.kernels.expose import BOXES
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
-from warp_ar.scene.ray_scene import (
-    has_sized_lights,
-    has_textures,
-    material_model,
-    proxies_face,
-    reflects_diffusely,
-    reflects_glossily,
-    trace_config,
-)
+from warp_ar.scene.object_materials import is_detailed, reflects_diffusely, reflects_glossily, scene_materials
+from warp_ar.scene.ray_scene import has_sized_lights, material_model, proxies_face, trace_config
 from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 
@@ -43,7 +36,7 @@ class Features:
     recovered: bool
     """Light that clips in the ball is put back."""
     emitters: bool
-    """Emitters of the environment are known by their places: there is a resource ``lamps``."""
+    """Emitters of the environment are known by their places: there is a resource ``emitters``."""
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
@@ -102,7 +95,8 @@ def find_features(request: Request) -> Features:
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
     lit_by_both = bool(environment and scene.lights and scene.proxies)
-    emitters = recovered and quality.method("recover") == "shading"
+    placed = recovered or (environment and not observed and request.emitters)
+    emitters = placed and quality.method("recover") == "shading"
     by_series = quality.method("irradiance") == "sh2"
     return Features(
         request=request,
@@ -146,12 +140,12 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
 
 
 def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLightConfig:
-    materials = [item.material for item in scene.objects]
+    materials = scene_materials(scene)
     environment = has_environment(scene)
     return DistantLightConfig(
         trace=trace_config(scene),
         models=tuple(sorted(set(map(material_model, materials)))),
-        textures=has_textures(scene),
+        textures=is_detailed(scene),
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
         specular=environment and any(map(reflects_glossily, materials)),
         probes=bool(scene.probes),

@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import near_field
-from warp_ar.scene import Material, MetallicRoughnessMaterial, PhongMaterial
-from warp_ar.scene.ray_scene import reflects_glossily
+from warp_ar.scene import MetallicRoughnessMaterial, PhongMaterial
+from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages.base import (
     NO_BALL,
     NO_OBJECT,
@@ -41,14 +42,17 @@ MIRROR_SAMPLES = 4
 """Rays per pixel of a mirror."""
 
 
-def lobe_width(material: Material) -> float:
-    """Width alpha of what a material mirrors, as ``kernels.near_field`` has it."""
-    match material:
+def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
+    """Least and largest width alpha of what a material mirrors, as ``kernels.near_field`` has it."""
+    surface = material.surface
+    match surface:
         case MetallicRoughnessMaterial():
-            return material.roughness**2
+            low, high = ((factor * surface.roughness) ** 2 for factor in material.roughness_span)
+            return low, high
         case PhongMaterial():
-            return 1.0 / math.sqrt(max(material.shininess, 1.0))
-    return 0.0
+            width = 1.0 / math.sqrt(max(surface.shininess, 1.0))
+            return width, width
+    return 0.0, 0.0
 
 
 class NearField(Stage):
@@ -128,7 +132,8 @@ class NearField(Stage):
     def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
         layers = self.features.layers
-        widths = [lobe_width(item.material) for item in self.request.scene.objects if reflects_glossily(item.material)]
+        materials = scene_materials(self.request.scene)
+        widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
         # The forms themselves stay the scene's: they are what the kernel writes.
         forms, variant = self.features.distant, distant_variant(self.features, device)

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_ar.kernels import prefilter, pyramid, sphere_map
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
-from warp_ar.scene.ray_scene import reflects_glossily
+from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.settled import settled_environment
@@ -19,7 +19,7 @@ from warp_ar.stages.shared.settled import settled_environment
 
 def glossy_materials(scene: Scene) -> list[Material]:
     """Materials of virtual objects that reflect more than diffusely."""
-    return [item.material for item in scene.objects if reflects_glossily(item.material)]
+    return [material.surface for material in scene_materials(scene) if reflects_glossily(material)]
 
 
 def scene_lobe(scene: Scene) -> prefilter.Lobe:

@@ -3,9 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 
 from warp_ar.scene import Scene
 from warp_ar.stages.quality import Quality
+
+
+@dataclasses.dataclass(frozen=True)
+class Layer:
+    """A layer of the picture, or what is known of each of its pixels, that can be asked for by name."""
+
+    resource: str
+    """Array that holds it."""
+    neutral: float | None
+    """Its value where it changes or says nothing; None: the frame itself."""
+    summary: str
+    """What it is, with its unit."""
+
+
+LAYERS: Mapping[str, Layer] = MappingProxyType(
+    {
+        "plate": Layer("plate", None, "the frame as linear radiance, 1 where the camera clips"),
+        "objects": Layer("layer_objects", 0.0, "virtual objects: premultiplied linear radiance, coverage"),
+        "shadow_ratio": Layer("layer_shadow_ratio", 1.0, "factor on the plate: shadows of the environment's light"),
+        "added_light": Layer("layer_added_light", 0.0, "linear radiance that virtual lights add to the plate"),
+        "mirror_ball": Layer("layer_mirror_ball", 0.0, "change of the plate's radiance in the mirror balls"),
+        "ids": Layer("surface_ids", -1.0, "surface at the pixel's centre: objects, then proxies, then balls; -1: none"),
+        "coverage": Layer("coverage", 0.0, "four surfaces that cover most of a pixel: number and share in turn"),
+        "depth": Layer("depth", float("inf"), "metres along the camera's axis at the pixel's centre; infinite: none"),
+        "normals": Layer("normals", 0.0, "unit normal at the pixel's centre, world, toward the camera"),
+        "position": Layer("position", 0.0, "place at the pixel's centre, world, metres"),
+        "motion": Layer("motion", 0.0, "pixels that the surface has moved since the frame before: x right, y down"),
+    }
+)
+"""Every layer, by the name by which ``outputs`` ask for it; one that a scene does not call for is neutral."""
+PICTURE_LAYERS = ("plate", "objects", "shadow_ratio", "added_light", "mirror_ball")
+"""Those that make the picture."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,8 +53,24 @@ class Request:
     size: tuple[int, int]
     """Width and height of the frames in pixels."""
     outputs: tuple[str, ...] = ("image",)
-    """Names of the resources that the caller wants: ``image``, ``environment``, ``pose``."""
+    """Names of what the caller wants: ``image``, ``environment``, ``pose``, and any of ``LAYERS``."""
     exposures: tuple[float, ...] = ()
     """Exposures between which frames alternate, longest first, over the one that is shown; empty: only one."""
     synchronous: bool = False
     """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
+    emitters: bool = False
+    """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
+
+    @property
+    def resources(self) -> tuple[str, ...]:
+        """Resources that hold the outputs."""
+        return tuple(LAYERS[name].resource if name in LAYERS else name for name in self.outputs)
+
+    @property
+    def asks_for_layers(self) -> bool:
+        """Whether a layer is one of the outputs."""
+        return not LAYERS.keys().isdisjoint(self.outputs)
+
+    def asks_for(self, resource: str) -> bool:
+        """Whether a resource is one of the outputs."""
+        return resource in self.resources

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from warp_ar.errors import UsageError
 from warp_ar.input.sources import QueueSource
 from warp_ar.pictures import decode_picture
-from warp_ar.scene import Camera
 from warp_ar.viewer import protocol
 from warp_ar.viewer.controls import Controls, Feed, Notify
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
@@ -53,13 +52,17 @@ class BrowserCamera:
         self._estimated: float | None = None
         self._estimate_until = 0.0
         self._looked = 0.0
-        self._calibrated: dict[tuple[int, int], Camera] = {}
         self._pushed: collections.deque[Pushed] = collections.deque(maxlen=4)
 
     @property
     def estimating(self) -> bool:
         """Whether the focal length is still being estimated."""
         return self._estimator is not None
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the marker has told the focal length."""
+        return self._estimated is not None
 
     def use(self, width: int, height: int, owner: object) -> None:
         """Make ``owner``'s camera the source.
@@ -72,13 +75,13 @@ class BrowserCamera:
         if feed.is_browser and feed.owner is not owner:
             raise UsageError("another viewer's camera is the source; it must be switched off there first")
         self._estimator = self._estimated = None
-        known = self._calibrated.get((width, height))
+        known = controls.wanted.camera_of((width, height))
         marker = controls.wanted.scene.marker
         if known is None and marker.board is None:
             self._estimator = FocalEstimator(marker, width, height)
             self._estimate_until = time.monotonic() + _ESTIMATE_SECONDS
         source = QueueSource((width, height), description="the browser's camera")
-        controls.switch(Feed(source, known or guessed_camera(width, height), owner=owner))
+        controls.switch(Feed(source, guessed_camera(width, height), owner=owner))
 
     def is_of(self, owner: object) -> bool:
         """Whether ``owner``'s camera is the source."""
@@ -142,8 +145,6 @@ class BrowserCamera:
             if self._estimated is None:
                 self._notify({"type": "intrinsics", "focal": None, "spread": None, "views": 0})
 
-    def calibrated(self, camera: Camera) -> None:
-        """Use a calibrated camera, now and whenever frames of its size come again."""
-        self._calibrated[camera.width, camera.height] = camera
+    def stop_estimating(self) -> None:
+        """Leave the focal length as it is: it was calibrated."""
         self._estimator = None
-        self._controls.use_camera(camera)

@@ -31,6 +31,8 @@ from warp_ar.viewer.controls import Notify
 
 _COST_FRAMES: Final = 30
 """Frames whose median tells what a preset costs."""
+_TOLD: Final = 0.03
+"""Share of the measurements after which the rest is estimated."""
 _SETTLED: Final = 10
 """Frames of a new pipeline that do not count."""
 
@@ -54,6 +56,7 @@ class BudgetSetting:
         self._costs: Costs | None = None
         self._offer: dict[str, Any] = {}
         self._progress: float | None = None
+        self._began = 0.0
         self._failed: str | None = None
         self._settings: tuple[Setting, ...] = ()
         self._stopped = False
@@ -111,7 +114,7 @@ class BudgetSetting:
             self._adopt(read_costs(self._folder, self._cache_key, self._settings))
             self._notify(self.record())
         if self._costs is None and self._budget is not None and key != self._failed:
-            self._progress = 0.0
+            self._progress, self._began = 0.0, time.monotonic()
             self._notify(self.record())
             steps = measure_steps(scene, image.copy(), pose, str(pipeline.device), size, self._settings)
             helper.submit(self._step, helper, steps, key)
@@ -204,7 +207,15 @@ class BudgetSetting:
 
     def record(self) -> dict[str, Any]:
         """All that can be bought, as a message for the page. From any thread."""
-        return {"type": "budget", "measuring": self._progress, "known": self._controller is not None, **self._offer}
+        told = {"measuring": self._progress, "remaining": self._remaining(), "known": self._controller is not None}
+        return {"type": "budget", **told, **self._offer}
+
+    def _remaining(self) -> float | None:
+        """Seconds that the measurements still take, at the pace so far; None while there is too little to tell by."""
+        progress = self._progress
+        if progress is None or progress < _TOLD:
+            return None
+        return round((time.monotonic() - self._began) * (1.0 - progress) / progress, 1)
 
     def _list(self, controller: Controller, costs: Costs) -> dict[str, Any]:
         names = [setting.name for setting in self._settings]

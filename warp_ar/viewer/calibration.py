@@ -107,9 +107,9 @@ class CalibrationSession:
         return written("camera.yml", lambda path: write_camera(report, path))
 
 
-def board_picture() -> bytes:
-    """The card to print, a PNG of a sheet of A4."""
-    return written("board.png", lambda path: write_card(SHEET, path, dpi=300.0))
+def card_pdf(paper: str) -> bytes:
+    """The card to print, a PDF."""
+    return written("card.pdf", lambda path: write_card(SHEET, path, paper))
 
 
 def written(name: str, write: Callable[[Path], object]) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +15,7 @@ from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
 from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.history import History
 
 CAMERA: Final = "camera"
 """What a picture is compared with when it is not another preset."""
@@ -79,6 +81,7 @@ class Controls:
         self.stopped = False
         self.feed = feed
         self._next: Feed | None = None
+        self._history = History()
 
     @property
     def newest_feed(self) -> Feed:
@@ -90,12 +93,62 @@ class Controls:
         """Whether the present source shall be left."""
         return self.stopped or self._next is not None
 
-    def change(self, make: Callable[[Wanted], Wanted]) -> None:
-        """Make what is wanted anew from what was."""
+    def change(self, make: Callable[[Wanted], Wanted], label: str | None = None) -> None:
+        """Make what is wanted anew from what was.
+
+        Args:
+            make: Gives what is wanted from then on.
+            label: What the edit does, in words; None is no edit, and cannot be undone.
+        """
         with self.changed:
-            self.wanted = make(self.wanted)
+            before = self.wanted
+            self.wanted = make(before)
+            if label is not None and self.wanted != before:
+                self._history.note(label, before, time.monotonic())
             self._touch()
-        self._notify(messages.scene(self.wanted))
+        self._notify(self.scene_message())
+
+    def undo(self) -> None:
+        """Take the last edit back; without one nothing happens."""
+        self._step_to(self._history.undo)
+
+    def redo(self) -> None:
+        """Make the edit again that was taken back last; without one nothing happens."""
+        self._step_to(self._history.redo)
+
+    def _step_to(self, step: Callable[[Wanted], Wanted | None]) -> None:
+        with self.changed:
+            wanted = step(self.wanted)
+            if wanted is not None:
+                self.wanted = wanted
+                self._touch()
+        self._notify(self.scene_message())
+
+    def give_back(self, good: Wanted) -> None:
+        """Want again what was wanted before an edit that could not be built."""
+        with self.changed:
+            self.wanted = good
+            self._history.drop(good)
+            self._touch()
+        self._notify(self.scene_message())
+
+    def start_anew(self, wanted: Wanted) -> None:
+        """Want another scene; edits of the one before are forgotten."""
+        with self.changed:
+            self.wanted = wanted
+            self._history.clear()
+            self._touch()
+        self._notify(self.scene_message())
+
+    def scene_message(self) -> dict[str, Any]:
+        """The scene as it is edited, and what can be undone."""
+        with self.changed:
+            return messages.scene(self.wanted, self._history.undo_label, self._history.redo_label)
+
+    def camera_of(self, feed: Feed, wanted: Wanted | None = None) -> Camera:
+        """What is known of the camera that took a feed's frames."""
+        wanted = wanted or self.wanted
+        return wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
 
     def _touch(self) -> None:
         self.edits += 1
@@ -151,9 +204,11 @@ class Controls:
             if self._next is None:
                 return False
             self.feed, self._next = self._next, None
-            self.wanted = self.feed.wanted or self.wanted
+            if self.feed.wanted is not None:
+                self.wanted = self.feed.wanted
+                self._history.clear()
             self._touch()
-        self._notify(messages.scene(self.wanted))
+        self._notify(self.scene_message())
         return True
 
     def use_camera(self, camera: Camera) -> None:

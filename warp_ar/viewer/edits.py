@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
 from warp_ar.errors import UsageError
+from warp_ar.input.check_print import card_scale
+from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import (
+    Camera,
+    CharucoBoard,
     Exposure,
+    FileMaterial,
     LambertMaterial,
     Light,
     Material,
@@ -20,17 +24,24 @@ from warp_ar.scene import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Probe,
+    Proxy,
     Scene,
     dumps_scene,
     loads_scene,
 )
-from warp_ar.scene.mesh_files import load_mesh
+from warp_ar.scene.object_materials import mesh_of
 from warp_ar.stages import STAGES
 from warp_ar.stages.quality import Quality
+from warp_ar.viewer import protocol
 from warp_ar.viewer.protocol import EFFECTS
 
 MOST_PARTS: Final = 16
-"""Objects or lights in a scene that the page may add to."""
+"""Objects, lights or proxies in a scene that the page may add to."""
+RULER: Final = 0.1
+"""Metres that each ruler of the card has in a print at true scale."""
+_SCALES: Final = (0.5, 1.5)
+"""What a ruler may measure over what it should: beyond that it was read wrong."""
 
 _LISTS: Final = {"object": "objects", "light": "lights", "proxy": "proxies", "probe": "probes"}
 # No key that names a file is among them.
@@ -48,7 +59,9 @@ _MODELS: Final[Mapping[str, type[Material]]] = {
     "phong": PhongMaterial,
     "metallic_roughness": MetallicRoughnessMaterial,
     "mirror": MirrorMaterial,
+    "file": FileMaterial,
 }
+_PLANE, _BOX = Proxy("plane", size=(0.2, 0.15)), Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06))
 _NEW: Final[Mapping[str, Object | Light]] = {
     "sphere": Object("sphere", radius=0.03, at=(0.12, -0.08, 0.03), material=MetallicRoughnessMaterial()),
     "box": Object("box", size=(0.05, 0.05, 0.05), at=(0.12, -0.08, 0.025), material=LambertMaterial()),
@@ -74,6 +87,48 @@ def checked(scene: Scene) -> Scene:
     return dataclasses.replace(loads_scene(dumps_scene(scene)), path=scene.path)
 
 
+def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
+    """The scene with the printed card as its marker and a mirror ball on the card's cross.
+
+    Args:
+        scene: The scene; its balls go, its objects, lights and proxies stay, and it gets a table if it has none.
+        radius: Of the ball, metres.
+        ruler: What the print's rulers of 100 mm measure, metres.
+
+    Raises:
+        UsageError: The radius is no ball's that stands on the card, or the ruler was read wrong.
+    """
+    largest = 1.25 * max(RINGS)
+    if not 0.005 <= radius <= largest:
+        raise UsageError(f"the ball's radius is {1e3 * radius:g} mm; expected 5 to {1e3 * largest:g} mm")
+    scale = ruler / RULER
+    if not _SCALES[0] <= scale <= _SCALES[1]:
+        low, high = (1e3 * RULER * bound for bound in _SCALES)
+        raise UsageError(f"the print's ruler measures {1e3 * ruler:g} mm; expected {low:g} to {high:g} mm")
+    made = SHEET.board
+    assert isinstance(made, CharucoBoard)
+    lengths = (round(made.square_length * scale, 7), round(made.marker_length * scale, 7))
+    board = CharucoBoard(made.columns, made.rows, *lengths)
+    x, y, _ = ball_center(radius)
+    center = (round(x * scale, 5), round(y * scale, 5), radius)
+    ball = dataclasses.replace(scene.probes[0], center=center, radius=radius) if scene.probes else Probe(center, radius)
+    has_table = any(proxy.shape == "plane" for proxy in scene.proxies)
+    return checked(
+        dataclasses.replace(
+            scene,
+            marker=dataclasses.replace(SHEET, board=board),
+            probes=(ball,),
+            proxies=scene.proxies if has_table else (*scene.proxies, Proxy("plane", size=(1.6, 1.2))),
+        )
+    )
+
+
+def card_ruler(scene: Scene) -> float | None:
+    """What the rulers of the scene's printed card measure, metres; None where its marker is another one."""
+    scale = card_scale(scene.marker)
+    return None if scale is None else RULER * scale
+
+
 def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scene:
     """The scene with one key of one part changed.
 
@@ -90,6 +145,8 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
     """
     if part in ("exposure", "marker"):
         section = dataclasses.replace(getattr(scene, part), **{_key(part, key): value})
+        if part == "marker" and key in ("id", "size"):
+            section = dataclasses.replace(section, board=None)  # a marker of its own instead of a board's
         changed: dict[str, Any] = {part: section}
         return checked(dataclasses.replace(scene, **changed))
     items = list(getattr(scene, _LISTS[part]))
@@ -97,7 +154,7 @@ def set_value(scene: Scene, part: str, index: int, key: str, value: Any) -> Scen
         raise UsageError(f"{part} {index}: the scene has {len(items)}")
     item = items[index]
     if isinstance(item, Object) and (key == "model" or key in _MATERIAL_KEYS):
-        items[index] = dataclasses.replace(item, material=_material(item.material, key, value))
+        items[index] = dataclasses.replace(item, material=_material(_shown_material(item), key, value))
     else:
         changes = {_key(part, key): value}
         if part == "light" and key in ("target", "direction"):
@@ -117,12 +174,21 @@ def _key(part: str, key: str) -> str:
     return key
 
 
+def _shown_material(item: Object) -> Material:
+    """An object's material; what has no file is chalk where no material is given."""
+    return LambertMaterial() if isinstance(item.material, FileMaterial) and item.shape != "mesh" else item.material
+
+
 def _material(material: Material, key: str, value: Any) -> Material:
     if key == "model":
         if value not in _MODELS:
             raise UsageError(f"material: model {value!r}; expected {', '.join(_MODELS)}")
-        color: Any = next(iter(vars(material).values()))  # the first field of every model is its colour
-        return _MODELS[value](color)
+        if value == "file":
+            return FileMaterial()
+        first = iter(vars(material).values())  # of every model but the file's own its colour
+        color: Any = next(first, LambertMaterial.base_color)
+        made: Any = _MODELS[value]
+        return cast(Material, made(color))
     if key not in vars(material):
         raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
     color_like = isinstance(vars(material)[key], tuple | Path)
@@ -132,15 +198,27 @@ def _material(material: Material, key: str, value: Any) -> Material:
 
 
 def add_part(scene: Scene, part: str, kind: str) -> Scene:
-    """The scene with a new object or light of ``kind``."""
+    """The scene with a new object, light or proxy of ``kind``."""
+    if part == "proxy":
+        return add_item(scene, part, _PLANE if kind == "plane" else _BOX)
+    return add_item(scene, part, _NEW[kind])
+
+
+def add_item(scene: Scene, part: str, item: Object | Light | Proxy) -> Scene:
+    """The scene with one object, light or proxy more.
+
+    Raises:
+        UsageError: It has as many as it may have.
+        SceneError: The scene file would refuse it.
+    """
     items = getattr(scene, _LISTS[part])
     if len(items) >= MOST_PARTS:
         raise UsageError(f"{len(items)} are in the scene already; {MOST_PARTS} at most: take one away first")
-    return _with_list(scene, part, (*items, _NEW[kind]))
+    return _with_list(scene, part, (*items, item))
 
 
 def remove_part(scene: Scene, part: str, index: int) -> Scene:
-    """The scene without one object or light."""
+    """The scene without one object, light or proxy."""
     items = getattr(scene, _LISTS[part])
     if index >= len(items):
         raise UsageError(f"{part} {index}: the scene has {len(items)}")
@@ -158,9 +236,20 @@ class Wanted:
     off: frozenset[str] = frozenset()
     """Effects that are switched off."""
     hidden: frozenset[tuple[str, int]] = frozenset()
-    """(part, index) of objects and lights that are hidden."""
+    """(part, index) of objects, lights and proxies that are hidden."""
     methods: tuple[tuple[str, str], ...] = ()
     """(stage, method) that differ from the preset's."""
+    cameras: tuple[Camera, ...] = ()
+    """Cameras that were calibrated, one for each size of frames, instead of the scene's."""
+
+    def camera_of(self, size: tuple[int, int]) -> Camera | None:
+        """The calibrated camera of frames of a size; None where none was calibrated."""
+        return next((camera for camera in self.cameras if (camera.width, camera.height) == size), None)
+
+    def with_camera(self, camera: Camera) -> Wanted:
+        """With a calibrated camera for frames of its size."""
+        others = (own for own in self.cameras if (own.width, own.height) != (camera.width, camera.height))
+        return dataclasses.replace(self, cameras=(*others, camera))
 
     def shown_scene(self) -> Scene:
         """The scene without what is hidden or switched off: the one that a file of this picture holds."""
@@ -189,12 +278,12 @@ class Wanted:
         return self.quality.with_methods(**methods) if methods else self.quality
 
     def without_part(self, part: str, index: int) -> Wanted:
-        """With one object or light removed; what is hidden stays hidden."""
+        """With one object, light or proxy removed; what is hidden stays hidden."""
         hidden = {(t, i - (t == part and i > index)) for t, i in self.hidden if (t, i) != (part, index)}
         return dataclasses.replace(self, scene=remove_part(self.scene, part, index), hidden=frozenset(hidden))
 
     def with_part_shown(self, part: str, index: int, on: bool) -> Wanted:
-        """With one object or light shown or hidden."""
+        """With one object, light or proxy shown or hidden."""
         item = {(part, index)}
         return dataclasses.replace(self, hidden=self.hidden - item if on else self.hidden | item)
 
@@ -215,6 +304,41 @@ class Wanted:
         return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
 
 
+def make_edit(command: protocol.Command, original: Wanted) -> tuple[Callable[[Wanted], Wanted], str] | None:
+    """What a command makes of what is wanted, and its name in words; None if it is no edit.
+
+    Args:
+        command: What the page asks for.
+        original: The scene before any edit.
+    """
+    match command:
+        case protocol.Set(part, index, key, value):
+            return lambda w: dataclasses.replace(w, scene=set_value(w.scene, part, index, key, value)), (
+                f"set {key} of {_named(part, index)}"
+            )
+        case protocol.Add(part, kind):
+            return lambda w: dataclasses.replace(w, scene=add_part(w.scene, part, kind)), f"add {kind}"
+        case protocol.Remove(part, index):
+            return lambda w: w.without_part(part, index), f"remove {_named(part, index)}"
+        case protocol.Show(part, index, on):
+            return lambda w: w.with_part_shown(part, index, on), f"{'show' if on else 'hide'} {_named(part, index)}"
+        case protocol.Effect(name, on):
+            return lambda w: w.with_effect(name, on), f"switch {name.replace('_', ' ')} {'on' if on else 'off'}"
+        case protocol.Method(stage, method):
+            return lambda w: w.with_method(stage, method), f"choose the method of {stage.replace('_', ' ')}"
+        case protocol.UseCard(radius, ruler):
+            return lambda w: dataclasses.replace(w, scene=use_card(w.scene, radius, ruler)), "use the printed card"
+        case protocol.Reset():
+            return lambda w: dataclasses.replace(original, quality=w.quality, cameras=w.cameras), "undo all edits"
+    return None
+
+
+def _named(part: str, index: int) -> str:
+    """A part in words."""
+    names = {"object": "object", "light": "light", "proxy": "shape", "probe": "mirror ball"}
+    return f"{names[part]} {index + 1}" if part in names else f"the {part}"
+
+
 def wanted_record(wanted: Wanted) -> dict[str, Any]:
     """What the page needs to know of a scene, as plain data; of files only their names."""
     scene = wanted.scene
@@ -226,20 +350,30 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         }
 
     def part(kind: str, index: int, item: Any) -> dict[str, Any]:
-        record = {**plain(item), "visible": (kind, index) not in wanted.hidden, "animated": item.animate is not None}
+        record = {**plain(item), "visible": (kind, index) not in wanted.hidden}
+        record["animated"] = not isinstance(item, Proxy) and item.animate is not None
         if isinstance(item, Object):
-            model = next(name for name, made in _MODELS.items() if isinstance(item.material, made))
-            record["material"] = {"model": model, **plain(item.material)}
+            material = _shown_material(item)
+            model = next(name for name, made in _MODELS.items() if isinstance(material, made))
+            record["material"] = {"model": model, **plain(material)}
             record["reach"] = _reach(item)
         return record
 
+    marker, ruler = scene.marker, card_ruler(scene)
     return {
         "name": scene.name,
         "objects": [part("object", i, item) for i, item in enumerate(scene.objects)],
         "lights": [part("light", i, item) for i, item in enumerate(scene.lights)],
+        "proxies": [part("proxy", i, item) for i, item in enumerate(scene.proxies)],
         "probes": [plain(item) for item in scene.probes],
         "exposure": scene.exposure.scale,
-        "marker": {"dictionary": scene.marker.dictionary, "id": scene.marker.id, "size": scene.marker.size},
+        "marker": {
+            "dictionary": marker.dictionary,
+            "id": marker.id,
+            "size": marker.size,
+            "board": None if marker.board is None else str(marker.board),
+            "ruler": None if ruler is None else round(ruler, 6),
+        },
         "effects": {name: name not in wanted.off for name in EFFECTS},
         "quality": wanted.quality.name,
         "methods": dict(wanted.methods),
@@ -249,13 +383,9 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
 def _reach(item: Object) -> float:
     """Radius in metres of a circle on the ground around an object, about its size."""
     if item.shape == "mesh":
-        assert item.file is not None
-        return item.scale * _mesh_reach(item.file)
+        mesh = mesh_of(item)
+        assert mesh is not None
+        return item.scale * float(np.abs(mesh.bounds)[:, :2].mean())
     if item.shape == "box":
         return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
     return item.scale * (item.radius + item.major_radius + item.minor_radius)
-
-
-@functools.lru_cache(maxsize=32)
-def _mesh_reach(file: Path) -> float:
-    return float(np.abs(load_mesh(file).bounds)[:, :2].mean())

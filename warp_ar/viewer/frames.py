@@ -27,6 +27,7 @@ from warp_ar.viewer.controls import Controls, Notify
 from warp_ar.viewer.intrinsics import guessed_camera
 from warp_ar.viewer.lighting import Lighting
 from warp_ar.viewer.recorder import Recorder
+from warp_ar.viewer.setup import SetupChecks
 
 PLAY_RATE: Final = 30.0
 """Frames a second of clips that tell no rate."""
@@ -79,6 +80,7 @@ class Helpers:
     camera: BrowserCamera
     calibration: CalibrationSession
     recorder: Recorder
+    setup: SetupChecks
 
 
 class FrameLoop:
@@ -209,6 +211,8 @@ class FrameLoop:
             helpers.budget.restart()
         self.latest = self._lit_by(pipeline, frame, now, pushed) or self._plain(frame, pushed)
         self._times.append(time.monotonic())
+        if self.latest.plan:
+            helpers.setup.note(frame.image, self.latest.state, self._times[-1])
         try:
             helpers.recorder.add(self.latest.image)
         except WarpArError as error:
@@ -259,7 +263,7 @@ class FrameLoop:
         """A frame as the camera gave it, for viewers to see meanwhile."""
         self._id += 1
         taken, stamp = (pushed.taken, pushed.stamp) if pushed is not None else (time.monotonic(), None)
-        camera = self._controls.feed.camera or self._controls.wanted.scene.camera
+        camera = self._controls.camera_of(self._controls.feed)
         size = frame.image.shape[1], frame.image.shape[0]
         if (camera.width, camera.height) != size:
             camera = guessed_camera(*size)

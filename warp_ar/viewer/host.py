@@ -15,10 +15,11 @@ import numpy.typing as npt
 
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.errors import UsageError
+from warp_ar.input.outline_fit import fit_outline
 from warp_ar.output.sinks import write_environment
 from warp_ar.scene import Scene, bundled_scenes, dumps_scene, load_scene
 from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.viewer import calibration, edits, messages, protocol
+from warp_ar.viewer import calibration, edits, protocol
 from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
@@ -27,6 +28,7 @@ from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.recorder import Recorder
+from warp_ar.viewer.setup import RESPONSE, SetupChecks
 
 
 class Host:
@@ -79,7 +81,8 @@ class Host:
         self._camera = BrowserCamera(self._controls, notify)
         self._looker = ThreadPoolExecutor(1, "warp-ar-board")
         self._calibration = CalibrationSession(self._looker, notify, self._use_calibrated)
-        helpers = Helpers(self._lighting, self._budget, self._camera, self._calibration, self._recorder)
+        self._setup = SetupChecks(self._controls, self._looker, notify, Path(self._folder.name))
+        helpers = Helpers(self._lighting, self._budget, self._camera, self._calibration, self._recorder, self._setup)
         self._loop = FrameLoop(self._controls, helpers, frames=frames, publish=publish, notify=notify)
         self.run = self._loop.run
         """Light frames until told to stop; blocks."""
@@ -118,30 +121,25 @@ class Host:
         Raises:
             WarpArError: It cannot be done; nothing has changed.
         """
-        change = self._controls.change
+        controls = self._controls
         match command:
-            case protocol.Set(part, index, key, value):
-                change(lambda w: dataclasses.replace(w, scene=edits.set_value(w.scene, part, index, key, value)))
-            case protocol.Add(part, kind):
-                change(lambda w: dataclasses.replace(w, scene=edits.add_part(w.scene, part, kind)))
-            case protocol.Remove(part, index):
-                change(lambda w: w.without_part(part, index))
-            case protocol.Show(part, index, on):
-                change(lambda w: w.with_part_shown(part, index, on))
-            case protocol.Effect(name, on):
-                change(lambda w: w.with_effect(name, on))
+            case protocol.Undo():
+                controls.undo()
+            case protocol.Redo():
+                controls.redo()
+            case protocol.Outline(kind, points):
+                self._point_out(kind, points)
             case protocol.SetQuality(name):
                 self._set_budget(self._budget.last_budget if name == AUTO else None, name)
-            case protocol.Method(stage, method):
-                change(lambda w: w.with_method(stage, method))
             case protocol.Budget(ms):
                 self._set_budget(ms, self._preset.name)
             case protocol.OpenScene(name):
                 self._open_scene(name)
-            case protocol.Reset():
-                change(lambda w: dataclasses.replace(self._original, quality=w.quality))
             case _:
-                self._control(command, owner)
+                if (made := edits.make_edit(command, self._original)) is not None:
+                    controls.change(*made)
+                else:
+                    self._control(command, owner)
 
     def _control(self, command: protocol.Command, owner: object) -> None:
         """Do what is no edit of the scene."""
@@ -164,6 +162,9 @@ class Host:
             case protocol.Calibrate(step):
                 self._calibration.step(step)
                 return
+            case protocol.Setup(step):
+                self._setup.step(step)
+                return
         self._notify(self.state_message())
 
     def _set_budget(self, budget: float | None, preset: str) -> None:
@@ -177,16 +178,31 @@ class Host:
         self._controls.change(lambda w: dataclasses.replace(w, quality=quality))
         self._notify(self.state_message())
 
+    def _point_out(self, kind: str, points: tuple[tuple[float, float], ...]) -> None:
+        """Model a part of the desk that four points of the newest frame outline."""
+        lit = self._loop.latest
+        if lit is None or lit.pose is None:
+            raise UsageError("the marker is not seen, so no point of the picture has a place: show it first")
+        found = fit_outline(lit.frame, lit.camera, lit.pose, kind, points)
+        self._controls.change(
+            lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", found.proxy)), f"point out a {kind}"
+        )
+        sides = " x ".join(f"{1e3 * side:.0f}" for side in found.proxy.size)
+        how = f"{found.met:.0%} of its outline lies on edges of the picture"
+        if not found.fitted:
+            how = "as pointed out, for the picture shows too few of its edges"
+        self._notify({"type": "notice", "text": f"{kind.capitalize()} of {sides} mm: {how}.", "bad": False})
+
     def _open_scene(self, name: str) -> None:
         if name not in bundled_scenes():
             raise UsageError(f"no bundled scene {name!r}; expected {', '.join(bundled_scenes())}")
         scene = load_scene(name)
         running = self._controls.wanted.quality
         quality = self._budget.start_quality() if self._budget.rules(running) else running
-        wanted = self._original = Wanted(scene, quality)
+        wanted = self._original = Wanted(scene, quality, cameras=self._controls.wanted.cameras)
         self._budget.forget_costs()
         if self._controls.feed.is_browser or self._given_source is not None:
-            self._controls.change(lambda _: wanted)
+            self._controls.start_anew(wanted)
         else:
             self._controls.switch(open_feed(scene, None, wanted))
 
@@ -210,7 +226,9 @@ class Host:
         self._camera.push(taken, owner)
 
     def _use_calibrated(self, camera: Any) -> None:
-        self._camera.calibrated(calibration.with_transfer(camera, self._controls.wanted.scene.camera))
+        known = self._controls.camera_of(self._controls.feed)
+        self._camera.stop_estimating()
+        self._controls.change(lambda w: w.with_camera(calibration.with_transfer(camera, known)), "calibrate the camera")
 
     # ------------------------------------------------------------------------------------------------ what can be saved
 
@@ -222,9 +240,17 @@ class Host:
         """
         return self._calibration.camera_file()
 
-    def board_picture(self) -> bytes:
-        """The board to print, a PNG of a sheet of A4."""
-        return calibration.board_picture()
+    def card(self, paper: str) -> bytes:
+        """The card to print, a PDF of a paper that ``input.card`` knows."""
+        return calibration.card_pdf(paper)
+
+    def response_file(self) -> bytes:
+        """The response that was measured by the card's greys, as text.
+
+        Raises:
+            UsageError: None was measured.
+        """
+        return self._setup.response_file()
 
     def recording(self) -> bytes:
         """The finished recording, an MP4.
@@ -265,6 +291,9 @@ class Host:
             full_paths: Write the paths of files in full; else relative to the scene's folder where they lie in it.
         """
         scene = make_target(self._controls.wanted, self._controls.feed).scene
+        if isinstance(scene.camera.transfer, Path) and scene.camera.transfer.parent == Path(self._folder.name):
+            # What was measured here is saved beside the scene.
+            scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, transfer=Path(RESPONSE)))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 
@@ -277,12 +306,13 @@ class Host:
             self.scene_message(),
             self._budget.record(),
             self.calibration_message(),
+            self._setup.message(),
             self.state_message(),
         ]
 
     def scene_message(self) -> dict[str, Any]:
         """The scene as it is edited."""
-        return messages.scene(self._controls.wanted)
+        return self._controls.scene_message()
 
     def plan_message(self) -> dict[str, Any]:
         """The stages that run, and why the others do not."""
@@ -301,6 +331,8 @@ class Host:
             "source": self.description,
             "camera": controls.feed.is_browser,
             "estimating": self._camera.estimating,
+            "lens": self._lens(),
+            "missing": self._setup.missing_record(),
             "playing": controls.playing,
             "recording": self._recorder.count,
             "building": lighting.doing(),
@@ -312,6 +344,16 @@ class Host:
             "watchers": controls.watchers,
             "difference": self._loop.difference,
         }
+
+    def _lens(self) -> str:
+        """Where the camera's numbers come from: calibrated, given by the scene, estimated, or guessed."""
+        controls = self._controls
+        feed, wanted = controls.feed, controls.wanted
+        if wanted.camera_of(feed.source.size) is not None:
+            return "calibrated"
+        if feed.camera is not None:
+            return "estimated" if self._camera.estimated else "guessed"
+        return "given" if wanted.scene.camera.field_of_view is None else "guessed"
 
     def light(self) -> npt.NDArray[np.float32] | None:
         """The environment, latlong linear RGB, as it was a moment ago."""

@@ -31,7 +31,8 @@ _AS_QUICK: Final = ("low", "paper")
 
 def make_target(wanted: Wanted, feed: Feed) -> Target:
     """What a pipeline is built for."""
-    scene = dataclasses.replace(wanted.shown_scene(), camera=feed.camera or wanted.scene.camera)
+    camera = wanted.camera_of(feed.source.size) or feed.camera or wanted.scene.camera
+    scene = dataclasses.replace(wanted.shown_scene(), camera=camera)
     # The page draws handles where parts are: that takes the pose, even where no stage does.
     outputs = ("image", "pose") if wanted.scene.objects or wanted.scene.lights else ("image",)
     return Target(scene, wanted.shown_quality(), feed.source.size, outputs, feed.source.exposures)
@@ -135,7 +136,7 @@ class Lighting:
                 self._settled = True
                 self._notify(messages.notice(error))
                 self._give_up()
-                controls.change(lambda _: self._good)
+                controls.give_back(self._good)
         if self._main.swaps != before:
             assert self._main.pipeline is not None
             self.plan = self._main.pipeline.plan

@@ -16,9 +16,9 @@ def notice(error: WarpArError) -> dict[str, Any]:
     return {"type": "notice", "text": str(error), "bad": True}
 
 
-def scene(wanted: Wanted) -> dict[str, Any]:
-    """The scene as it is edited."""
-    return {"type": "scene", "scene": wanted_record(wanted)}
+def scene(wanted: Wanted, undo: str | None, redo: str | None) -> dict[str, Any]:
+    """The scene as it is edited, and what can be undone and done again, in words."""
+    return {"type": "scene", "scene": wanted_record(wanted), "undo": undo, "redo": redo}
 
 
 def plan(plan: Plan | None, number: int, device: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 
 from warp_ar.errors import WarpArError
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Number of what both sides may say, told in ``hello``; it grows when keys change."""
 MAX_TEXT: Final = 4096
 """Longest text message from a page in bytes: an edit takes under 200."""
@@ -32,8 +32,17 @@ EFFECTS: Final = ("objects", "lights", "environment", "receiver", "exposure", "r
 """What the page can switch off."""
 PARTS: Final = ("object", "light", "proxy", "probe", "exposure", "marker")
 """What of a scene the page can edit."""
-KINDS: Final = {"object": ("sphere", "box", "torus"), "light": ("point", "spot", "directional")}
+KINDS: Final = {
+    "object": ("sphere", "box", "torus"),
+    "light": ("point", "spot", "directional"),
+    "proxy": ("plane", "box"),
+}
 """What the page can add. Meshes are files, and the page names no file."""
+_ALL_KINDS: Final = tuple(dict.fromkeys(kind for kinds in KINDS.values() for kind in kinds))
+OUTLINES: Final = ("plane", "wall", "box")
+"""What of the desk can be pointed out by four points of the picture."""
+SETUP_STEPS: Final = ("check", "ball", "response")
+"""What of a set-up the page can have looked at."""
 
 
 class ProtocolError(WarpArError, ValueError):
@@ -141,6 +150,41 @@ class OpenScene:
 
 
 @dataclasses.dataclass(frozen=True)
+class Outline:
+    """Model a part of the desk that four points of the picture outline, in pixels."""
+
+    kind: str
+    points: tuple[tuple[float, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class UseCard:
+    """The printed card is the marker, and a mirror ball stands on its cross."""
+
+    radius: float
+    """Of the ball, metres."""
+    ruler: float
+    """What the print's rulers of 100 mm measure, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """Look at the set-up: ``check`` all of it, or measure the ``ball`` or the camera's ``response``."""
+
+    step: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Undo:
+    """Take the last edit back."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Redo:
+    """Make the edit again that was taken back last."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Reset:
     """Undo every edit."""
 
@@ -196,6 +240,11 @@ Command: TypeAlias = (
     | Compare
     | Play
     | OpenScene
+    | Outline
+    | UseCard
+    | Setup
+    | Undo
+    | Redo
     | Reset
     | UseCamera
     | LeaveCamera
@@ -258,6 +307,16 @@ def _optional(check: Callable[[Any], float]) -> Callable[[Any], float | None]:
     return lambda value: None if value is None else check(value)
 
 
+def _points(value: Any) -> tuple[tuple[float, float], ...]:
+    """Four points of a picture."""
+    if not isinstance(value, list) or len(value) != 4:
+        raise ProtocolError("expected four points")
+    check = _number(-1e5, 1e5)
+    if not all(isinstance(point, list) and len(point) == 2 for point in value):
+        raise ProtocolError("expected points of two numbers")
+    return tuple((check(x), check(y)) for x, y in value)
+
+
 _INDEX = _integer(0, 63)
 _ID = _integer(0, 1 << 53)
 
@@ -265,7 +324,7 @@ _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callabl
     "ack": (Ack, {"id": _ID}),
     "ping": (Ping, {"sent": _number(0.0, 1e15)}),
     "set": (Set, {"part": _choice(*PARTS), "index": _INDEX, "key": _name, "value": _value}),
-    "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*KINDS["object"], *KINDS["light"])}),
+    "add": (Add, {"part": _choice(*KINDS), "kind": _choice(*_ALL_KINDS)}),
     "remove": (Remove, {"part": _choice(*KINDS), "index": _INDEX}),
     "show": (Show, {"part": _choice(*KINDS), "index": _INDEX, "on": _flag}),
     "effect": (Effect, {"name": _choice(*EFFECTS), "on": _flag}),
@@ -275,6 +334,11 @@ _MESSAGES: Final[Mapping[str, tuple[Callable[..., Command], Mapping[str, Callabl
     "compare": (Compare, {"other": _name}),
     "play": (Play, {"on": _flag}),
     "scene": (OpenScene, {"name": _name}),
+    "outline": (Outline, {"kind": _choice(*OUTLINES), "points": _points}),
+    "card": (UseCard, {"radius": _number(0.0, 10.0), "ruler": _number(0.0, 10.0)}),
+    "setup": (Setup, {"step": _choice(*SETUP_STEPS)}),
+    "undo": (Undo, {}),
+    "redo": (Redo, {}),
     "reset": (Reset, {}),
     "camera": (
         UseCamera,

@@ -267,7 +267,9 @@ class Server:
             "scene.toml": ("application/toml", lambda: host.scene_toml(full_paths=self.address.loopback).encode()),
             "recording.mp4": ("video/mp4", host.recording),
             "camera.yml": ("application/yaml", host.camera_file),
-            "board.png": ("image/png", host.board_picture),
+            "response.txt": ("text/plain", host.response_file),
+            "card-a4.pdf": ("application/pdf", lambda: host.card("a4")),
+            "card-letter.pdf": ("application/pdf", lambda: host.card("letter")),
         }
         name = request.match_info["name"]
         if name not in makers:

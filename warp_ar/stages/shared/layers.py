@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from warp_ar.kernels import composite
-from warp_ar.stages.base import Arrays
 
 
-def layers_of(arrays: Arrays) -> composite.Layers:
+def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
     """The layers that there are, as kernels read them."""
     names = ("virtual", "physical_added", "shadow_ratio", "mirrored")
     return composite.make_layers(*(arrays.get(name) for name in names))

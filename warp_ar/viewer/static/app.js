@@ -6,6 +6,8 @@ import { Handles } from "./handles.js";
 import { Light } from "./light.js";
 import { Connection, downloadUrl } from "./net.js";
 import { QualityPanel, ScenePanel, TimePanel } from "./panels.js";
+import { Pointing } from "./pointing.js";
+import { SetupPanel } from "./setup.js";
 import { View } from "./view.js";
 
 const $ = (id) => document.getElementById(id);
@@ -17,6 +19,8 @@ const light = new Light($("latlong"), $("ball"), $("light-note"));
 const time = new TimePanel(connection);
 const scenePanel = new ScenePanel(connection, handles);
 const quality = new QualityPanel(connection, time);
+const setup = new SetupPanel(connection);
+const pointing = new Pointing($("handles"), connection, $("point-note"));
 let state = {};
 let scene = null;
 let camera = null;
@@ -42,9 +46,12 @@ const adopt = (next) => {
   handles.scene = scene;
   scenePanel.scene = scene;
   quality.scene = scene;
+  setup.scene = scene;
 };
 let waiting = null;
 connection.addEventListener("scene", ({ detail }) => {
+  showEdit("undo", detail.undo, "Undo", "Ctrl+Z");
+  showEdit("redo", detail.redo, "Do again", "Ctrl+Shift+Z");
   if (handles.busy) waiting = detail.scene;
   else adopt(detail.scene);
 });
@@ -53,6 +60,16 @@ handles.addEventListener("released", () => {
   waiting = null;
 });
 
+function showEdit(id, label, verb, keys) {
+  // A button that is switched off loses the focus, and the keyboard its place.
+  const button = $(id);
+  button.title = label ? `${verb}: ${label} (${keys})` : `Nothing to ${verb.toLowerCase()}`;
+  button.lastElementChild.textContent = label ? `${verb}: ${label}` : verb;
+  if (!label && document.activeElement === button) button.blur();
+  button.disabled = !label;
+}
+
+connection.addEventListener("setup", ({ detail }) => (setup.message = detail));
 connection.addEventListener("plan", ({ detail }) => (time.plan = detail));
 connection.addEventListener("budget", ({ detail }) => (quality.budget = detail));
 
@@ -60,6 +77,8 @@ connection.addEventListener("state", ({ detail }) => {
   const before = state;
   state = detail;
   quality.state = state;
+  setup.state = state;
+  if (before.lens !== state.lens) withdrawOffers(state.lens);
   $("play").setAttribute("aria-pressed", String(state.playing));
   $("play").lastElementChild.textContent = state.playing ? "Hold" : "Go on";
   $("record").setAttribute("aria-pressed", String(state.recording !== null));
@@ -97,8 +116,10 @@ connection.addEventListener("calibration", ({ detail }) => {
   $("coverage").style.gridTemplate = `repeat(${covered.length}, 1fr) / repeat(${covered[0]?.length ?? 1}, 1fr)`;
   $("coverage").replaceChildren(...covered.flat().map((seen) => Object.assign(document.createElement("i"), { className: seen ? "on" : "" })));
   const lines = [];
-  if (on) lines.push(`${views} of ${wanted} views. Hold the printed card before the camera, tilted another way each time, until every field of the picture is green.`);
-  else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${report.deviation.toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
+  const fields = covered.flat();
+  const enough = views >= wanted ? "enough" : `${wanted - views} more are good`;
+  if (on) lines.push(`${views} view${views === 1 ? "" : "s"} so far, ${enough}; ${fields.filter(Boolean).length} of ${fields.length} fields reached. Hold the printed card before the camera, tilted another way each time, until every field of the picture is green.`);
+  else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${report.deviation.toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Undo takes it back. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
   else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
   $("calibration-note").textContent = lines.join(" ");
 });
@@ -117,8 +138,9 @@ view.addEventListener("shown", ({ detail: frame }) => {
   light.pose = pose;
   light.draw();
   time.frame(frame);
+  setup.frame(frame);
   $("track-state").className = `chip ${frame.state ?? ""}`;
-  $("track-state").lastElementChild.textContent = frame.state === null ? (frame.plan ? "no marker needed" : "not lit yet") : { tracked: "marker found", held: "marker hidden", lost: "no marker" }[frame.state];
+  $("track-state").lastElementChild.textContent = frame.state === null ? (frame.plan ? "no marker needed" : "not lit yet") : { tracked: "marker found", held: "marker hidden", lost: "marker not seen" }[frame.state];
 });
 view.addEventListener("resize", () => $("figure").style.setProperty("--aspect", $("canvas").width / $("canvas").height));
 
@@ -135,17 +157,24 @@ function offer(text) {
   for (const old of document.querySelectorAll(".notice.offer")) old.remove();
   const box = notice(text);
   box.classList.add("offer");
+  // Told before the next state says so.
+  box.dataset.lens = text.includes("was estimated") ? "estimated" : "guessed";
   const button = document.createElement("button");
   button.textContent = "Calibrate";
   button.className = "go";
   button.onclick = () => {
     box.remove();
-    openTab($("tab-light"));
+    openTab($("tab-setup"));
     connection.send("calibrate", { step: "start" });
     $("calibrate").scrollIntoView({ block: "nearest" });
     $("calibrate").focus({ preventScroll: true });
   };
   box.lastElementChild.before(button);
+}
+
+/** What was offered for another state of the camera is no longer true. */
+function withdrawOffers(lens) {
+  for (const old of document.querySelectorAll(".notice.offer")) if (old.dataset.lens !== lens) old.remove();
 }
 
 function notice(text, bad = false) {
@@ -218,6 +247,12 @@ for (const button of document.querySelectorAll("[data-add]")) {
     connection.send("add", { part, kind });
   });
 }
+for (const button of document.querySelectorAll("[data-point]")) {
+  button.addEventListener("click", () => {
+    if (!pose) return notice("The marker must be seen before something can be pointed out: show it first.", true);
+    pointing.start(button.dataset.point, state.playing);
+  });
+}
 const tabs = [...document.querySelectorAll("[role=tab]")];
 const openTab = (tab) => {
   for (const one of tabs) {
@@ -243,6 +278,13 @@ $("split").addEventListener("input", (event) => {
 });
 $("play").addEventListener("click", () => connection.send("play", { on: !state.playing }));
 $("record").addEventListener("click", () => connection.send("record", { on: state.recording === null }));
+$("undo").addEventListener("click", () => connection.send("undo"));
+$("redo").addEventListener("click", () => connection.send("redo"));
+$("guide-go").addEventListener("click", () => {
+  openTab($("tab-setup"));
+  $("panel-setup").scrollIntoView({ block: "nearest" });
+  $("tab-setup").focus({ preventScroll: true });
+});
 $("reset").addEventListener("click", () => connection.send("reset"));
 $("show-handles").addEventListener("click", (event) => {
   const on = event.currentTarget.getAttribute("aria-pressed") !== "true";
@@ -264,6 +306,11 @@ $("calibrate").addEventListener("click", (event) => connection.send("calibrate",
 $("calibrate-finish").addEventListener("click", () => connection.send("calibrate", { step: "finish" }));
 
 document.addEventListener("keydown", (event) => {
+  const typing = event.target.closest("select, textarea, input:not([type=range])");
+  if ((event.ctrlKey || event.metaKey) && !event.altKey && !typing && ["z", "Z", "y"].includes(event.key)) {
+    connection.send(event.key === "y" || event.shiftKey ? "redo" : "undo");
+    return event.preventDefault();
+  }
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, textarea, summary")) return;
   const keys = { " ": "play", h: "show-handles", r: "record", f: "fullscreen" };
   if (event.key === " " && event.target.closest("button, [tabindex]:not(g)")) return;

@@ -54,10 +54,11 @@ export class Handles extends EventTarget {
   set selected(key) {
     this.#selected = key;
     for (const item of this.#items) item.group.classList.toggle("on", item.key === key);
+    if (this.#items.some((item) => item.part === "proxy")) this.#place();
   }
 
   set scene(scene) {
-    const shape = JSON.stringify([scene.objects.map((o) => o.shape), scene.lights.map((l) => [l.kind, !!l.target])]);
+    const shape = JSON.stringify([scene.objects.map((o) => o.shape), scene.lights.map((l) => [l.kind, !!l.target]), scene.proxies.map((p) => p.shape)]);
     const same = this.#scene && shape === this.#scene.shape;
     this.#scene = { ...scene, shape };
     if (!same) this.#rebuild();
@@ -72,12 +73,18 @@ export class Handles extends EventTarget {
   }
 
   #part(item) {
-    return item.part === "object" ? this.#scene.objects[item.index] : this.#scene.lights[item.index];
+    return this.#scene[{ object: "objects", light: "lights", proxy: "proxies" }[item.part]][item.index];
   }
 
   #rebuild() {
     this.#svg.replaceChildren();
     this.#items = [];
+    // Shapes of the desk first: they are large, and what stands on them is to be hit.
+    this.#scene.proxies.forEach((proxy, index) => {
+      const item = this.#group("proxy", index, `${proxy.shape} of the desk ${index + 1}`);
+      item.face = this.#grip(item, "at", make("path", { class: "face" }, item.group));
+      item.edge = make("path", { class: "edge" }, item.group);
+    });
     // Lights last: a light or its target over an object's ring is the smaller one to hit.
     this.#scene.objects.forEach((object, index) => {
       const item = this.#group("object", index, `${object.file ?? object.shape} ${index + 1}`);
@@ -134,7 +141,7 @@ export class Handles extends EventTarget {
 
   #place() {
     const shown = this.#visible && this.#camera && this.#pose && this.#scene;
-    this.#svg.style.visibility = shown ? "" : "hidden";
+    this.#svg.style.visibility = shown || this.#svg.classList.contains("pointing") ? "" : "hidden";
     if (!shown) return;
     const { width, height } = this.#camera;
     const box = `0 0 ${width} ${height}`;
@@ -143,9 +150,12 @@ export class Handles extends EventTarget {
     const unit = width / (this.#svg.clientWidth || width);
     for (const item of this.#items) {
       const part = this.#part(item);
-      item.group.style.display = part.visible ? "" : "none";
-      if (!part.visible) continue;
-      if (item.part === "object") this.#placeObject(item, part, unit);
+      // A shape of the desk shows its edges while it is chosen: it is there to be seen anyway.
+      const seen = part.visible && (item.part !== "proxy" || item.key === this.#selected);
+      item.group.style.display = seen ? "" : "none";
+      if (!seen) continue;
+      if (item.part === "proxy") this.#placeProxy(item, part);
+      else if (item.part === "object") this.#placeObject(item, part, unit);
       else this.#placeLight(item, part, unit);
     }
   }
@@ -157,7 +167,20 @@ export class Handles extends EventTarget {
     item.halo.setAttribute("d", path);
     const angle = (object.rotate[2] * Math.PI) / 180;
     const turn = project(this.#camera, this.#pose, [object.at[0] + radius * Math.cos(angle), object.at[1] + radius * Math.sin(angle), 0]);
-    for (const [element, size] of [[item.turn, 5.5], [item.turnHit, 18]]) put(element, turn, size * unit);
+    for (const [element, size] of [[item.turn, 5.5], [item.turnHit, 22]]) put(element, turn, size * unit);
+  }
+
+  #placeProxy(item, proxy) {
+    const path = (points, close) => {
+      const seen = points.map((point) => project(this.#camera, this.#pose, point));
+      return seen.every(Boolean) ? `M${seen.map(([x, y]) => `${(x + 0.5).toFixed(1)} ${(y + 0.5).toFixed(1)}`).join("L")}${close ? "Z" : ""}` : "";
+    };
+    const corners = proxyCorners(proxy);
+    const box = corners.length === 8;
+    const top = box ? corners.slice(4) : corners;
+    const uprights = box ? corners.slice(0, 4).map((corner, i) => path([corner, corners[i + 4]], false)).join("") : "";
+    item.edge.setAttribute("d", path(top, true) + (box ? path(corners.slice(0, 4), true) : "") + uprights);
+    item.face.setAttribute("d", path(top, true));
   }
 
   #placeLight(item, light, unit) {
@@ -176,7 +199,7 @@ export class Handles extends EventTarget {
     if (item.target) {
       const target = project(this.#camera, this.#pose, light.target);
       put(item.target, target, 4.5 * unit);
-      put(item.targetHit, target, 18 * unit);
+      put(item.targetHit, target, 22 * unit);
       line(item.beam, held, target);
     }
   }
@@ -198,7 +221,7 @@ export class Handles extends EventTarget {
     event.preventDefault();
     event.stopPropagation();
     const part = this.#part(item);
-    const point = item.part === "object" || grip === "floor" ? [part.at[0], part.at[1], 0] : grip === "target" ? part.target : this.#lightAt(part);
+    const point = item.part === "proxy" ? part.at : item.part === "object" || grip === "floor" ? [part.at[0], part.at[1], 0] : grip === "target" ? part.target : this.#lightAt(part);
     const seen = project(this.#camera, this.#pose, point) ?? [0, 0];
     const [u, v] = this.#pointer(event);
     this.#drag = { item, grip, point, off: [seen[0] - u, seen[1] - v], height: part.at[2], from: v };
@@ -257,7 +280,7 @@ export class Handles extends EventTarget {
 
   #turn(item, degrees) {
     const part = this.#part(item);
-    if (item.part === "object") this.#put(item, "rotate", [part.rotate[0], part.rotate[1], part.rotate[2] + degrees]);
+    if (item.part !== "light") this.#put(item, "rotate", [part.rotate[0], part.rotate[1], part.rotate[2] + degrees]);
   }
 
   #key(event, item) {
@@ -265,6 +288,7 @@ export class Handles extends EventTarget {
     const axes = deskAxes(this.#pose);
     const arrows = { ArrowRight: axes.right, ArrowLeft: axes.right.map((a) => -a), ArrowUp: axes.away, ArrowDown: axes.away.map((a) => -a) };
     const part = this.#part(item);
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (arrows[event.key]) {
       const [x, y] = arrows[event.key];
       if (part.kind === "directional") {
@@ -305,4 +329,19 @@ function line(element, from, to) {
   element.setAttribute("y1", from[1] + 0.5);
   element.setAttribute("x2", to[0] + 0.5);
   element.setAttribute("y2", to[1] + 0.5);
+}
+
+/** Corners of a plane (four) or a box (its base, then its top) in the world; none of a mesh. */
+export function proxyCorners({ shape, at, rotate, size }) {
+  if (shape === "mesh") return [];
+  const [a, b, c] = rotate.map((angle) => (angle * Math.PI) / 180);
+  const turned = ([x, y, z]) => {
+    [y, z] = [y * Math.cos(a) - z * Math.sin(a), y * Math.sin(a) + z * Math.cos(a)];
+    [x, z] = [x * Math.cos(b) + z * Math.sin(b), -x * Math.sin(b) + z * Math.cos(b)];
+    [x, y] = [x * Math.cos(c) - y * Math.sin(c), x * Math.sin(c) + y * Math.cos(c)];
+    return [x + at[0], y + at[1], z + at[2]];
+  };
+  const square = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) => [(x * size[0]) / 2, (y * size[1]) / 2]);
+  const levels = shape === "box" ? [-size[2] / 2, size[2] / 2] : [0];
+  return levels.flatMap((z) => square.map(([x, y]) => turned([x, y, z])));
 }

@@ -2,7 +2,7 @@
 
 import { lightColor } from "./handles.js";
 
-const el = (name, attributes = {}, ...children) => {
+export const el = (name, attributes = {}, ...children) => {
   const element = document.createElement(name);
   for (const [key, value] of Object.entries(attributes)) {
     if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
@@ -25,22 +25,35 @@ const toHex = (color) => "#" + color.map((c) => Math.round(255 * Math.pow(Math.m
 const fromHex = (hex) => [1, 3, 5].map((i) => Math.round(1e4 * Math.pow(parseInt(hex.slice(i, i + 2), 16) / 255, 2.2)) / 1e4);
 const shown = (value) => Math.abs(value) < 5e-4 ? "0" :  (Math.abs(value) >= 100 ? value.toFixed(0) : Math.abs(value) >= 10 ? value.toFixed(1) : value.toFixed(3).replace(/\.?0+$/, "") || "0");
 
-/** A row of label, slider and number; `curve` above 1 spreads the slider's low end. */
-function slider(label, { low, high, curve = 1, step = 0.001 }, value, change) {
-  const range = el("input", { type: "range", min: "0", max: "1000", "aria-label": label });
-  const number = el("input", { type: "number", step: String(step), "aria-label": label });
+const MM = { unit: "mm", factor: 1000 };
+const DEGREES = { unit: "°" };
+
+/**
+ * A row of label, slider, number and unit. `curve` above 1 spreads the slider's low end; what is shown is `factor` times
+ * the value.
+ */
+function slider(label, { low, high, curve = 1, step = 0.001, unit = "", factor = 1 }, value, change) {
+  const name = unit ? `${label} in ${{ mm: "millimetres", "°": "degrees", "×": "times" }[unit] ?? unit}` : label;
+  const range = el("input", { type: "range", min: "0", max: "1000", "aria-label": name });
+  const number = el("input", { type: "number", step: String(Number((step * factor).toPrecision(6))), "aria-label": name });
   const place = (v) => {
     range.value = 1000 * Math.pow(Math.min(Math.max((v - low) / (high - low), 0), 1), 1 / curve);
-    if (document.activeElement !== number) number.value = shown(v);
+    range.setAttribute("aria-valuetext", `${shown(v * factor)} ${unit}`);
+    if (document.activeElement !== number) number.value = shown(v * factor);
   };
   range.addEventListener("input", () => {
     const v = low + (high - low) * Math.pow(range.value / 1000, curve);
     const near = Math.round(v / step) * step;
-    if (document.activeElement !== number) number.value = shown(near);
+    range.setAttribute("aria-valuetext", `${shown(near * factor)} ${unit}`);
+    if (document.activeElement !== number) number.value = shown(near * factor);
     change(near);
   });
-  number.addEventListener("change", () => Number.isFinite(number.valueAsNumber) && (change(number.valueAsNumber), place(number.valueAsNumber)));
-  const row = el("div", { class: "row" }, el("span", {}, label), range, number);
+  number.addEventListener("change", () => {
+    if (!Number.isFinite(number.valueAsNumber)) return;
+    change(number.valueAsNumber / factor);
+    place(number.valueAsNumber / factor);
+  });
+  const row = el("div", { class: "row" }, el("span", {}, label), range, number, el("span", { class: "unit", "aria-hidden": "true" }, unit));
   row.place = place;
   place(value);
   return row;
@@ -53,7 +66,9 @@ function color(label, value, change) {
   return el("div", { class: "row" }, el("span", {}, label), input);
 }
 
-const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror" };
+const shapeName = (proxy) => (proxy.shape === "plane" && proxy.rotate[0] ? "wall" : proxy.shape === "plane" ? "plane" : proxy.file?.replace(/\.\w+$/, "") ?? proxy.shape);
+
+const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", file: "The file's own" };
 const EFFECTS = {
   objects: ["Virtual objects", ""],
   lights: ["Virtual lights", ""],
@@ -76,6 +91,8 @@ export class ScenePanel {
     this.#handles = handles;
     this.parts = document.getElementById("parts");
     this.inspector = document.getElementById("inspector");
+    this.proxies = document.getElementById("proxies");
+    this.proxyInspector = document.getElementById("proxy-inspector");
     handles.addEventListener("select", ({ detail }) => this.select(detail, false));
     handles.addEventListener("edited", ({ detail }) => detail === this.#selected && this.#fill());
   }
@@ -83,21 +100,34 @@ export class ScenePanel {
   select(key, tellHandles = true) {
     this.#selected = key;
     if (tellHandles) this.#handles.selected = key;
-    for (const item of this.parts.children) item.classList.toggle("on", item.dataset.key === key);
+    this.#mark();
     this.#inspect();
+  }
+
+  #mark() {
+    for (const item of [...this.parts.children, ...this.proxies.children]) {
+      item.classList.toggle("on", item.dataset.key === this.#selected);
+      item.querySelector(".pick")?.setAttribute("aria-current", String(item.dataset.key === this.#selected));
+    }
   }
 
   set scene(scene) {
     this.#scene = scene;
+    const focused = document.activeElement?.closest?.("[data-key] > button");
+    const back = focused && [focused.closest("[data-key]").dataset.key, focused.className];
     const entries = [...scene.objects.map((o, i) => ["object", i, o]), ...scene.lights.map((l, i) => ["light", i, l])];
     this.parts.replaceChildren(...entries.map(([part, index, item]) => this.#entry(part, index, item)));
     if (!entries.length) this.parts.append(el("li", { class: "note" }, "Nothing yet: add an object or a light."));
-    if (!this.#selected || !this.parts.querySelector(`[data-key="${this.#selected}"]`)) {
+    this.proxies.replaceChildren(...scene.proxies.map((proxy, index) => this.#entry("proxy", index, proxy)));
+    const known = (key) => document.querySelector(`:is(#parts, #proxies) [data-key="${key}"]`);
+    if (!this.#selected || !known(this.#selected)) {
       this.#selected = entries.length ? `${entries[0][0]} ${entries[0][1]}` : null;
       this.#handles.selected = this.#selected;
     }
-    for (const item of this.parts.children) item.classList.toggle("on", item.dataset.key === this.#selected);
-    const inside = this.inspector.contains(document.activeElement);
+    this.#mark();
+    // The list is made anew: whoever was at one of its buttons stays there.
+    if (back) (known(back[0])?.querySelector(`.${back[1]}`) ?? this.parts.querySelector(".pick"))?.focus({ preventScroll: true });
+    const inside = this.inspector.contains(document.activeElement) || this.proxyInspector.contains(document.activeElement);
     const shape = JSON.stringify([scene.name, this.#selected, this.#item() && Object.keys(this.#item()), this.#item()?.material?.model, this.#item()?.target === null]);
     if (shape !== this.#shape || !inside) this.#inspect();
     this.#shape = shape;
@@ -107,12 +137,12 @@ export class ScenePanel {
 
   #entry(part, index, item) {
     const key = `${part} ${index}`;
-    const tint = part === "light" ? item.color : item.material.base_color ?? item.material.diffuse;
+    const tint = part === "light" ? item.color : part === "proxy" ? null : item.material.base_color ?? item.material.diffuse;
     const dot = el("i", { class: part });
     const css = Array.isArray(tint) ? (part === "light" ? lightColor(tint) : toHex(tint)) : "#999";
     dot.style.background = css;
     dot.style.setProperty("--c", css);
-    const name = part === "light" ? { point: "Point light", spot: "Spotlight", directional: "Sun" }[item.kind] : item.file?.replace(/\.\w+$/, "") ?? item.shape;
+    const name = part === "proxy" ? shapeName(item) : part === "light" ? { point: "Point light", spot: "Spotlight", directional: "Sun" }[item.kind] : item.file?.replace(/\.\w+$/, "") ?? item.shape;
     const title = name[0].toUpperCase() + name.slice(1);
     const entry = el("li", { class: item.visible ? "" : "off" },
       el("button", { class: "pick", onclick: () => this.select(key) }, dot, title),
@@ -126,7 +156,7 @@ export class ScenePanel {
   #item() {
     if (!this.#selected || !this.#scene) return null;
     const [part, index] = this.#selected.split(" ");
-    return (part === "object" ? this.#scene.objects : this.#scene.lights)[index] ?? null;
+    return this.#scene[{ object: "objects", light: "lights", proxy: "proxies" }[part]][index] ?? null;
   }
 
   /** Bring the numbers of the inspector up to date with a drag. */
@@ -136,7 +166,9 @@ export class ScenePanel {
 
   #inspect() {
     const item = this.#item();
-    if (!item) return this.inspector.replaceChildren();
+    this.inspector.replaceChildren();
+    this.proxyInspector.replaceChildren();
+    if (!item) return;
     const [part, number] = this.#selected.split(" ");
     const index = Number(number);
     const set = (key, value, holder = item) => {
@@ -150,19 +182,30 @@ export class ScenePanel {
       set(key, changed);
     };
     const rows = [];
+    if (part === "proxy") return this.proxyInspector.replaceChildren(...this.#proxy(item, along));
     if (item.kind !== "directional") {
-      rows.push(slider("Height", { low: part === "light" ? 0.01 : 0, high: part === "light" ? 1 : 0.3, curve: 1.6 }, item.at[2], along("at", 2)));
+      rows.push(slider("Height", { low: part === "light" ? 0.01 : 0, high: part === "light" ? 1 : 0.3, curve: 1.6, ...MM }, item.at[2], along("at", 2)));
     }
     if (part === "object") rows.push(...this.#object(item, set, along));
     else rows.push(...this.#light(item, set));
     this.inspector.replaceChildren(...rows);
   }
 
+  /** Sizes and place of a shape of the desk. */
+  #proxy(item, along) {
+    const sides = item.shape === "box" ? ["Width", "Depth", "Height"] : item.rotate[0] ? ["Width", "Height"] : ["Width", "Depth"];
+    const sizes = item.size.map((size, axis) => slider(sides[axis], { low: 0.005, high: Math.max(0.6, 1.5 * size), curve: 2, ...MM }, size, along("size", axis)));
+    const places = ["Right", "Away", "Up"].map((label, axis) => slider(label, { low: axis < 2 ? -0.8 : 0, high: axis < 2 ? 0.8 : 0.4, ...MM }, item.at[axis], along("at", axis)));
+    return [...places, ...sizes, slider("Turn", { low: -180, high: 180, step: 1, ...DEGREES }, ((item.rotate[2] + 540) % 360) - 180, along("rotate", 2))];
+  }
+
   #object(item, set, along) {
     const { material } = item;
-    const rows = [slider("Turn", { low: -180, high: 180, step: 1 }, ((item.rotate[2] + 540) % 360) - 180, along("rotate", 2))];
+    const rows = [slider("Turn", { low: -180, high: 180, step: 1, ...DEGREES }, ((item.rotate[2] + 540) % 360) - 180, along("rotate", 2))];
     const scale = item.scale;
-    rows.push(slider("Size", { low: scale * 0.25, high: scale * 2.5, step: scale / 200 }, scale, (value) => set("scale", value)));
+    // A size that can be held against a ruler: twice the reach, which grows with the scale.
+    const across = (2000 * item.reach) / scale;
+    rows.push(slider("Size", { low: scale * 0.25, high: scale * 2.5, step: scale / 200, unit: "mm", factor: across }, scale, (value) => set("scale", value)));
     const model = el("select", { "aria-label": "Material", onchange: () => set("model", model.value, {}) },
       ...Object.entries(MODELS).map(([value, text]) => el("option", { value, selected: value === material.model }, text)));
     rows.push(el("div", { class: "row" }, el("span", {}, "Material"), model));
@@ -181,10 +224,10 @@ export class ScenePanel {
     const high = item.kind === "spot" ? 12 : item.kind === "point" ? 3 : 6;
     rows.push(slider("Intensity", { low: 0, high: Math.max(high, item.intensity), curve: 2, step: 0.005 }, item.intensity, (value) => set("intensity", value)));
     if (item.kind === "spot") {
-      rows.push(slider("Inner cone", { low: 0, high: 60, step: 0.5 }, item.inner_angle, (v) => set("inner_angle", Math.min(v, item.outer_angle))));
-      rows.push(slider("Outer cone", { low: 1, high: 80, step: 0.5 }, item.outer_angle, (v) => set("outer_angle", Math.max(v, item.inner_angle))));
+      rows.push(slider("Inner cone", { low: 0, high: 60, step: 0.5, ...DEGREES }, item.inner_angle, (v) => set("inner_angle", Math.min(v, item.outer_angle))));
+      rows.push(slider("Outer cone", { low: 1, high: 80, step: 0.5, ...DEGREES }, item.outer_angle, (v) => set("outer_angle", Math.max(v, item.inner_angle))));
     }
-    if (item.kind !== "directional") rows.push(slider("Softness", { low: 0, high: 0.1, curve: 2 }, item.radius, (value) => set("radius", value)));
+    if (item.kind !== "directional") rows.push(slider("Softness", { low: 0, high: 0.1, curve: 2, ...MM }, item.radius, (value) => set("radius", value)));
     return rows;
   }
 
@@ -206,7 +249,7 @@ export class ScenePanel {
     if (holder.contains(document.activeElement) && document.activeElement.type === "range" && scene.exposure !== "auto") return;
     const auto = scene.exposure === "auto";
     const set = (value) => this.#connection.set("exposure", 0, "scale", value);
-    const row = slider("Scale", { low: 0, high: 2, step: 0.01 }, auto ? 1 : scene.exposure, set);
+    const row = slider("Scale", { low: 0, high: 2, step: 0.01, unit: "×" }, auto ? 1 : scene.exposure, set);
     row.querySelectorAll("input").forEach((input) => (input.disabled = auto));
     const flip = el("button", { class: "switch", role: "switch", id: "exposure-auto", "aria-checked": String(auto), "aria-label": "Automatic exposure",
       onclick: () => set(auto ? 1 : "auto") });
@@ -333,6 +376,7 @@ export class TimePanel {
 const BUDGET = { low: 1, high: 1000 }; // milliseconds
 const AIM = 0.9; // the share of a budget that the program plans for
 const share = (ms) => Math.min(Math.max(Math.log(ms / BUDGET.low) / Math.log(BUDGET.high / BUDGET.low), 0), 1);
+const duration = (seconds) => (seconds < 90 ? `${Math.max(Math.round(seconds / 5) * 5, 5)} s` : `${Math.round(seconds / 60)} minutes`);
 const brief = (ms) => ms.toFixed(ms < 10 ? 1 : 0);
 const SVG = "http://www.w3.org/2000/svg";
 const shape = (name, attributes, text = "") => {
@@ -444,9 +488,12 @@ export class QualityPanel {
   }
 
   #note(bought) {
-    const { measuring } = this.#budget ?? {};
-    if (typeof measuring === "number") return `Measuring what each method costs on this device, once: ${Math.round(100 * measuring)} %. The picture is slower meanwhile.`;
-    if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once, in about half a minute.";
+    const { measuring, remaining } = this.#budget ?? {};
+    if (typeof measuring === "number") {
+      const left = remaining === null || remaining === undefined ? "" : `, about ${duration(remaining)} left`;
+      return `Measuring what each method costs on this device, once: ${Math.round(100 * measuring)} %${left}. The picture is slower meanwhile.`;
+    }
+    if (!bought) return "The program then chooses the methods that err least within this time. What each costs on this device is measured once; how long that takes is told as soon as it is known.";
     const { choice, took, fits } = bought;
     if (this.#budget.choices.every((one) => one.error === 0)) return "What these methods err is not in the cost table, so the cheapest are taken: python -m warp_ar.tradeoff makes one.";
     const parts = [`${this.#on ? "This buys" : "This would buy"} about ${brief(took(choice))} ms a frame, ${error(choice.error)} off the best that can be had.`];

@@ -1,0 +1,116 @@
+"""What a quality loses against path tracing in the same light, and what both lose against the truth.
+
+    python -m bench.judge SCENE ... [--quality high,medium] [--frame N] [--samples N] [--width N] [--light FILE]
+
+SCENE is a bundled scene, or the scene file of a case of truth (``scene_VERSION.toml`` beside ``VERSION/NNNN.png``). The
+frames up to N run through the pipeline; its picture of that frame, averaged down, is compared with the reference that
+follows paths in the light that the pipeline had. One JSON line per scene and quality:
+
+  nothing    mean FLIP of the camera's frame to the reference, where the reference differs from it
+  lost       the same of the pipeline's picture
+  half       the same between the reference's first and second half of samples: its noise, twice over
+  kept       lost / nothing
+  truth_*    kept of the error to the truth, by the pipeline and by the reference
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bench.common import commit
+from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
+from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.scene import Scene, load_scene
+from warp_ar.session import with_light
+
+Image = npt.NDArray[np.uint8]
+
+
+def averaged(image: Image, size: tuple[int, int]) -> Image:
+    """A picture at another size."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def truth_of(scene: Scene, frame: int) -> Image | None:
+    """What the camera would have seen, if the scene is a case of truth that has this frame."""
+    if scene.path is None or not scene.path.stem.startswith("scene_"):
+        return None
+    path = scene.path.parent / scene.path.stem.removeprefix("scene_") / f"{frame:04d}.png"
+    image = cv2.imread(str(path))
+    return None if image is None else np.asarray(image[..., ::-1], np.uint8)
+
+
+def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, device: str) -> dict[str, Any]:
+    """Errors of one quality on one scene."""
+    camera = known.scene.camera
+    size = (width, width * camera.height // camera.width)
+    frame, lit = averaged(known.image, size), averaged(known.lit, size)
+    halves = []
+    for seed in (0, 1):
+        tracer = known.tracer(device=device, size=size, seed=seed)
+        tracer.sample(samples // 2)
+        halves.append(tracer.picture())
+    linear = 0.5 * (halves[0].radiance + halves[1].radiance)
+    reference = encoded(linear, known)
+    region = changed_region(frame, reference)
+    nothing, lost = (float(flip_map(reference, image)[region].mean()) for image in (frame, lit))
+    row: dict[str, Any] = {
+        "nothing": round(nothing, 4),
+        "lost": round(lost, 4),
+        "half": round(float(flip_map(halves[0].image, halves[1].image)[region].mean()), 4),
+        "kept": round(lost / nothing, 3),
+        "seconds": round(sum(half.seconds for half in halves), 1),
+        "pipeline_ms": round(known.milliseconds, 1),
+    }
+    if truth is not None:
+        true = averaged(truth, size)
+        changed = changed_region(frame, true)
+        before = flip_map(true, frame)[changed].mean()
+        for name, image in (("pipeline", lit), ("reference", reference)):
+            row[f"truth_{name}"] = round(float(flip_map(true, image)[changed].mean() / before), 3)
+    return row
+
+
+def encoded(radiance: npt.NDArray[np.float32], known: KnownFrame) -> Image:
+    """Codes of linear radiance by the camera's transfer."""
+    from warp_ar.kernels.color import decode_table
+
+    table = decode_table(known.scene.camera.transfer)
+    edges = 0.5 * (table[:-1] + table[1:])
+    codes = [np.searchsorted(edges[:, c], radiance[..., c], side="right") for c in range(3)]
+    return np.stack(codes, axis=-1).astype(np.uint8)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.judge", description="Qualities judged by path tracing.")
+    parser.add_argument("scenes", nargs="+", metavar="SCENE")
+    parser.add_argument("--quality", default="high,medium", help="several are separated by commas")
+    parser.add_argument("--frame", type=int, default=6)
+    parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--width", type=int, default=240, help="of the pictures that are compared")
+    parser.add_argument("--light", help="captured light instead of the ball's")
+    parser.add_argument("--device", default="auto")
+    options = parser.parse_args()
+    for name in options.scenes:
+        scene = load_scene(Path(name) if "/" in name else name)
+        if options.light is not None:
+            scene = with_light(scene, options.light)
+        for quality in options.quality.split(","):
+            known = light_up_to(scene, options.frame, quality=quality, device=options.device)
+            truth = truth_of(scene, options.frame)
+            row = judge(known, truth, options.width, options.samples, options.device)
+            about = {"scene": scene.name, "quality": quality, "light": "given" if options.light else "own"}
+            print(json.dumps({**about, **row, "samples": options.samples, "commit": commit()}), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

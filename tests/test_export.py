@@ -1,0 +1,102 @@
+"""The command that writes shots: its files, and one line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from tests.test_live import message, write_scene
+from warp_ar import export
+from warp_ar.output.sinks import read_environment
+from warp_ar.scene.pose_file import load_poses
+
+
+def run(*arguments: object) -> int:
+    return export.main([str(argument) for argument in ("--device", "cpu", *arguments)])
+
+
+@pytest.fixture
+def clip(tmp_path: pathlib.Path) -> pathlib.Path:
+    """A scene whose frames lie in a folder."""
+    import cv2
+
+    from warp_ar.input.sources import Synthetic
+
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    with Synthetic("card") as card:
+        for index, frame in zip(range(3), card, strict=False):
+            cv2.imwrite(str(frames / f"{index:04d}.png"), frame.image[..., ::-1])
+    return write_scene(tmp_path, source='path = "frames"\nfps = 25.0')
+
+
+def test_a_shot_is_written_with_its_light(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(clip, "--output", out / "shot.glb", "--stmaps") == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "shot.glb",
+        "shot_distort.exr",
+        "shot_environment.exr",
+        "shot_undistort.exr",
+    ]
+    assert capsys.readouterr().out.splitlines()[0] == "3 frames"
+    assert np.isfinite(read_environment(out / "shot_environment.exr")).all()
+    data = (out / "shot.glb").read_bytes()
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert tree["asset"]["extras"] == {"plate": "../frames", "fps": 25.0, "environment": "shot_environment.exr"}
+    # A second time its own files are replaced.
+    assert run(clip, "--output", out / "shot.glb") == 0
+    assert "is replaced: this program wrote it before" in capsys.readouterr().err
+
+
+def test_a_way_comes_back_as_poses(clip: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    assert run(clip, "--output", tmp_path / "way.jsonl", "--frames", 2) == 0
+    assert not (tmp_path / "way_environment.exr").exists()
+    assert len(load_poses(tmp_path / "way.jsonl")) == 2
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    assert run(clip, "--output", tmp_path / "way.usda", "--frames", 2, "--no-environment") == 0
+    for one, other in zip(load_poses(tmp_path / "way.usda"), load_poses(tmp_path / "way.jsonl"), strict=True):
+        np.testing.assert_allclose(np.concatenate(one), np.concatenate(other), atol=1e-9)
+    assert run(clip, "--output", tmp_path / "way.usda", "--frames", 1, "--no-environment") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--output", "shot.fbx"), "--output shot.fbx ends in '.fbx'; use .usda, .usdc, .usd, .glb, .jsonl"),
+        (("--output", "shot.glb", "--frames", "0"), "--frames 0: expected a number of frames, 1 or more"),
+        (("--output", "shot.glb", "--source", "missing"), "missing"),
+    ],
+)
+def test_what_cannot_be_is_said(
+    clip: pathlib.Path, tmp_path: pathlib.Path, monkeypatch, capsys, arguments: tuple, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(clip, *arguments) != 0
+    assert words in message(capsys)
+
+
+def test_frames_without_a_marker_have_no_way(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
+    import cv2
+
+    for path in (tmp_path / "frames").iterdir():
+        cv2.imwrite(str(path), np.full((480, 640, 3), 128, np.uint8))
+    assert run(clip, "--output", tmp_path / "shot.glb", "--no-environment") == 1
+    assert "no frame shows the marker" in message(capsys)
+    assert not (tmp_path / "shot.glb").exists()
+
+
+def test_files_of_others_stay(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
+    (tmp_path / "shot.glb").write_bytes(b"somebody's")
+    assert run(clip, "--output", tmp_path / "shot.glb", "--no-environment") == 1
+    assert "this program did not write it" in message(capsys)
+    assert run(clip, "--output", tmp_path / "shot.glb", "--no-environment", "--overwrite", "--frames", 1) == 0
+
+
+def test_usd_without_its_library_is_named(clip: pathlib.Path, tmp_path: pathlib.Path, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pxr", None)
+    assert run(clip, "--output", tmp_path / "shot.usda") == 2
+    assert 'USD files need usd-core; install it with pip install "warp-ar[exchange]"' in message(capsys)

@@ -1,0 +1,133 @@
+"""Variations of a data set: seeded, clear of each other and of the marker, resting on the desk."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.farm_rig import make_jobs
+from warp_ar.farm.draws import NoPlace, _overlap, desk_of, draw_variation, local_points
+from warp_ar.scene import Pose, load_scene
+from warp_ar.scene.geometry import rotation_matrix
+
+OBJECTS = [
+    {"shape": "sphere", "radius": 0.02},
+    {"shape": "box", "size": [0.03, 0.05, 0.02], "rest": "any"},
+    {"shape": "torus", "major_radius": 0.02, "minor_radius": 0.006, "scale": 1.5},
+]
+LIGHT = {"kind": "spot", "at": [[-0.3, -0.3, 0.3], [0.3, 0.3, 0.5]], "intensity": [0.5, 2.0]}
+MARGIN = 0.004
+ROUNDED = 2e-6
+"""Metres by which a hull of single-precision points, and a place rounded to a micrometre, may be off."""
+
+
+def looking_down(x: float, y: float, height: float = 0.6) -> Pose:
+    """A camera above (x, y) that looks at the origin."""
+    place = np.array([x, y, height])
+    forward = -place / np.linalg.norm(place)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Pose(rotation, -rotation @ place)
+
+
+POSES = [looking_down(0.5 * np.cos(a), 0.5 * np.sin(a)) for a in np.linspace(-2.2, -0.9, 5)]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    section = {"variations": 5, "seed": 3, "objects": [2, 4], "margin": MARGIN, "object": OBJECTS, "light": [LIGHT]}
+    return make_jobs(tmp_path_factory.mktemp("jobs"), [{"scene": "desk"}], dataset=section).dataset
+
+
+@pytest.fixture(scope="module")
+def drawn(dataset):
+    return [draw_variation(load_scene("desk"), dataset, 0, number, POSES) for number in range(12)]
+
+
+def points_of(item):
+    return item.scale * local_points(item) @ rotation_matrix(item.rotate).T + np.array(item.at)
+
+
+def hull(points):
+    return cv2.convexHull(points[:, :2].astype(np.float32)).reshape(-1, 2).astype(float)
+
+
+def test_a_seed_gives_one_scene_whoever_draws_it(dataset, drawn):
+    assert draw_variation(load_scene("desk"), dataset, 0, 7, POSES) == drawn[7]
+    assert len({variation.scene.objects for variation in drawn}) == len(drawn)
+    assert draw_variation(load_scene("desk"), dataset, 1, 7, POSES) != drawn[7]
+
+
+def test_numbers_of_objects_and_lights_are_as_asked(drawn):
+    assert {len(variation.scene.objects) for variation in drawn} <= {2, 3, 4}
+    assert {len(variation.scene.lights) for variation in drawn} == {1}
+    assert {kind for variation in drawn for kind in variation.kinds} == {0, 1, 2}
+
+
+def test_every_object_rests_on_the_desk(dataset, drawn):
+    height = desk_of(load_scene("desk"), dataset).height
+    assert height == -0.0004
+    for item in (item for variation in drawn for item in variation.scene.objects):
+        assert points_of(item)[:, 2].min() == pytest.approx(height, abs=ROUNDED)
+
+
+def test_objects_are_apart_from_each_other_and_from_the_desk(dataset, drawn):
+    taken = desk_of(load_scene("desk"), dataset).taken
+    assert len(taken) == 3, "the tin, the ball and the marker's card"
+    for variation in drawn:
+        outlines = [hull(points_of(item)) for item in variation.scene.objects]
+        for a, b in itertools.combinations(outlines, 2):
+            assert distance(a, b) >= MARGIN - ROUNDED
+        for a, b in itertools.product(outlines, taken):
+            assert distance(a, b) >= MARGIN - ROUNDED
+
+
+def distance(a, b):
+    """Between two convex outlines: along the best of many directions, from above by less than a thousandth."""
+    turn = np.linspace(0, 2 * np.pi, 2000)
+    axis = np.stack([np.cos(turn), np.sin(turn)])
+    return float(((a @ axis).min(0) - (b @ axis).max(0)).max())
+
+
+def test_no_object_hides_the_marker_from_any_camera(drawn):
+    camera = load_scene("desk").camera
+    square = 0.04 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+
+    def pixels(pose, points):
+        return cv2.projectPoints(pose.apply(points), np.zeros(3), np.zeros(3), camera.matrix(), None)[0].reshape(-1, 2)
+
+    for variation, pose in itertools.product(drawn, POSES):
+        marker = hull(pixels(pose, square))
+        for item in variation.scene.objects:
+            assert not _overlap(hull(pixels(pose, points_of(item))), marker)
+
+
+def test_outlines_overlap_where_no_side_separates_them():
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    assert _overlap(square, square + 0.9)
+    assert not _overlap(square, square + 1.1)
+    diamond = np.array([[0, -1], [1, 0], [0, 1], [-1, 0]], float)
+    assert not _overlap(square, diamond + 1.8)
+    assert _overlap(square, diamond + 1.4)
+
+
+def test_too_many_objects_for_the_region_are_told(tmp_path):
+    section = {"objects": [9, 9], "region": [0.1, -0.12, 0.18, -0.05], "object": [OBJECTS[0]]}
+    dataset = make_jobs(tmp_path, [{"scene": "desk"}], dataset=section).dataset
+    with pytest.raises(NoPlace, match=r"of 9 objects find a place .* enlarge dataset.region"):
+        draw_variation(load_scene("desk"), dataset, 0, 0, POSES)
+
+
+def test_any_way_up_is_any_way_up_evenly():
+    """The mean of a rotation over all of them is zero; a third of 1 is each entry's variance."""
+    from warp_ar.farm.draws import _angles, _random_rotation
+
+    random = np.random.default_rng(5)
+    turns = [_random_rotation(random) for _ in range(3000)]
+    assert np.abs(np.mean(turns, 0)).max() < 5 * np.sqrt(1 / 3 / len(turns))
+    for turn in turns[:50]:
+        assert np.abs(rotation_matrix(_angles(turn)) - turn).max() < 1e-5

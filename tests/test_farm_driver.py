@@ -1,0 +1,232 @@
+"""The driver against workers that do, fail, crash and are killed as a test says."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import pytest
+
+from tests.farm_rig import make_jobs
+from warp_ar.farm.driver import INTERRUPTIONS, Driver
+from warp_ar.farm.jobs import Job
+from warp_ar.farm.manifest import RECORD, Manifest, RunError
+from warp_ar.farm.pool import Event
+from warp_ar.farm.work import Outcome
+
+VERSION = "warp_ar 1"
+FRAMES = 10
+
+
+class Workers:
+    """A pool whose workers do as ``behave(job, how often it was given before)`` says: an outcome or an exit code."""
+
+    def __init__(self, jobs, folder, behave=lambda job, before: None, size=3, version=VERSION):
+        self.size, self.names = size, ["cpu"] * size
+        self.jobs, self.folder, self.behave, self.version = jobs, folder, behave, version
+        self.events = [Event(worker, "ready", version) for worker in range(size)]
+        self.given: list[Job] = []
+        self.most = 0
+        self.closed = False
+
+    def give(self, worker, job, arguments):
+        before = self.given.count(job)
+        self.given.append(job)
+        said = self.behave(job, before)
+        if isinstance(said, int):
+            self.events += [Event(worker, "died", said), Event(worker, "ready", self.version)]
+            return
+        if said is None:
+            said = self.do(job)
+        self.events.append(Event(worker, "outcome", said))
+
+    def do(self, job):
+        place = self.folder / job.place(self.jobs)
+        if job.kind in ("join", "index"):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text("")
+        else:
+            place.mkdir(parents=True)
+            (place / RECORD).write_text(json.dumps({"job": job.key(self.jobs), "bytes": 1}))
+        return Outcome(
+            "done", {"length": FRAMES, "found": FRAMES} if job.kind == "survey" else {"frames": 2, "bytes": 1}
+        )
+
+    def wait(self, seconds):
+        self.most = max(self.most, len(self.events))
+        events, self.events = self.events, []
+        return events
+
+    def close(self):
+        self.closed = True
+
+
+def drive(jobs, folder, behave=lambda job, before: None, **options):
+    folder.mkdir(exist_ok=True)
+    manifest = Manifest(folder, write=True)
+    pool = Workers(jobs, folder, behave, **options)
+    said: list[str] = []
+    try:
+        summary = Driver(jobs, folder, manifest, pool, VERSION, said.append).run()
+    finally:
+        manifest.close()
+        assert pool.closed
+    return pool, summary, said
+
+
+@pytest.fixture
+def jobs(tmp_path):
+    return make_jobs(tmp_path, [{"name": "a"}, {"name": "b"}, {"name": "c"}], run={"segment_frames": 2})
+
+
+def keys(jobs, given):
+    return [job.key(jobs) for job in given]
+
+
+def test_every_job_is_given_once_and_joined_last(jobs, tmp_path):
+    pool, summary, _ = drive(jobs, tmp_path / "run")
+    given = keys(jobs, pool.given)
+    assert len(given) == len(set(given)) == 3 * (1 + 5 + 1)
+    for name in "abc":
+        mine = [key for key in given if key.startswith(name)]
+        assert (mine[0], mine[-1]) == (f"{name}/survey", f"{name}/join")
+    assert not summary.failed
+    assert pool.most == 3, "all workers must have been busy at once"
+
+
+def test_a_finished_run_has_nothing_left(jobs, tmp_path):
+    drive(jobs, tmp_path / "run")
+    pool, summary, _ = drive(jobs, tmp_path / "run")
+    assert pool.given == []
+    assert not summary.failed
+
+
+def test_a_poisoned_job_fails_alone_after_two_tries(jobs, tmp_path):
+    def behave(job, before):
+        return Outcome("failed", reason="frame 3 cannot be decoded") if job == Job("segment", 1, 2, 4, 6) else None
+
+    pool, summary, said = drive(jobs, tmp_path / "run", behave)
+    given = keys(jobs, pool.given)
+    assert given.count("b/segment-000002") == 2
+    assert summary.failed == {"b/segment-000002": "frame 3 cannot be decoded"}
+    assert said == ["b/segment-000002 failed: frame 3 cannot be decoded"]
+    assert "b/join" not in given
+    assert {"a/join", "c/join"} <= set(given)
+    # It stays failed until it is asked for again.
+    assert drive(jobs, tmp_path / "run")[0].given == []
+
+
+def test_a_survey_that_fails_takes_only_its_clip(jobs, tmp_path):
+    pool, summary, _ = drive(
+        jobs, tmp_path / "run", lambda job, _: Outcome("failed", reason="cut off") if job == Job("survey", 0) else None
+    )
+    assert summary.failed == {"a/survey": "cut off"}
+    assert [key for key in keys(jobs, pool.given) if key.startswith("a")] == ["a/survey", "a/survey"]
+
+
+def test_a_second_try_may_succeed(jobs, tmp_path):
+    pool, summary, _ = drive(
+        jobs,
+        tmp_path / "run",
+        lambda job, before: Outcome("failed", reason="once") if job.kind == "join" and not before else None,
+    )
+    assert not summary.failed
+    assert keys(jobs, pool.given).count("a/join") == 2
+
+
+def test_a_job_that_crashes_its_worker_fails_after_two_tries(jobs, tmp_path):
+    crashing = Job("segment", 0, 1, 2, 4)
+    pool, summary, _ = drive(jobs, tmp_path / "run", lambda job, _: -signal.SIGSEGV if job == crashing else None)
+    assert pool.given.count(crashing) == 2
+    assert summary.failed == {"a/segment-000001": "its worker was ended by SIGSEGV"}
+
+
+def test_kills_from_outside_are_no_tries(jobs, tmp_path):
+    killed = Job("segment", 0, 1, 2, 4)
+
+    def behave(job, before):
+        return -signal.SIGKILL if job == killed and before < INTERRUPTIONS - 1 else None
+
+    pool, summary, _ = drive(jobs, tmp_path / "run", behave)
+    assert not summary.failed
+    assert pool.given.count(killed) == INTERRUPTIONS
+
+
+def test_a_job_that_is_always_killed_fails_in_the_end(jobs, tmp_path):
+    killed = Job("segment", 0, 1, 2, 4)
+    _, summary, _ = drive(jobs, tmp_path / "run", lambda job, _: -signal.SIGKILL if job == killed else None)
+    assert summary.failed == {"a/segment-000001": "its worker was ended by SIGKILL"}
+
+
+def test_outputs_without_a_line_are_taken_over(jobs, tmp_path):
+    """The worker had moved them to their place, and the driver died before it wrote the line."""
+    run = tmp_path / "run"
+    drive(jobs, run)
+    lines = (run / "manifest.jsonl").read_text().splitlines()
+    lost = [line for line in lines if '"b/segment-000003"' in line or "b/join" in line]
+    (run / "manifest.jsonl").write_text("".join(f"{line}\n" for line in lines if line not in lost))
+    (run / "b.mp4").unlink()
+    pool, _, _ = drive(jobs, run)
+    assert keys(jobs, pool.given) == ["b/join"]
+    done = [json.loads(line)["job"] for line in (run / "manifest.jsonl").read_text().splitlines()]
+    assert len(done) == len(set(done)) == 21
+
+
+def test_lines_without_outputs_are_forgotten(jobs, tmp_path):
+    run = tmp_path / "run"
+    drive(jobs, run)
+    (run / "b.mp4").unlink()
+    (run / "parts/b/000003" / RECORD).unlink()
+    (run / "parts/b/000003").rmdir()
+    pool, summary, _ = drive(jobs, run)
+    assert keys(jobs, pool.given) == ["b/segment-000003", "b/join"]
+    assert not summary.failed
+
+
+def test_a_full_disk_ends_the_run_and_says_how_to_go_on(jobs, tmp_path):
+    with pytest.raises(RunError, match=r"the disk of .* is full \(no room\); free some space, then: farm resume"):
+        drive(
+            jobs, tmp_path / "run", lambda job, _: Outcome("full", reason="no room") if job.kind == "segment" else None
+        )
+    pool, summary, _ = drive(jobs, tmp_path / "run")
+    assert not summary.failed
+    assert len([key for key in keys(jobs, pool.given) if "segment" in key]) == 15
+
+
+def test_a_worker_of_another_version_ends_the_run(jobs, tmp_path):
+    with pytest.raises(RunError, match="worker 0 is warp_ar 2, the driver is warp_ar 1; install one version on all"):
+        drive(jobs, tmp_path / "run", version="warp_ar 2")
+
+
+def test_workers_that_never_get_ready_end_the_run(jobs, tmp_path):
+    class Dead(Workers):
+        def wait(self, seconds):
+            return [Event(1, "died", 1)]
+
+    with pytest.raises(RunError, match=r"worker 1 died 3 times before it was ready; see .*worker-1\.log"):
+        Driver(jobs, tmp_path, Manifest(tmp_path, write=True), Dead(jobs, tmp_path), VERSION, print).run()
+
+
+def test_variations_are_numbered_over_all_clips_and_indexed_once(tmp_path):
+    section = {"variations": 4, "object": [{"shape": "sphere", "radius": 0.02}]}
+    jobs = make_jobs(tmp_path, [{"name": "a"}, {"name": "b"}], dataset=section)
+    told = []
+
+    class Indexed(Workers):
+        def give(self, worker, job, arguments):
+            told.append(arguments) if job.kind == "index" else None
+            super().give(worker, job, arguments)
+
+    manifest = Manifest(tmp_path, write=True)
+    Driver(jobs, tmp_path, manifest, Indexed(jobs, tmp_path), VERSION, print).run()
+    assert told == [[f"dataset/train/{number:06d}" for number in range(8)]]
+    Driver(jobs, tmp_path, manifest, Indexed(jobs, tmp_path), VERSION, print).run()
+    assert len(told) == 1
+    manifest.close()
+
+
+def test_progress_says_where_things_stand(jobs, tmp_path):
+    drive(jobs, tmp_path / "run")
+    told = json.loads((tmp_path / "run/progress.json").read_text())
+    assert (told["clips"], told["clips_surveyed"], told["jobs_known"], told["jobs_open"]) == (3, 3, 15, 0)
+    assert len(told["workers"]) == 3

@@ -1,0 +1,170 @@
+"""The manifest: whole lines, outputs that appear at once, one driver at a time."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from warp_ar.errors import UsageError
+from warp_ar.farm import manifest as manifests
+from warp_ar.farm.manifest import (
+    Manifest,
+    RunError,
+    aside,
+    begin_run,
+    clear_aside,
+    is_no_space,
+    load_run,
+    locked,
+    publish,
+    record_at,
+)
+
+
+def opened(folder):
+    return Manifest(folder, write=True)
+
+
+def test_lines_say_what_is_done_failed_and_tried(tmp_path):
+    first = opened(tmp_path)
+    first.add("done", "a/survey", length=12)
+    first.add("try", "a/segment-000000", reason="why")
+    first.add("try", "a/segment-000000", reason="why")
+    first.add("failed", "a/segment-000000", reason="why")
+    first.add("done", "a/segment-000001", frames=3, bytes=7)
+    first.add("again", "a/segment-000001", reason="gone")
+    first.close()
+    second = Manifest(tmp_path, write=False)
+    assert second.done == {"a/survey": {"length": 12}}
+    assert second.failed == {"a/segment-000000": "why"}
+    assert second.tries == {"a/segment-000000": 2}
+
+
+def test_a_line_that_was_cut_off_is_cut_away(tmp_path):
+    first = opened(tmp_path)
+    first.add("done", "a/survey", length=12)
+    first.close()
+    with open(first.path, "ab") as stream:
+        stream.write(b'{"state": "done", "job": "a/segm')
+    assert list(Manifest(tmp_path, write=False).done) == ["a/survey"]
+    second = opened(tmp_path)
+    second.add("done", "b/survey", length=1)
+    second.close()
+    lines = first.path.read_text().splitlines()
+    assert [json.loads(line)["job"] for line in lines] == ["a/survey", "b/survey"]
+
+
+def test_a_damaged_line_is_told_by_its_number(tmp_path):
+    (tmp_path / "manifest.jsonl").write_text('{"state": "done", "job": "a"}\nnonsense\n')
+    with pytest.raises(RunError, match=r"manifest\.jsonl: line 2 is damaged"):
+        opened(tmp_path)
+
+
+def test_a_line_that_does_not_fit_the_disk_is_taken_back(tmp_path, monkeypatch):
+    manifest = opened(tmp_path)
+    manifest.add("done", "a/survey", length=12)
+    write = os.write
+    monkeypatch.setattr(manifests.os, "write", lambda file, data: write(file, data[:5]))
+    with pytest.raises(RunError, match=r"manifest\.jsonl cannot be written: No space left"):
+        manifest.add("done", "b/survey", length=12)
+    monkeypatch.undo()
+    manifest.add("done", "c/survey", length=12)
+    manifest.close()
+    assert list(opened(tmp_path).done) == ["a/survey", "c/survey"]
+
+
+def test_outputs_appear_whole_with_their_record(tmp_path):
+    with aside(tmp_path, "one") as part:
+        (part / "deep").mkdir()
+        (part / "deep/x").write_bytes(b"12345")
+        told = publish(part, tmp_path / "out/one", "clip/one")
+    assert told["bytes"] == 5
+    assert record_at(tmp_path / "out/one", "clip/one") == told
+    assert record_at(tmp_path / "out/one", "clip/two") is None
+    assert (tmp_path / "out/one/deep/x").read_bytes() == b"12345"
+    assert not list((tmp_path / ".aside").iterdir())
+
+
+def test_outputs_that_are_there_are_not_replaced(tmp_path):
+    for content in (b"first", b"again"):
+        with aside(tmp_path, "one") as part:
+            (part / "x").write_bytes(content)
+            publish(part, tmp_path / "one", "key")
+    assert (tmp_path / "one/x").read_bytes() == b"first"
+
+
+def test_something_else_in_the_place_is_an_error(tmp_path):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one/foreign").write_bytes(b"")
+    with aside(tmp_path, "one") as part:
+        (part / "x").write_bytes(b"")
+        with pytest.raises(OSError, match="not empty"):
+            publish(part, tmp_path / "one", "key")
+
+
+def test_a_digest_is_of_names_and_contents(tmp_path):
+    digests = set()
+    for number, (name, content) in enumerate([("x", b"1"), ("y", b"1"), ("x", b"2"), ("x", b"1")]):
+        with aside(tmp_path, str(number)) as part:
+            (part / name).write_bytes(content)
+            digests.add(publish(part, tmp_path / f"place-{number}", "key")["sha256"])
+    assert len(digests) == 3
+
+
+def test_what_a_dead_worker_left_is_cleared(tmp_path):
+    (tmp_path / ".aside/dead").mkdir(parents=True)
+    (tmp_path / ".aside/dead/x").write_bytes(b"")
+    clear_aside(tmp_path)
+    assert not (tmp_path / ".aside").exists()
+
+
+def test_one_driver_at_a_time(tmp_path):
+    code = (
+        "import pathlib, sys\nfrom warp_ar.farm.manifest import locked\n"
+        "with locked(pathlib.Path(sys.argv[1])):\n print('mine', flush=True)\n sys.stdin.read()\n"
+    )
+    other = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=os.getcwd()
+    )
+    try:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"mine\n"
+        with pytest.raises(RunError, match="is being worked on by another driver"), locked(tmp_path):
+            pass
+    finally:
+        other.kill()
+        other.communicate()
+    with locked(tmp_path):  # its death has freed it
+        pass
+
+
+def test_a_run_begins_in_a_folder_of_its_own(tmp_path):
+    begin_run(tmp_path / "run", {"schema": 1}, "version")
+    assert load_run(tmp_path / "run") == ({"schema": 1}, "version")
+    with pytest.raises(UsageError, match="holds a run already; go on with: farm resume"):
+        begin_run(tmp_path / "run", {}, "version")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/mine.txt").write_text("")
+    with pytest.raises(UsageError, match=r"is not empty \(it holds mine\.txt\)"):
+        begin_run(tmp_path / "other", {}, "version")
+    with pytest.raises(UsageError, match="holds no run"):
+        load_run(tmp_path / "other")
+
+
+def test_a_full_disk_is_known_behind_other_errors():
+    def fails():
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        except OSError as error:
+            raise ValueError("cannot be written") from error
+
+    with pytest.raises(ValueError, match="cannot be written") as caught:
+        fails()
+    assert is_no_space(caught.value)
+    assert not is_no_space(OSError(errno.EACCES, "no"))
+    assert not is_no_space(None)

@@ -1,0 +1,287 @@
+"""Objects with their files' materials as rays meet them: surfaces, what lets rays pass, where normals point."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+from tests.gltf_files import SQUARE_UVS, Gltf
+from warp_ar.errors import SceneError
+from warp_ar.kernels.materials import make_surface
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
+from warp_ar.kernels.visibility import FAR, make_trace
+from warp_ar.scene import Camera, FileMaterial, LambertMaterial, Object, PhongMaterial, Scene, dumps_scene
+from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
+from warp_ar.scene.object_materials import look_of, reflects_diffusely, reflects_glossily
+from warp_ar.scene.ray_scene import HostScene, TraceConfig, trace_config
+
+CAMERA = Camera(width=64, height=48, fx=600.0, fy=620.0, cx=30.5, cy=24.0)
+DETAIL = TraceConfig((0,), ()).general()
+trace = make_trace(dataclasses.replace(DETAIL, detail=True))
+closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
+surface_at = make_surface((LAMBERT, PHONG, METALLIC_ROUGHNESS), True)
+# Codes of 8 bits come back as they are; a few float32 products on the way.
+FLOAT_TOLERANCE = 2e-6
+
+
+@wp.struct
+class Seen:
+    """What a ray finds."""
+
+    t: wp.float32
+    normal: wp.vec3
+    hidden: wp.int32
+    diffuse: wp.vec3
+    f0: wp.vec3
+    roughness: wp.float32
+    emission: wp.vec3
+    occlusion: wp.float32
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def look_kernel(
+    # In:
+    scene: RayScene,
+    dfg: wp.array2d[wp.vec2],
+    origins: wp.array[wp.vec3],
+    direction: wp.vec3,
+    # Out:
+    seen_out: wp.array[Seen],
+):
+    i = wp.tid()
+    seen = Seen()
+    hit = closest_object(scene, origins[i], direction, FAR)
+    seen.t = hit.t
+    if occluded_by_objects(scene, origins[i], direction, FAR):
+        seen.hidden = 1
+    if hit.shape >= 0:
+        seen.normal = hit.normal
+        surface = surface_at(scene, dfg, hit, 1.0, 0.0)
+        seen.diffuse = surface.diffuse
+        seen.f0 = surface.f0
+        seen.roughness = surface.roughness
+        seen.emission = surface.emission
+        seen.occlusion = surface.occlusion
+    seen_out[i] = seen
+
+
+def look(objects, origins, direction, device):
+    """What rays along a direction find of virtual objects."""
+    host = HostScene(Scene(CAMERA, objects=tuple(objects)), wp.get_device(device))
+    table = wp.zeros((32, 32), dtype=wp.vec2, device=device)
+    integrate_dfg(table)
+    seen = wp.zeros(len(origins), dtype=Seen, device=device)
+    starts = wp.array(np.asarray(origins, np.float32), dtype=wp.vec3, device=device)
+    inputs = [host.ray_scene, table, starts, wp.vec3(*direction)]
+    wp.launch(look_kernel, dim=len(origins), inputs=inputs, outputs=[seen], device=device)
+    return seen.numpy()
+
+
+def square(tmp_path: pathlib.Path, *, tilt: float = 0.0, uvs=None, **material) -> pathlib.Path:
+    """An upright square around the origin, seen along +y."""
+    made = Gltf()
+    textures = {"baseColorTexture", "metallicRoughnessTexture"}
+    own = {key: value for key, value in material.items() if key not in textures}
+    reflection = own.setdefault("pbrMetallicRoughness", {})
+    for key in textures & set(material):
+        reflection[key] = material[key](made)
+    own = {key: value(made) if callable(value) else value for key, value in own.items()}
+    made.material(**own)
+    attributes = {} if uvs is None else {"TEXCOORD_0": made.array(np.float32(uvs))}
+    made.node(made.square(0, **attributes))
+    return made.save(tmp_path / "square.glb")
+
+
+def grid(count: int = 16, y: float = -3.0):
+    """Origins of rays before the square, one in the middle of each texel of a picture so large."""
+    at = (np.arange(count) + 0.5) / count * 2.0 - 1.0
+    x, z = np.meshgrid(at, at[::-1])
+    return np.stack([x, np.full_like(x, y), z], axis=-1).reshape(-1, 3)
+
+
+FORWARD = (0.0, 1.0, 0.0)
+
+
+def picture(seed=1, channels=4):
+    return np.random.default_rng(seed).integers(0, 256, (16, 16, channels)).astype(np.uint8)
+
+
+def reference_of(values):
+    return {"index": values}
+
+
+def test_every_texture_reaches_the_surface(device, tmp_path):
+    """A ray through each texel's middle finds the products of factors and texels, of the right channels."""
+    base, factors, occlusion, glow = (picture(seed, 3) for seed in range(4))
+    path = square(
+        tmp_path,
+        baseColorTexture=lambda made: {"index": made.texture(base)},
+        metallicRoughnessTexture=lambda made: {"index": made.texture(factors)},
+        pbrMetallicRoughness={"baseColorFactor": [0.5, 0.6, 0.7, 1.0], "metallicFactor": 1.0, "roughnessFactor": 0.5},
+        occlusionTexture=lambda made: {"index": made.texture(occlusion), "strength": 0.5},
+        emissiveTexture=lambda made: {"index": made.texture(glow)},
+        emissiveFactor=[0.25, 0.5, 1.0],
+    )
+    seen = look([Object("mesh", file=path)], grid(), FORWARD, device)
+
+    def srgb(codes):
+        x = codes.reshape(-1, 3) / 255.0
+        return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+    metallic = factors.reshape(-1, 3)[:, 2:] / 255.0
+    color = srgb(base) * [0.5, 0.6, 0.7]
+    np.testing.assert_allclose(seen["f0"], 0.04 * (1 - metallic) + metallic * color, atol=FLOAT_TOLERANCE)
+    np.testing.assert_allclose(seen["roughness"], 0.5 * factors.reshape(-1, 3)[:, 1] / 255.0, atol=FLOAT_TOLERANCE)
+    np.testing.assert_allclose(
+        seen["occlusion"], 0.5 + 0.5 * occlusion.reshape(-1, 3)[:, 0] / 255, atol=FLOAT_TOLERANCE
+    )
+    np.testing.assert_allclose(seen["emission"], srgb(glow) * [0.25, 0.5, 1.0], atol=FLOAT_TOLERANCE)
+
+
+def test_normal_maps_tilt_the_normal(device, tmp_path):
+    """Texels of a flat map tilt the normal in the frame of the picture, also where the picture is mirrored."""
+    turned = np.full((16, 16, 3), (128 + 60, 128 + 30, 128 + 90), np.uint8)
+    x, y, z = (turned[0, 0] / 255.0 * 2.0 - 1.0) * [0.5, 0.5, 1.0]
+    for mirrored in (False, True):
+        uvs = SQUARE_UVS * [-1.0, 1.0] + [1.0, 0.0] if mirrored else SQUARE_UVS
+        path = square(tmp_path, uvs=uvs, normalTexture=lambda made: {"index": made.texture(turned), "scale": 0.5})
+        seen = look([Object("mesh", file=path)], grid(4), FORWARD, device)
+        # In the world the picture's right is x (or -x), its up is z, and the surface faces -y.
+        expected = np.array([-x if mirrored else x, -z, y]) / np.linalg.norm([x, y, z])
+        np.testing.assert_allclose(seen["normal"], np.tile(expected, (16, 1)), atol=1e-5)
+
+
+def test_masks_let_rays_pass(device, tmp_path):
+    """What lies behind a hole is seen, and lit through it; a masked texel is neither."""
+    alpha = picture(5)
+    path = square(
+        tmp_path, baseColorTexture=lambda made: {"index": made.texture(alpha)}, alphaMode="MASK", alphaCutoff=0.5
+    )
+    front, back = Object("mesh", file=path), Object("box", size=(0.4, 0.4, 0.4), at=(0.0, 3.0, 0.0))
+    there = alpha[..., 3].ravel() >= 128
+    seen = look([front], grid(), FORWARD, device)
+    np.testing.assert_array_equal(seen["t"] < FAR, there)
+    np.testing.assert_array_equal(seen["hidden"] == 1, there)
+    seen = look([front, back], grid(), FORWARD, device)
+    at = grid()
+    behind = (np.abs(at[:, [0, 2]]) < 0.2).all(axis=1)
+    np.testing.assert_array_equal(seen["t"] < FAR, there | behind)
+    np.testing.assert_allclose(seen["t"][there], 3.0, rtol=1e-5)
+    assert (~there & behind).any()
+
+
+def test_blending_shows_its_share(device, tmp_path):
+    """Of many rays as many are held up as alpha says, within five standard errors; again the same ones."""
+    for opacity in (0.0, 0.3, 0.8, 1.0):
+        path = square(tmp_path, pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, opacity]}, alphaMode="BLEND")
+        seen = look([Object("mesh", file=path)], grid(100), FORWARD, device)
+        share = float((seen["t"] < FAR).mean())
+        error = np.sqrt(opacity * (1.0 - opacity) / len(seen))
+        assert abs(share - opacity) <= 5.0 * error
+        again = look([Object("mesh", file=path)], grid(100), FORWARD, device)
+        np.testing.assert_array_equal(seen["t"], again["t"])
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_a_sheet_seen_from_behind(device, tmp_path, double):
+    """A sheet of one side is not there from behind, but throws a shadow; one of two sides is."""
+    path = square(tmp_path, doubleSided=double)
+    seen = look([Object("mesh", file=path)], grid(4, y=3.0), (0.0, -1.0, 0.0), device)
+    assert ((seen["t"] < FAR) == double).all()
+    assert (seen["hidden"] == 1).all()
+    front = look([Object("mesh", file=path)], grid(4), FORWARD, device)
+    assert (front["t"] < FAR).all()
+
+
+def test_a_closed_mesh_costs_no_questions(tmp_path):
+    """Nobody sees its back: rays ask no triangle for its sides."""
+    path = tmp_path / "box.glb"
+    trimesh.creation.box().export(path)
+    assert not look_of(Object("mesh", file=path)).holed
+    assert not trace_config(Scene(CAMERA, objects=(Object("mesh", file=path),))).detail
+
+
+def test_objects_share_a_mesh_but_not_materials(device, tmp_path):
+    """Two objects of one file with two materials, one of them with another of the scene's."""
+    made = Gltf()
+    red, green = (made.material(emissiveFactor=color, doubleSided=True) for color in ([1, 0, 0], [0, 1, 0]))
+    made.node(made.square(red))
+    made.node(made.square(green), translation=[3, 0, 0])
+    path = made.save(tmp_path / "two.glb")
+    chalk = LambertMaterial((0.1, 0.2, 0.3))
+    objects = [Object("mesh", file=path), Object("mesh", file=path, at=(0.0, 0.0, 5.0), material=chalk)]
+    seen = look(objects, [(0, -3, 0), (3, -3, 0), (0, -3, 5), (3, -3, 5)], FORWARD, device)
+    np.testing.assert_allclose(seen["emission"], [[1, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(seen["diffuse"][2:], np.tile(np.float32([0.1, 0.2, 0.3]), (2, 1)))
+
+
+def test_colours_of_a_ply_are_what_it_reflects(device, tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.visual.vertex_colors = [255, 0, 128, 255]
+    ball.export(tmp_path / "ball.ply")
+    seen = look([Object("mesh", file=tmp_path / "ball.ply")], [(0, -3, 0)], FORWARD, device)
+    np.testing.assert_allclose(seen["diffuse"][0], [1.0, 0.0, ((128 / 255 + 0.055) / 1.055) ** 2.4], atol=1e-5)
+
+
+def test_material_libraries(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl shiny\nf 1 2 3\nusemtl matt\nf 3 2 1\n")
+    (tmp_path / "a.mtl").write_text(
+        "newmtl shiny\nKd 0.5 0.25 0.125\nKs 0.2 0.2 0.2\nNs 40\nd 0.5\nbump b.png\n"
+        "newmtl matt\nKd 0.9 0.9 0.9\nKe 3 2 1\nillum 1\n"
+    )
+    mesh = load_mesh(path)
+    shiny, matt = (next(item for item in mesh.materials if item.name == name) for name in ("shiny", "matt"))
+    assert shiny.surface == PhongMaterial((0.5, 0.25, 0.125), (0.2, 0.2, 0.2), 40.0)
+    assert (shiny.alpha, shiny.opacity) == ("blend", 0.5)
+    assert (matt.surface, matt.emission) == (LambertMaterial((0.9, 0.9, 0.9)), (3.0, 2.0, 1.0))
+    assert mesh.notes == ("bump maps",)
+    (tmp_path / "a.mtl").write_text("newmtl shiny\nKd 1 1 1\nPr 0.2\nPm 1\nnewmtl matt\nmap_Ke none.png\n")
+    with pytest.raises(SceneError, match=r"none\.png, which it names, is not there"):
+        load_mesh(path)
+
+
+def test_boxes_of_drawing_formats_are_flat_and_balls_round(tmp_path):
+    for suffix in (".obj", ".stl", ".off"):
+        trimesh.creation.box().export(
+            tmp_path / f"box{suffix}", **({"include_normals": False} if suffix == ".obj" else {})
+        )
+        normals = load_mesh(tmp_path / f"box{suffix}").normals
+        np.testing.assert_allclose(np.sort(np.abs(normals), axis=1), np.tile([0, 0, 1], (36, 1)), atol=1e-6)
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    ball.export(tmp_path / "ball.stl")
+    mesh = load_mesh(tmp_path / "ball.stl")
+    assert (mesh.vertices * mesh.normals).sum(axis=1).min() > 0.999
+
+
+def test_meshes_in_memory(device, tmp_path):
+    """A Trimesh is an object as it is; a scene file cannot say it."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ball.visual.vertex_colors = [0, 255, 0, 255]
+    item = Object("mesh", mesh=mesh_from_trimesh(ball), at=(0.0, 1.0, 0.0))
+    seen = look([item], [(0, -3, 0)], FORWARD, device)
+    assert seen["t"][0] == pytest.approx(3.5, abs=0.01)
+    np.testing.assert_allclose(seen["diffuse"][0], [0, 1, 0], atol=1e-6)
+    with pytest.raises(SceneError, match="a mesh in memory cannot be written"):
+        dumps_scene(Scene(CAMERA, objects=(item,)))
+    with pytest.raises(SceneError, match=r"a mesh is str; a trimesh\.Trimesh"):
+        mesh_from_trimesh("ball.ply")
+    with pytest.raises(SceneError, match="no triangle"):
+        mesh_from_trimesh(trimesh.Trimesh())
+
+
+def test_which_light_file_materials_show(tmp_path):
+    path = square(tmp_path, extensions={"KHR_materials_unlit": {}})
+    (material,) = look_of(Object("mesh", file=path)).materials
+    assert (reflects_diffusely(material), reflects_glossily(material)) == (False, False)
+    path = square(tmp_path, metallicRoughnessTexture=lambda made: {"index": made.texture(picture())})
+    (material,) = look_of(Object("mesh", file=path)).materials
+    assert (reflects_diffusely(material), reflects_glossily(material)) == (True, True)
+    assert isinstance(Object("sphere", radius=1.0).material, FileMaterial)
+    assert look_of(Object("sphere", radius=1.0)).materials[0].surface == LambertMaterial()

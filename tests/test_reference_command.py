@@ -1,0 +1,84 @@
+"""The command ``warp_ar.reference``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.reference import MAGNIFIED, main
+
+QUICK = ["torus", "--quality", "low", "--size", "64x48", "--samples", "8", "--device", "cpu"]
+
+
+def test_it_writes_radiance_error_and_comparison(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    radiance, compared = tmp_path / "deep" / "torus.exr", tmp_path / "torus.png"
+    assert main([*QUICK, "--output", str(radiance), "--compare", str(compared)]) == EXIT_DONE
+    line = capsys.readouterr().out
+    assert line.startswith("torus: 64x48, 8 samples a pixel on cpu in ")
+    assert "relative standard error" in line
+    with OpenEXR.File(str(radiance), separate_channels=True) as file:
+        channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        assert file.header()["samples"] == 8
+    assert set(channels) == {"R", "G", "B", "error.R", "error.G", "error.B"}
+    assert channels["error.R"].max() > 0.0
+    wide = cv2.imread(str(compared))[..., ::-1].astype(int)
+    lit, traced, difference = wide[:, :64], wide[:, 64:128], wide[:, 128:]
+    assert wide.shape == (48, 192, 3)
+    assert abs(lit - traced).max() > 10
+    shown = np.abs(lit - traced).max(axis=2) < 127 // MAGNIFIED - 1
+    # The first is rounded to codes before it is compared here.
+    assert abs(difference - 127.5 - MAGNIFIED * (lit - traced))[shown].max() <= 0.5 * MAGNIFIED + 1
+
+
+def test_the_same_seed_writes_the_same_file(tmp_path: Path) -> None:
+    pictures = []
+    for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
+        path = tmp_path / f"{name}.png"
+        assert main([*QUICK, "--seed", seed, "--output", str(path)]) == EXIT_DONE
+        pictures.append(cv2.imread(str(path)))
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    assert (pictures[0] != pictures[2]).any()
+
+
+def test_it_stops_at_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*QUICK[:-4], "--samples", "4096", "--device", "cpu", "--error", "0.9"]) == EXIT_DONE
+    assert "64x48, 16 samples a pixel" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--samples", "0"], "--samples 0: expected 1 or more"),
+        (["--error", "-1"], "--error -1: expected a number above 0"),
+        (["--output", "x.jpg"], "--output x.jpg ends in '.jpg'; use .png, .exr"),
+        (["--compare", "x.exr"], "--compare x.exr ends in '.exr'; use .png"),
+        (["--size", "64"], "--size 64: expected width x height"),
+        (["--size", "64x64"], "another aspect ratio"),
+        (["--quality", "best"], "quality 'best' is no preset"),
+        (["--seed", "-3"], "seed = -3: expected 0 to"),
+    ],
+)
+def test_wrong_usage_is_one_line(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*QUICK, *options]) == EXIT_USAGE
+    text = capsys.readouterr().err
+    assert words in text
+    assert text.count("\n") == 1
+
+
+def test_a_frame_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((480, 640, 3), np.uint8))
+    assert main([*QUICK, "--source", str(tmp_path), "--frame", "1"]) == EXIT_FAILED
+    assert "has no frame 1; it ends before" in capsys.readouterr().err
+
+
+def test_files_of_others_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "own.png"
+    path.write_bytes(b"mine")
+    assert main([*QUICK, "--output", str(path)]) != EXIT_DONE
+    assert path.read_bytes() == b"mine"
+    assert "--overwrite" in capsys.readouterr().err

@@ -1,0 +1,271 @@
+"""A shot as USD and glTF, read back by others' readers: usd-core and trimesh."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from tests.layer_rig import POSES, make_scene
+from warp_ar.errors import SinkError
+from warp_ar.output.gltf_file import quaternions, write_glb
+from warp_ar.output.shot import Look, Shot, look_of, mesh_of, placement
+from warp_ar.output.usd_file import write_usd
+from warp_ar.scene import Camera, Light, Object
+from warp_ar.scene.description import Animation, PhongMaterial
+from warp_ar.scene.geometry import rotation_matrix
+
+# USD keeps a camera's lens in float32: 1e-7 of a picture of 64 pixels, and frusta of float64.
+PIXELS = 1e-4
+# glTF keeps places and turns in float32.
+GLTF = 1e-6
+
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) * (0.05, 0.025, 0.03)
+
+
+@pytest.fixture(scope="module")
+def shot() -> Shot:
+    """A camera without distortion whose principal point is off the middle; its second frame is lost."""
+    scene = make_scene(
+        camera=Camera(64, 48, 70.0, 72.0, 29.0, 27.5),
+        lights=(
+            Light("point", 0.2, at=(0.1, -0.1, 0.3)),
+            Light(
+                "spot",
+                0.5,
+                color=(1.0, 0.5, 2.0),
+                at=(0.2, 0.1, 0.3),
+                target=(0, 0, 0),
+                inner_angle=10.0,
+                outer_angle=30.0,
+                animate=Animation(sway=(0.1, 0.0, 0.0), period=1.0),
+            ),
+            Light("directional", 0.3, direction=(0.3, 0.2, -1.0)),
+        ),
+    )
+    return Shot(scene, 24.0, (POSES[0], None, POSES[1]))
+
+
+def in_picture(camera, pose, points):
+    turn, _ = cv2.Rodrigues(pose.rotation)
+    return cv2.projectPoints(points, turn, pose.translation, camera.matrix(), None)[0][:, 0]
+
+
+@pytest.fixture(scope="module")
+def stage(shot, tmp_path_factory):
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    path = tmp_path_factory.mktemp("usd") / "shot.usda"
+    assert write_usd(path, shot) == [path]
+    assert sorted(entry.name for entry in path.parent.iterdir()) == ["shot.usda"]
+    return usd.Stage.Open(str(path))
+
+
+def test_usd_shows_corners_where_the_camera_does(shot, stage):
+    """By USD's own frustum: proxies' corners fall onto the plate's pixels."""
+    from pxr import Gf, UsdGeom
+
+    camera = shot.camera
+    prim = UsdGeom.Camera(stage.GetPrimAtPath("/shot/camera"))
+    box = UsdGeom.Mesh(stage.GetPrimAtPath("/shot/proxies/proxy_1_box"))
+    points = np.array(box.GetPointsAttr().Get(), float)
+    world = np.array(box.ComputeLocalToWorldTransform(0)).T
+    placed = points @ world[:3, :3].T + world[:3, 3]
+    expected = CORNERS + np.array([0.0, 0.1, 0.03])
+    np.testing.assert_allclose(np.unique(np.round(placed, 6), axis=0), np.unique(np.round(expected, 6), axis=0))
+    for frame in (0, 2):
+        frustum = prim.GetCamera(frame).frustum
+        to_clip = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+        seen = np.array([to_clip.Transform(Gf.Vec3d(*point)) for point in placed])
+        # Clip coordinates -1..1 span the outer edges of the picture's pixels.
+        pixels = np.stack([(seen[:, 0] + 1) / 2 * camera.width, (1 - seen[:, 1]) / 2 * camera.height], -1) - 0.5
+        np.testing.assert_allclose(pixels, in_picture(camera, shot.poses[frame], placed), atol=PIXELS)
+
+
+def test_usd_says_units_times_and_lens(shot, stage):
+    from pxr import UsdGeom
+
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 2, 24)
+    prim = stage.GetPrimAtPath("/shot/camera")
+    assert list(prim.GetAttribute("warp_ar:intrinsics").Get()) == [70.0, 72.0, 29.0, 27.5]
+    times = UsdGeom.Camera(prim).GetOrderedXformOps()[0].GetTimeSamples()
+    assert times == [0.0, 2.0], "a frame without a pose has no sample"
+
+
+def test_usd_moves_what_is_animated(shot, stage):
+    from pxr import UsdGeom
+
+    box = UsdGeom.Xformable(stage.GetPrimAtPath("/shot/objects/object_1_box"))
+    for frame in range(3):
+        rotation, position = shot.scene.objects[1].pose_at(frame / 24.0)
+        found = np.array(box.ComputeLocalToWorldTransform(frame)).T
+        np.testing.assert_allclose(found, placement(rotation, position), atol=1e-12)
+    still = UsdGeom.Xformable(stage.GetPrimAtPath("/shot/objects/object_0_sphere"))
+    assert not still.TransformMightBeTimeVarying()
+
+
+def test_usd_lights(shot, stage):
+    from pxr import UsdLux
+
+    point = UsdLux.SphereLight(stage.GetPrimAtPath("/shot/lights/light_0"))
+    # Radiance of a sphere of radius r and power normalised: i / (4 pi r^2); seen face on it has an area of pi r^2.
+    radius = point.GetRadiusAttr().Get()
+    radiance = point.GetIntensityAttr().Get() / (4 * np.pi * radius**2)
+    assert radiance * np.pi * radius**2 == pytest.approx(0.2)
+    assert point.GetNormalizeAttr().Get()
+    assert point.GetTreatAsPointAttr().Get()
+    spot = stage.GetPrimAtPath("/shot/lights/light_1")
+    shaping = UsdLux.ShapingAPI(spot)
+    assert shaping.GetShapingConeAngleAttr().Get() == 30.0
+    assert shaping.GetShapingConeSoftnessAttr().Get() == pytest.approx(2 / 3)
+    for frame in (0, 2):
+        at, direction = shot.scene.lights[1].pose_at(frame / 24.0)
+        matrix = np.array(UsdLux.SphereLight(spot).ComputeLocalToWorldTransform(frame)).T
+        np.testing.assert_allclose(matrix[:3, 3], at, atol=1e-12)
+        np.testing.assert_allclose(-matrix[:3, 2], direction, atol=1e-12)
+        assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1.0)
+    sun = UsdLux.DistantLight(stage.GetPrimAtPath("/shot/lights/light_2"))
+    assert sun.GetIntensityAttr().Get() == pytest.approx(0.3)
+
+
+def test_usd_materials_and_dome(shot, tmp_path):
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    from pxr import Usd, UsdLux, UsdShade
+
+    lit = dataclasses.replace(shot, environment=tmp_path / "room.exr", plate=tmp_path / "clip.mp4")
+    for suffix in (".usda", ".usdc", ".usd"):
+        write_usd(tmp_path / f"shot{suffix}", lit)
+        stage = Usd.Stage.Open(str(tmp_path / f"shot{suffix}"))
+        bound = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/shot/objects/object_1_box"))
+        surface = bound.ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+        assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+        assert surface.GetInput("metallic").Get() == 1.0
+        assert surface.GetInput("roughness").Get() == pytest.approx(0.3)
+        np.testing.assert_allclose(surface.GetInput("diffuseColor").Get(), (0.9, 0.8, 0.4), rtol=1e-6)
+        dome = UsdLux.DomeLight(stage.GetPrimAtPath("/shot/lights/environment"))
+        assert dome.GetTextureFileAttr().Get().path == "./room.exr"
+        # The file's y, its pole, is the scene's z, and its z the scene's -y.
+        matrix = np.array(dome.ComputeLocalToWorldTransform(0)).T[:3, :3]
+        np.testing.assert_allclose(matrix @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(matrix @ [0, 0, 1], [0, -1, 0], atol=1e-12)
+        assert stage.GetRootLayer().customLayerData["plate"].endswith("clip.mp4")
+
+
+def glb(path):
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def test_gltf_puts_meshes_where_the_scene_does(shot, tmp_path):
+    """By trimesh's reader: every vertex, turned to y up."""
+    write_glb(tmp_path / "shot.glb", shot)
+    loaded = trimesh.load(tmp_path / "shot.glb")
+    scene = shot.scene
+    for name, item in (("object_0_sphere", scene.objects[0]), ("object_1_box", scene.objects[1])):
+        rotation, position = item.pose_at(0.0)
+        expected = mesh_of(item).vertices @ rotation.T + position
+        transform, geometry = loaded.graph[name]
+        found = trimesh.transform_points(loaded.geometry[geometry].vertices, transform)
+        np.testing.assert_allclose(found, expected[:, [0, 2, 1]] * (1, 1, -1), atol=GLTF)
+    assert loaded.camera.fov[1] == pytest.approx(np.degrees(2 * np.arctan(24 / 72.0)))
+
+
+def test_gltf_moves_camera_and_objects(shot, tmp_path):
+    write_glb(tmp_path / "shot.glb", shot)
+    tree, binary = glb(tmp_path / "shot.glb")
+    nodes = {node["name"]: index for index, node in enumerate(tree["nodes"])}
+
+    def values(accessor):
+        entry = tree["accessors"][accessor]
+        view = tree["bufferViews"][entry["bufferView"]]
+        lanes = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[entry["type"]]
+        data = np.frombuffer(binary, np.float32, entry["count"] * lanes, view["byteOffset"])
+        return data.reshape(entry["count"], lanes)
+
+    animation = tree["animations"][0]
+    tracks = {}
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        tracks[channel["target"]["node"], channel["target"]["path"]] = (
+            values(sampler["input"])[:, 0],
+            values(sampler["output"]),
+        )
+    times, places = tracks[nodes["camera"], "translation"]
+    np.testing.assert_allclose(times, [0.0, 2 / 24], rtol=1e-6)
+    expected = [shot.poses[frame].inverse().translation for frame in (0, 2)]
+    np.testing.assert_allclose(places, expected, atol=GLTF)
+    times, turns = tracks[nodes["object_1_box"], "rotation"]
+    for frame, (x, y, z, w) in enumerate(turns.astype(float)):
+        turned, _ = cv2.Rodrigues(
+            2 * np.arctan2(np.linalg.norm([x, y, z]), w) * np.array([x, y, z]) / np.linalg.norm([x, y, z])
+        )
+        np.testing.assert_allclose(turned, shot.scene.objects[1].pose_at(frame / 24.0)[0], atol=1e-6)
+    lights = tree["extensions"]["KHR_lights_punctual"]["lights"]
+    assert [light["type"] for light in lights] == ["point", "spot", "directional"]
+    # Radiance of the channels is colour times intensity, the colour within 0..1.
+    assert lights[1]["intensity"] == pytest.approx(1.0)
+    np.testing.assert_allclose(lights[1]["color"], (0.5, 0.25, 1.0))
+    assert lights[1]["spot"]["outerConeAngle"] == pytest.approx(np.radians(30.0))
+    assert tree["cameras"][0]["extras"]["intrinsics"] == [70.0, 72.0, 29.0, 27.5]
+    for view in tree["bufferViews"]:
+        assert view["byteOffset"] % 4 == 0
+        assert view["byteOffset"] + view["byteLength"] <= len(binary)
+
+
+def test_quaternions_turn_as_their_matrices():
+    rng = np.random.default_rng(0)
+    matrices = np.stack(
+        [rotation_matrix(rng.uniform(-180, 180, 3)) for _ in range(200)]
+        + [np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])]
+    )
+    found = quaternions(matrices)
+    for (x, y, z, w), matrix in zip(found, matrices, strict=True):
+        back = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        np.testing.assert_allclose(back, matrix, atol=1e-12)
+    assert (np.sum(found[1:] * found[:-1], -1) >= 0.0).all(), "each on the side of the one before"
+
+
+def test_a_phong_lobe_becomes_as_wide_a_one():
+    item = Object("sphere", radius=0.1, material=PhongMaterial((0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 30.0))
+    look = look_of(item, mesh_of(item))
+    assert look == Look((0.1, 0.2, 0.3), 0.0, pytest.approx((2 / 32) ** 0.25), (0.4, 0.5, 0.6), None)
+
+
+def test_a_texture_is_taken_along(shot, tmp_path):
+    """A texture of a file and one that a mesh brings: as a PNG beside USD, within glTF."""
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    picture = np.random.default_rng(0).integers(0, 256, (4, 8, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "wood.png"), picture[..., ::-1])
+    item = dataclasses.replace(shot.scene.objects[0], material=PhongMaterial(diffuse=tmp_path / "wood.png"))
+    textured = dataclasses.replace(shot, scene=dataclasses.replace(shot.scene, objects=(item,)))
+    written = write_usd(tmp_path / "shot.usda", textured)
+    assert [path.name for path in written] == ["shot.usda", "shot_object_0_sphere.png"]
+    np.testing.assert_array_equal(cv2.imread(str(written[1]))[..., ::-1], picture)
+    write_glb(tmp_path / "shot.glb", textured)
+    tree, binary = glb(tmp_path / "shot.glb")
+    view = tree["bufferViews"][tree["images"][0]["bufferView"]]
+    data = np.frombuffer(binary, np.uint8, view["byteLength"], view["byteOffset"])
+    np.testing.assert_array_equal(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1], picture)
+
+
+def test_what_cannot_be_written_is_said(shot, tmp_path):
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    (tmp_path / "missing").write_text("a file, where a folder should be")
+    for write, name in ((write_usd, "shot.usda"), (write_glb, "shot.glb")):
+        with pytest.raises(SinkError, match=rf"{name} cannot be written"):
+            write(tmp_path / "missing" / name, shot)

@@ -1,0 +1,147 @@
+"""A frame of a scene with all that the pipeline knows of it: its pose, its light, and the picture that it made."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.accuracy.path_tracer import Image, PathTracer
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SourceError, UsageError
+from warp_ar.input.sources import Source, open_source
+from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
+from warp_ar.scene import Pose, Scene
+from warp_ar.stages.quality import Quality
+
+
+@dataclasses.dataclass(frozen=True)
+class KnownFrame:
+    """A frame, and what the pipeline knew when it lit it."""
+
+    scene: Scene
+    """With its camera at the frame's size."""
+    image: Image
+    """What the camera saw."""
+    lit: Image
+    """What the pipeline made of it."""
+    pose: Pose
+    """``camera_from_world``."""
+    light: Light
+    """Of the environment; emitters of known distance are in ``Light.emitters``."""
+    seconds: float
+    """Since the first frame."""
+    milliseconds: float
+    """That its stages took."""
+
+    def tracer(self, *, device: str = "auto", size: tuple[int, int] | None = None, seed: int = 0) -> PathTracer:
+        """A path tracer of this frame; arguments as those of ``PathTracer``."""
+        return PathTracer(
+            self.scene, self.light, self.image, self.pose, device=device, size=size, seconds=self.seconds, seed=seed
+        )
+
+
+def open_scene_source(scene: Scene, source: str | int | Path | None = None) -> Source:
+    """The source that a scene names, or another.
+
+    Raises:
+        UsageError: The scene names none.
+        SourceError: It cannot be opened.
+    """
+    spec = scene.source
+    if source is not None:
+        return open_source(source)
+    if spec is None:
+        raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
+    where: str | int | Path = f"synthetic:{spec.synthetic}"
+    if spec.path is not None:
+        where = spec.path
+    elif spec.camera is not None:
+        where = spec.camera
+    return open_source(where, fps=spec.fps, exposures=spec.exposures or ())
+
+
+def light_up_to(
+    scene: Scene,
+    number: int,
+    *,
+    quality: str | Quality,
+    device: str = "auto",
+    source: str | int | Path | None = None,
+) -> KnownFrame:
+    """Run a scene's frames through a pipeline up to one of them.
+
+    Args:
+        scene: What to light.
+        number: Of the frame, from 0.
+        quality: Of the pipeline, and so of the light that it finds.
+        device: ``auto``, ``cpu`` or ``cuda:N``.
+        source: Frames instead of the scene's own.
+
+    Raises:
+        SceneError: The scene cannot be used.
+        SourceError: The source ends before the frame, or the frame cannot be judged.
+        UsageError: Any other argument cannot be used.
+    """
+    if number < 0:
+        raise UsageError(f"--frame {number}: expected 0 or more")
+    shown = scene.source.shown if scene.source is not None and source is None else None
+    with (
+        open_scene_source(scene, source) as frames,
+        Pipeline(
+            scene,
+            device=device,
+            quality=quality,
+            size=frames.size,
+            outputs=("image", "environment", "pose"),
+            exposures=frames.exposures,
+            shown=shown,
+            synchronous=True,
+        ) as pipeline,
+    ):
+        first: float | None = None
+        for frame in frames:
+            first = frame.time if first is None else first
+            result = pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+            if frame.index < number:
+                continue
+            where = f"frame {number} of {frames.description}"
+            if not result.shown:
+                raise SourceError(f"{where} has another exposure than the frames that are shown; name one of those")
+            if result.pose is None:
+                raise SourceError(f"{where} shows no marker, so where things are is not known; name another frame")
+            milliseconds = sum(timing.milliseconds for timing in result.stages.values())
+            light, seconds = light_of(pipeline), frame.time - first
+            return KnownFrame(
+                pipeline.scene, frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
+            )
+    raise SourceError(f"{frames.description} has no frame {number}; it ends before")
+
+
+def light_of(pipeline: Pipeline) -> Light:
+    """The light that a pipeline knows; black where the scene calls for none."""
+    arrays = pipeline.arrays
+    radiance: npt.NDArray[np.float32] = np.zeros((2, 4, 3), np.float32)
+    if arrays.get("environment") is not None:
+        radiance = np.array(arrays["environment"].numpy())
+    emitters = []
+    if arrays.get("emitters") is not None:
+        for record in arrays["emitters"].numpy():
+            distance = float(record["distance"])
+            if distance > 0.0:
+                emitters.append(_emitter(record, distance if np.isfinite(distance) else None, len(radiance)))
+    return Light(radiance, np.ones(radiance.shape[:2], np.float32), tuple(emitters))
+
+
+def _triple(values: npt.NDArray[np.float32]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _emitter(record: np.void, distance: float | None, height: int) -> CapturedEmitter:
+    """An emitter that the pipeline found; it is taken to fill one texel."""
+    direction, origin, power = (_triple(record[name]) for name in ("direction", "origin", "power"))
+    size = float(texel_solid_angles(height)[height // 2, 0])
+    return CapturedEmitter(direction, size, power, power, None, distance, origin)

@@ -1,0 +1,331 @@
+"""The picture of a frame by path tracing: progressive, with a standard error for every pixel.
+
+``kernels/path_tracer.py`` says what it sums. It knows the scene, the light of the environment and one frame with its
+pose, as the pipeline does, and approximates nothing else: with enough samples it is what the pipeline's methods are to
+be judged by.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.device import exclusive, resolve_device, translating, usable_cores
+from warp_ar.errors import UsageError
+from warp_ar.kernels import path_tracer, structs
+from warp_ar.kernels.color import decode_table, encode_table
+from warp_ar.kernels.launch import Rows
+from warp_ar.kernels.path_sampling import make_sky
+from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.light.captured import Light
+from warp_ar.scene import Pose, Scene
+from warp_ar.scene.pixel_rays import pixel_rays
+from warp_ar.scene.ray_scene import HostScene, trace_config
+
+FloatImage = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
+
+DEFAULT_SAMPLES = 256
+"""Per pixel, where nothing else is asked for."""
+LIGHT_SAMPLES = 32
+"""Per pixel, by which the reflectance of proxies is found before the picture."""
+FIRST_LIGHT_SAMPLES = 4
+"""Of these, those after which the mean reflectance of each proxy is known."""
+UNKNOWN_REFLECTANCE = 0.5
+"""Of a proxy that no pixel shows."""
+DFG_SIZE = 32
+"""Rows and columns of the table of directional albedo."""
+BAND = 8
+"""Rows that a thread takes at a time."""
+LEAST_CHANGE = 1e-4
+"""Radiance, in camera values, by which a pixel that virtual things reach differs from the frame at least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedPicture:
+    """A picture on its way to the truth."""
+
+    radiance: FloatImage
+    """Linear, in camera values, not clipped, (H, W, 3)."""
+    error: FloatImage
+    """Standard error of ``radiance``, (H, W, 3)."""
+    image: Image
+    """The picture as the camera would have encoded it, (H, W, 3) RGB."""
+    samples: int
+    """Per pixel."""
+    seconds: float
+    """That sampling took, from the first sample on."""
+    relative_error: float
+    """Root mean square of the standard error over that of the radiance, in pixels that virtual things change; of a
+    pixel that clips, as far as it can be seen."""
+
+
+def _relative_error(picture: FloatImage, error: FloatImage, frame: FloatImage | None) -> float:
+    seen = np.clip(picture, 0.0, 1.0)
+    changed = np.ones(picture.shape[:2], bool)
+    if frame is not None:
+        changed = (np.abs(picture - frame) > LEAST_CHANGE).any(axis=2) | (error > LEAST_CHANGE).any(axis=2)
+    hidden = picture - error > 1.0
+    noise = np.where(hidden, 0.0, np.minimum(error, 1.0))[changed].astype(np.float64)
+    signal = seen[changed].astype(np.float64)
+    if not signal.size or not signal.any():
+        return 0.0
+    return float(np.sqrt((noise**2).mean() / (signal**2).mean()))
+
+
+class PathTracer:
+    """Path-traces one frame of a scene.
+
+    Samples are added with ``sample``; ``picture`` says what they give so far. The same arguments and seed give the same
+    picture to the bit on one device, however many samples are added at a time.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        light: Light | FloatImage,
+        frame: Image | FloatImage | None,
+        pose: Pose,
+        *,
+        device: str = "auto",
+        size: tuple[int, int] | None = None,
+        seconds: float = 0.0,
+        seed: int = 0,
+        reflectances: tuple[tuple[float, float, float], ...] | None = None,
+    ) -> None:
+        """Put everything on the device.
+
+        Args:
+            scene: What there is.
+            light: The environment, in the world's axes: latlong radiance (h, 2 h, 3) in camera values, or a captured
+                light, whose emitters of known distance are then where they are.
+            frame: What the camera saw, (H, W, 3): encoded (uint8) or linear (float32). None: nothing is known of the
+                physical surfaces but ``reflectances``, and the picture is that of the whole scene, physical surfaces
+                and environment included.
+            pose: ``camera_from_world``.
+            device: ``auto``, ``cpu`` or ``cuda:N``.
+            size: Width and height of the picture; None means the camera's. The frame is averaged down to it.
+            seconds: Since the first frame: where what is animated stands.
+            seed: Of the random numbers, 0 or more.
+            reflectances: RGB of each proxy, without a frame; 0.5 where left out.
+
+        Raises:
+            UsageError: The frame, the light, the seed or the reflectances do not fit.
+            SceneError: The camera cannot be scaled to ``size``.
+        """
+        if not 0 <= seed < 2**31:
+            raise UsageError(f"seed = {seed}: expected 0 to {2**31 - 1}")
+        self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
+        self.scene = dataclasses.replace(scene, camera=self.camera)
+        self.device = resolve_device(device)
+        self.seed, self.samples = seed, 0
+        self._seconds = 0.0
+        self._prepared = frame is None
+        self._linear = None if frame is None else _linear_frame(frame, self.camera)
+        self._trace = trace_config(scene)
+        if self.device.is_cpu:
+            self._trace = self._trace.general()
+        with translating(self.device), wp.ScopedDevice(self.device):
+            self._host = HostScene(self.scene, self.device)
+            self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
+            self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
+            self._set_reflectances(reflectances)
+            shape = (self.camera.height, self.camera.width)
+            self._moments = path_tracer.make_moments(shape, self.device)
+            self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+            self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+            self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
+            self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
+
+    def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
+        """The scene as paths meet it."""
+        local = path_tracer.LocalScene()
+        device, shape = self.device, (self.camera.height, self.camera.width)
+        objects = np.zeros(len(self.scene.objects), np.dtype(structs.Shape.numpy_dtype()))
+        lights = np.zeros(len(self.scene.lights), np.dtype(structs.Light.numpy_dtype()))
+        self._host.write_objects(objects, seconds)
+        self._host.write_lights(lights, seconds)
+        local.rays = self._host.ray_scene
+        local.rays.objects = wp.array(objects, dtype=structs.Shape, device=device)
+        local.lights = wp.array(lights, dtype=structs.Light, device=device)
+        balls = np.zeros(len(self.scene.probes), np.dtype(structs.Probe.numpy_dtype()))
+        for ball, probe in zip(balls, self.scene.probes, strict=True):
+            ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
+        local.probes = wp.array(balls, dtype=structs.Probe, device=device)
+        local.sky = make_sky(radiance, device, emitters)
+        local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
+        integrate_dfg(local.dfg)
+        rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
+        local.picture = structs.make_picture(wp.zeros(shape, dtype=wp.vec3ub, device=device), None, rays)
+        if self._linear is not None:
+            local.radiance = wp.array(self._linear, dtype=wp.vec3, device=device)
+            local.reflectance = wp.zeros(shape, dtype=wp.vec3, device=device)
+            local.shown = wp.full(shape, -1, dtype=wp.int32, device=device)
+        return local
+
+    def _camera_values(self, pose: Pose) -> npt.NDArray[Any]:
+        params = np.zeros(1, np.dtype(structs.FrameParams.numpy_dtype()))
+        inverse = pose.inverse()
+        params["camera_position"], params["world_from_camera"] = inverse.translation, inverse.rotation
+        params["focal"] = self.camera.fx, self.camera.fy
+        params["principal"] = self.camera.cx, self.camera.cy
+        params["distortion"] = np.resize(np.asarray([*self.camera.distortion, *([0.0] * 8)], np.float32), 8)
+        return params
+
+    def _set_reflectances(self, reflectances: Sequence[Any] | None) -> None:
+        count = len(self.scene.proxies)
+        if reflectances is None:
+            reflectances = [(UNKNOWN_REFLECTANCE,) * 3] * count
+        if len(reflectances) != count:
+            raise UsageError(f"{len(reflectances)} reflectances for {count} proxies: expected one for each")
+        values = np.asarray(reflectances, np.float32).reshape(count, 3)
+        self._local.proxy_reflectance = wp.array(values, dtype=wp.vec3, device=self.device)
+
+    def _add(self, asked: int, done: int, count: int, first: int) -> None:
+        """Add samples to the moments, on CPU by as many threads as there are cores."""
+
+        def trace(rows: Rows | None) -> None:
+            path_tracer.trace_paths(
+                self._trace, self._params, self._local, self._moments,
+                asked=asked, seed=self.seed, first=first, done=done, count=count, rows=rows,
+            )  # fmt: skip
+
+        if not self.device.is_cpu:
+            with translating(self.device), wp.ScopedDevice(self.device):
+                trace(None)
+            return
+        height = self.camera.height
+        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+        with translating(self.device):
+            trace(bands[0])  # compiles, before threads would each do so
+        with ThreadPoolExecutor(usable_cores(), "warp_ar-paths") as pool:
+            list(pool.map(trace, bands[1:]))
+
+    def prepare(self) -> None:
+        """Find the reflectance of proxies; ``sample`` does it where it was not done."""
+        if self._prepared:
+            return
+        self._prepared = True
+        with translating(self.device), wp.ScopedDevice(self.device):
+            path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
+        done = 0
+        for count in (FIRST_LIGHT_SAMPLES, LIGHT_SAMPLES - FIRST_LIGHT_SAMPLES):
+            self._add(path_tracer.IRRADIANCE, 0, count, done)
+            done += count
+            with translating(self.device), wp.ScopedDevice(self.device):
+                self._map_reflectance()
+
+    def _map_reflectance(self) -> None:
+        """Reflectance by the light that the moments hold, which then begin anew."""
+        path_tracer.map_reflectance(self._local, self._moments, self._local.reflectance)
+        found, shown = self._local.reflectance.numpy(), self._local.shown.numpy()
+        means = [
+            found[shown == k].mean(axis=0) if (shown == k).any() else np.full(3, UNKNOWN_REFLECTANCE)
+            for k in range(len(self.scene.proxies))
+        ]
+        self._set_reflectances(means)
+        self._moments = path_tracer.make_moments(shown.shape, self.device)
+
+    def sample(self, count: int) -> None:
+        """Add ``count`` samples to every pixel.
+
+        Raises:
+            UsageError: The count is not positive.
+        """
+        if count < 1:
+            raise UsageError(f"{count} samples: expected 1 or more")
+        self.prepare()
+        start = time.perf_counter()
+        asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
+        self._add(asked, self.samples, count, LIGHT_SAMPLES + self.samples)
+        with exclusive(self.device):
+            wp.synchronize_device(self.device)
+        self.samples += count
+        self._seconds += time.perf_counter() - start
+
+    def picture(self) -> TracedPicture:
+        """What the samples so far give.
+
+        Raises:
+            UsageError: There are none.
+        """
+        if self.samples < 1:
+            raise UsageError("no samples yet: call sample() first")
+        with exclusive(self.device):
+            path_tracer.finish_picture(
+                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image
+            )
+            radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
+        relative = _relative_error(radiance, error, self._linear)
+        return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
+
+    def rays(self) -> int:
+        """Rays that were traced for the samples so far."""
+        with exclusive(self.device):
+            return int(self._moments.rays.numpy().astype(np.int64).sum())
+
+    def render(
+        self,
+        samples: int = DEFAULT_SAMPLES,
+        *,
+        error: float | None = None,
+        step: int = 16,
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> Iterator[TracedPicture]:
+        """Pictures that get better, ``step`` samples at a time.
+
+        Args:
+            samples: Per pixel, after which to stop.
+            error: Relative standard error at which to stop before.
+            step: Samples between two pictures.
+            wanted: Asked between two; False stops.
+        """
+        while self.samples < samples and wanted():
+            self.sample(min(step, samples - self.samples))
+            picture = self.picture()
+            yield picture
+            if error is not None and picture.samples >= min(2 * step, samples) and picture.relative_error <= error:
+                return
+
+
+def _environment(light: Light | FloatImage) -> FloatImage:
+    radiance = light.radiance if isinstance(light, Light) else np.asarray(light, np.float32)
+    if radiance.ndim != 3 or radiance.shape[2] != 3 or min(radiance.shape[:2]) < 2:
+        raise UsageError(f"light has the shape {radiance.shape}: expected latlong radiance (h, 2 h, 3)")
+    return radiance
+
+
+def _near_emitters(light: Light | FloatImage) -> npt.NDArray[Any]:
+    """Records of the emitters whose distances are known."""
+    near = [e for e in light.emitters if e.distance is not None] if isinstance(light, Light) else []
+    records = np.zeros(len(near), np.dtype(structs.Emitter.numpy_dtype()))
+    for record, emitter in zip(records, near, strict=True):
+        record["origin"], record["direction"] = emitter.origin, emitter.direction
+        record["distance"], record["power"] = emitter.distance, emitter.power
+    return records
+
+
+def _linear_frame(frame: Image | FloatImage, camera: Any) -> FloatImage:
+    """Linear radiance of a frame at the camera's size."""
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype not in (np.uint8, np.float32):
+        raise UsageError(f"frame is {frame.dtype} {frame.shape}: expected uint8 or float32 (height, width, 3)")
+    linear = frame
+    if frame.dtype == np.uint8:
+        table = decode_table(camera.transfer)
+        linear = np.stack([table[frame[..., c], c] for c in range(3)], axis=-1)
+    size = (camera.width, camera.height)
+    if frame.shape[1::-1] != size:
+        if frame.shape[1] * size[1] != frame.shape[0] * size[0]:
+            raise UsageError(
+                f"frame is {frame.shape[1]}x{frame.shape[0]}, the picture {size[0]}x{size[1]}: another aspect ratio"
+            )
+        linear = cv2.resize(linear, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(linear, np.float32)

@@ -1,0 +1,122 @@
+"""``python -m warp_ar.export SCENE --output shot.usda``: the shot for other programs: camera, surfaces, lights."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.errors import SinkError, SourceError, UsageError
+from warp_ar.output.environment_file import write_environment
+from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
+from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.output.shot import Shot
+from warp_ar.output.sink import make_folder
+from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
+from warp_ar.output.track_file import TRACK_SUFFIX, write_track
+from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
+from warp_ar.scene import load_scene
+
+SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.export",
+        description="Write a scene and the way of its camera for other programs: USD, glTF, or OpenTrackIO (.jsonl).",
+    )
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="a scene file, a folder with one, or a bundled scene's name")
+    add("--output", type=Path, required=True, metavar="FILE", help=f"ends in {', '.join(SUFFIXES)}")
+    add("--source", metavar="PATH", help="frames from this folder or video, not the scene's own")
+    add("--calibration", metavar="FILE|exif", help="as in warp_ar.live")
+    add("--frames", type=int, metavar="N", help="stop after N frames")
+    text = "camera, surfaces and virtual lights only: frames are tracked, not lit"
+    add("--no-environment", action="store_true", help=text)
+    text = "write FILE_undistort.exr and FILE_distort.exr, STMaps of the lens, too"
+    add("--stmaps", action="store_true", help=text)
+    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
+    add("--overwrite", action="store_true", help="replace files that this program did not write")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: export(make_parser().parse_args(arguments)), (SinkError, SourceError))
+
+
+def export(options: argparse.Namespace) -> int:
+    """Track the frames, take the light of the last one, write."""
+    output: Path = options.output
+    if output.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"--output {output} ends in {output.suffix!r}; use {', '.join(SUFFIXES)}")
+    if options.frames is not None and options.frames < 1:
+        raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
+    if output.suffix.lower() in USD_SUFFIXES:
+        load_usd()
+    scene = load_scene(options.scene)
+    beside = {name: output.with_name(f"{output.stem}_{name}.exr") for name in ("environment", "undistort", "distort")}
+    if options.no_environment or output.suffix.lower() == TRACK_SUFFIX:
+        del beside["environment"]
+    if not options.stmaps:
+        del beside["undistort"], beside["distort"]
+    reads = {"the scene": [] if scene.path is None else [scene.path], "what the scene names,": [*files_of(scene)]}
+    reads["what the scene names,"] = [path for path in reads["what the scene names,"] if path != scene.path]
+    check_places(reads, {"--output": output, **{f"--output's {name}": path for name, path in beside.items()}})
+    for path in (output, *beside.values()):
+        if words := check_replaceable(path, overwrite=options.overwrite):
+            say(words)
+    make_folder(output.parent)
+    shot, radiance = _read_shot(options, scene)
+    if radiance is None:
+        beside.pop("environment", None)
+    else:
+        write_environment(beside["environment"], radiance, overwrite=True, axes="y-up")
+        shot = dataclasses.replace(shot, environment=beside["environment"])
+    for name, make in (("undistort", undistort_map), ("distort", distort_map)):
+        if name in beside:
+            write_stmap(beside[name], make(shot.camera))
+    write = {GLTF_SUFFIX: write_glb, TRACK_SUFFIX: write_track}.get(output.suffix.lower(), write_usd)
+    written = write(output, shot)
+    lost = sum(pose is None for pose in shot.poses)
+    print(f"{len(shot.poses)} frames" + (f", {lost} without a pose" if lost else ""))
+    for path in (*written, *beside.values()):
+        print(path)
+    return EXIT_DONE
+
+
+def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
+    """The camera's way, and the environment of the last frame that shows it."""
+    from warp_ar.session import Session  # loads Warp
+
+    light = not options.no_environment and bool(scene.probes or scene.captured)
+    light = light and options.output.suffix.lower() != TRACK_SUFFIX
+    outputs = ("pose", "environment") if light else ("pose",)
+    poses, radiance = [], None
+    with Session(
+        scene, source=options.source, calibration=options.calibration, device=options.device, outputs=outputs
+    ) as session:
+        fps = session.source.fps
+        if session.source.live:
+            raise UsageError("a camera's frames have no end to export; record them first, and name the file")
+        for _, result in itertools.islice(session, options.frames):
+            poses.append(result.pose)
+            radiance = result.environment if light and result.environment is not None else radiance
+        camera = session.scene.camera.scaled_to(*session.source.size)
+        lit = dataclasses.replace(session.scene, camera=camera)
+    if all(pose is None for pose in poses):
+        raise SourceError("no frame shows the marker, so the camera has no way; see python -m warp_ar.doctor")
+    path = options.source if options.source is not None else lit.source.path if lit.source is not None else None
+    plate = None if path is None else Path(os.path.relpath(path, options.output.parent))
+    return Shot(lit, fps, tuple(poses), plate), radiance
+
+
+if __name__ == "__main__":
+    sys.exit(main())

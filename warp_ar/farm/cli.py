@@ -1,0 +1,170 @@
+"""The command: ``python -m warp_ar.farm run|status|resume|plan``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
+from warp_ar.errors import UsageError, printable
+from warp_ar.farm.jobs import parse_jobs, read_jobs
+from warp_ar.farm.manifest import Manifest, RunError, begin_run, clear_aside, load_run, locked
+from warp_ar.farm.status import read_status, status_lines, words_of_seconds
+
+MOST_WORKERS = 4096
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.farm",
+        description="Light many recordings, or make a data set of them, with several workers; resume after any death.",
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="run|status|resume|plan")
+    run = commands.add_parser("run", help="begin a run")
+    run.add_argument("jobs", type=Path, metavar="JOBS.toml", help="clips, and what is to be made of them")
+    run.add_argument("--output", type=Path, required=True, metavar="DIR", help="a new folder for everything")
+    resume = commands.add_parser("resume", help="go on with a run")
+    resume.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
+    resume.add_argument("--failed", action="store_true", help="try jobs again that have failed for good")
+    for command in (run, resume):
+        command.add_argument(
+            "--workers", type=int, metavar="N", help="workers here (default: one per GPU, or per 4 cores)"
+        )
+        command.add_argument(
+            "--ray",
+            nargs="?",
+            const="",
+            metavar="ADDRESS",
+            help="workers of a Ray cluster, or of one that is started here",
+        )
+    plan = commands.add_parser("plan", help="count jobs, try three of them on a few frames, say what all would take")
+    plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="clips, and what is to be made of them")
+    plan.add_argument("--workers", type=int, metavar="N", help="workers that there will be")
+    for command in (run, resume, plan):
+        command.add_argument("--device", default="auto", metavar="auto|cpu|cuda", help="where the kernels run")
+    status = commands.add_parser("status", help="say where a run stands")
+    status.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
+    status.add_argument("--json", action="store_true", help="as JSON")
+    return parser
+
+
+def command(options: argparse.Namespace) -> int:
+    """Do what the options ask for."""
+    workers = getattr(options, "workers", None)
+    if workers is not None and not 1 <= workers <= MOST_WORKERS:
+        raise UsageError(f"--workers {workers}: expected a number from 1 to {MOST_WORKERS}")
+    match options.command:
+        case "run":
+            return begin(options)
+        case "resume":
+            return resume(options)
+        case "plan":
+            return plan(options)
+    status = read_status(options.folder)
+    print(json.dumps(status, indent=1) if options.json else "\n".join(status_lines(options.folder, status)))
+    return EXIT_DONE
+
+
+def begin(options: argparse.Namespace) -> int:
+    """``farm run``."""
+    from warp_ar.farm.version import program_version
+
+    data = read_jobs(options.jobs)
+    parse_jobs(data, str(options.jobs))  # before a folder is made
+    begin_run(options.output, data, program_version())
+    return work(options, options.output)
+
+
+def resume(options: argparse.Namespace) -> int:
+    """``farm resume``."""
+    load_run(options.folder)
+    return work(options, options.folder)
+
+
+def work(options: argparse.Namespace, folder: Path) -> int:
+    """Work through what is open of a run."""
+    from warp_ar.farm.driver import Driver
+    from warp_ar.farm.version import program_version
+
+    data, version = load_run(folder)
+    mine = program_version()
+    if version != mine:
+        raise UsageError(
+            f"{folder} was begun by {version}; this is {mine}: install that version, or begin a new run, for "
+            "pictures of two programs are not of one kind"
+        )
+    jobs = parse_jobs(data, str(folder / "run.json"))
+    with locked(folder):
+        clear_aside(folder)
+        manifest = Manifest(folder, write=True)
+        try:
+            if getattr(options, "failed", False):
+                for key in list(manifest.failed):
+                    manifest.add("again", key, reason="resumed with --failed")
+            pool = _make_pool(options, jobs, folder)
+            summary = Driver(jobs, folder, manifest, pool, mine, say).run()
+        finally:
+            manifest.close()
+    return _tell(folder, summary.failed)
+
+
+def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
+    from warp_ar.farm.pool import ProcessPool, devices_of
+    from warp_ar.farm.work import Context
+
+    context = Context(jobs, folder.absolute(), "cpu")
+    if options.ray is None:
+        return ProcessPool(context, devices_of(options.device, options.workers))
+    from warp_ar.farm.ray_pool import RayPool
+
+    pool = RayPool(context, options.ray or None, options.workers)
+    if page := pool.dashboard():
+        say(f"Ray's page: http://{page}")
+    return pool
+
+
+def _tell(folder: Path, failed: dict[str, str]) -> int:
+    """Say how a run went; returns the exit code."""
+    status = read_status(folder)
+    counts = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(status["done"].items()))
+    print(printable(f"{folder}: {counts or 'nothing'} done, {status['frames']} frames, {status['bytes'] / 1e6:.1f} MB"))
+    if not failed:
+        return EXIT_DONE
+    print(f"{len(failed)} jobs failed:")
+    for key, why in sorted(failed.items())[:50]:
+        print(printable(f"  {key}: {why}"))
+    return EXIT_FAILED
+
+
+def plan(options: argparse.Namespace) -> int:
+    """``farm plan``."""
+    from warp_ar.farm.plan import make_plan
+    from warp_ar.farm.pool import devices_of
+
+    jobs = parse_jobs(read_jobs(options.jobs), str(options.jobs))
+    devices = devices_of(options.device, options.workers)
+    found = make_plan(jobs, devices[0], say)
+    for problem in found.problems:
+        say(problem)
+    kind = "segments" if jobs.dataset is None else "variations"
+    print(f"{found.clips} clips, {found.jobs} {kind}, {found.frames} frames to light, {found.surveyed} to survey")
+    print(
+        f"a frame: {found.frame_ms:.1f} ms lit and written, {found.survey_ms:.1f} ms surveyed; a job: "
+        f"{found.job_ms:.0f} ms beside its frames, at quality {jobs.settings.quality} on {devices[0]}"
+    )
+    for count in sorted({1, len(devices)}):
+        print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(count))}")
+    print(f"output: {found.bytes / 1e6:.1f} MB")
+    return EXIT_FAILED if found.problems else EXIT_DONE
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code.
+
+    0 all done, 1 a job failed or the run cannot go on, 2 bad usage or job file, 130 interrupted, 143 terminated.
+    """
+    return run_command(lambda: command(make_parser().parse_args(arguments)), RunError)

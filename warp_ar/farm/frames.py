@@ -1,0 +1,163 @@
+"""Frames of a part of a recording, at the times that they have in the whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import fractions
+from collections.abc import Generator
+from pathlib import Path
+
+import av
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SourceError, reason
+from warp_ar.input.frame_folder import FrameFolder
+from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource
+from warp_ar.input.sources import open_source
+from warp_ar.input.video_file import VideoFile
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrameIndex:
+    """Where the frames of a recording stand in time."""
+
+    ticks: npt.NDArray[np.int64]
+    """Time stamp of every frame, (n,), growing."""
+    tick: fractions.Fraction
+    """Seconds of a tick."""
+    seekable: bool
+    """Whether the time stamps are those of the file, so that a reader can go to one."""
+
+    @property
+    def length(self) -> int:
+        """Number of frames."""
+        return len(self.ticks)
+
+
+class VideoPart(VideoFile):
+    """Frames ``first`` to ``end`` of a video, each with the number and the time that it has in the whole.
+
+    Args:
+        path: The file.
+        index: Of its frames.
+        first: Number of the first frame.
+        end: Number behind the last.
+        fps: Show frame n at n / fps instead of at its own time.
+    """
+
+    def __init__(self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None) -> None:
+        super().__init__(path, fps=fps)
+        self._index, self._first, self._end = index, first, end
+        self.length = end - first
+
+    def _decode(self) -> Generator[Frame, None, None]:
+        ticks, tick = self._index.ticks, self._index.tick
+        if not self._index.seekable or self._first == 0:
+            for frame in super()._decode():
+                if frame.index >= self._end:
+                    return
+                if frame.index >= self._first:
+                    yield dataclasses.replace(frame, time=self._time_of(frame.index))
+            return
+        start = int(ticks[self._first])
+        with self._open() as container:
+            try:
+                container.seek(start, stream=container.streams.video[0], backward=True)
+            except (av.FFmpegError, OSError) as error:
+                raise SourceError(f"{self._path}: frame {self._first} cannot be gone to: {reason(error)}") from error
+            number = self._first
+            for image, stamp in self._pictures(container, start):
+                expected = float(ticks[number] * tick)
+                if stamp is None or abs(stamp - expected) > 0.5 * tick:
+                    raise SourceError(
+                        f"{self._path}: frame {number} is stamped {stamp} s, not {expected:g} s as its packet; "
+                        "leave segment_frames out, so that it is lit as one"
+                    )
+                yield Frame(number, self._time_of(number), image)
+                number += 1
+                if number == self._end:
+                    return
+        raise SourceError(f"{self._path} ends before frame {number}; its packets promise {self._end}")
+
+    def _passes(self) -> Generator[Frame, None, None]:
+        """One pass; frames keep the numbers of the whole."""
+        yield from self._decode()
+
+    def _time_of(self, number: int) -> float:
+        """Seconds of a frame since the first of the whole: by one formula, whichever part it is read in."""
+        ticks = self._index.ticks
+        return number / self.fps if self._retimed else float(int(ticks[number] - ticks[0]) * self._index.tick)
+
+
+class FolderPart(FrameFolder):
+    """Pictures ``first`` to ``end`` of a folder."""
+
+    def __init__(self, path: Path, first: int, end: int, fps: float) -> None:
+        super().__init__(path, fps=fps)
+        self._first = first
+        self._paths = self._paths[first:end]
+        self.length = len(self._paths)
+
+    def _passes(self) -> Generator[Frame, None, None]:
+        """One pass; pictures keep the numbers of the whole."""
+        yield from self._decode()
+
+    def _decode(self) -> Generator[Frame, None, None]:
+        for frame in super()._decode():
+            number = frame.index + self._first
+            yield dataclasses.replace(frame, index=number, time=number / self.fps)
+
+
+def index_frames(path: Path, fps: float | None) -> FrameIndex:
+    """Find out at what times the frames of a recording are; of a video only packets are read, nothing is decoded.
+
+    Args:
+        path: A video file or a folder of pictures.
+        fps: Frame n is shown at n / fps; None: at its own time.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
+    with open_source(path, fps=fps) as source:
+        if source.exposures:
+            raise SourceError(f"{path}: its frames alternate between exposures, which a farm does not light")
+        if not isinstance(source, VideoFile):
+            rate = fractions.Fraction(fps or DEFAULT_FPS).limit_denominator(1001)
+            return FrameIndex(np.arange(source.length or 0), 1 / rate, False)
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            kept = [p for p in container.demux(stream) if p.size and not p.is_discard]
+            stamps = [packet.pts for packet in kept]
+            tick, rate = stream.time_base, stream.average_rate or fractions.Fraction(30)
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise SourceError(f"{path} cannot be read as a video ({reason(error)})") from error
+    known = bool(stamps) and tick is not None and None not in stamps and len(set(stamps)) == len(stamps)
+    if not known:
+        return FrameIndex(np.arange(len(stamps)), 1 / fractions.Fraction(fps or rate).limit_denominator(1001), False)
+    ticks = np.array(sorted(s for s in stamps if s is not None), np.int64)
+    return FrameIndex(ticks, fractions.Fraction(tick), True)
+
+
+def open_part(path: Path, index: FrameIndex, first: int, end: int, fps: float | None) -> RecordedSource:
+    """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
+    with open_source(path, fps=fps) as source:
+        is_video = isinstance(source, VideoFile)
+    if is_video:
+        return VideoPart(path, index, first, end, fps)
+    return FolderPart(path, first, end, fps or DEFAULT_FPS)
+
+
+def mean_rate(ticks: npt.NDArray[np.int64], tick: fractions.Fraction) -> float:
+    """Frames a second of time stamps, ``tick`` seconds each."""
+    seconds = float(int(ticks[-1] - ticks[0]) * tick)
+    return (len(ticks) - 1) / seconds if seconds > 0.0 else DEFAULT_FPS
+
+
+def shown_ticks(index: FrameIndex, fps: float | None) -> tuple[npt.NDArray[np.int64], fractions.Fraction]:
+    """Time stamps of what is written, and seconds of their tick: the recording's own unless a rate is given."""
+    if fps is None:
+        return index.ticks, index.tick
+    rate = fractions.Fraction(fps).limit_denominator(1001)
+    return np.arange(index.length), 1 / rate

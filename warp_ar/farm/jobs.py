@@ -1,0 +1,296 @@
+"""A job file and the jobs that it stands for: (clip, segment or variation, scene, seed).
+
+A job names files; frames never leave the worker that decodes them. Jobs are numbered, not listed: those of a clip are
+known when the clip has been surveyed, and 100,000 of them take no memory before they are given out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import glob
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from warp_ar.errors import SceneError, reason
+from warp_ar.farm.catalogue import Dataset, check_dataset, read_dataset
+from warp_ar.farm.tables import JobsError, Table
+from warp_ar.files import bracket_depth, check_depth, is_file, is_folder, read_text
+from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
+from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
+
+SCHEMA = 1
+LIGHTS = ("follow", "fixed", "preroll")
+"""Ways to light a clip whose scene has a mirror ball: by what was captured for each frame, by what was captured at the
+clip's end, or by what each segment finds for itself from some frames before it on."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll")
+_CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What holds for all clips."""
+
+    quality: str = DEFAULT_PRESET
+    """A preset's name."""
+    light: str = "follow"
+    """One of ``LIGHTS``."""
+    segment_frames: int | None = None
+    """Frames of a segment; None: a clip is one."""
+    preroll: int = 48
+    """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clip:
+    """One recording."""
+
+    name: str
+    """Of its files; no other clip has it."""
+    scene: str
+    """A scene file or a bundled scene's name."""
+    source: Path | None = None
+    """A video or a folder of frames instead of the scene's own."""
+    light: Path | None = None
+    """Captured light instead of a mirror ball's."""
+    calibration: Path | None = None
+    """Of the camera, instead of the scene's numbers."""
+    first: int = 0
+    """Number of the first frame that is lit."""
+    end: int | None = None
+    """Number behind the last one; None: all."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JobFile:
+    """What a job file says."""
+
+    settings: Settings
+    clips: tuple[Clip, ...]
+    dataset: Dataset | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One piece of work, which one worker does as a whole."""
+
+    kind: str
+    """``survey`` (frames, poses and light of a clip), ``segment``, ``variation``, ``join`` or ``index``."""
+    clip: int = 0
+    """Number of the clip."""
+    number: int = 0
+    """Of the segment or variation in its clip."""
+    first: int = 0
+    """Number of the first frame, for segments and variations."""
+    end: int = 0
+    """Number behind the last one."""
+
+    def key(self, jobs: JobFile) -> str:
+        """Its name in the manifest."""
+        if self.kind == "index":
+            return "dataset/index"
+        name = jobs.clips[self.clip].name
+        return f"{name}/{self.kind}" + (f"-{self.number:06d}" if self.kind in ("segment", "variation") else "")
+
+    def place(self, jobs: JobFile) -> Path:
+        """Where its result lies, relative to the run's folder: a folder, or the last file of several."""
+        name = jobs.clips[self.clip].name
+        match self.kind:
+            case "survey":
+                return Path("clips") / name
+            case "segment":
+                return Path("parts") / name / f"{self.number:06d}"
+            case "variation":
+                assert jobs.dataset is not None
+                return Path("dataset/train") / f"{self.clip * jobs.dataset.variations + self.number:06d}"
+            case "join":
+                return Path(f"{name}.mp4")
+        return Path("dataset/annotations.json")
+
+
+def jobs_of_clip(jobs: JobFile, clip: int, length: int) -> int:
+    """How many segments or variations a clip has.
+
+    Args:
+        jobs: The job file.
+        clip: Number of the clip.
+        length: Frames that its source has.
+    """
+    if jobs.dataset is not None:
+        return jobs.dataset.variations
+    first, end = lit_range(jobs.clips[clip], length)
+    return -(-(end - first) // (jobs.settings.segment_frames or max(end - first, 1)))
+
+
+def job_of_clip(jobs: JobFile, clip: int, number: int, length: int) -> Job:
+    """One of a clip's segments or variations; arguments as ``jobs_of_clip``."""
+    first, end = lit_range(jobs.clips[clip], length)
+    if jobs.dataset is not None:
+        return Job("variation", clip, number, first, end)
+    size = jobs.settings.segment_frames or end - first
+    start = first + number * size
+    return Job("segment", clip, number, start, min(start + size, end))
+
+
+def lit_range(clip: Clip, length: int) -> tuple[int, int]:
+    """First frame that is lit of a clip of so many frames, and the one behind the last.
+
+    Raises:
+        JobsError: There are none.
+    """
+    end = length if clip.end is None else min(clip.end, length)
+    if clip.first >= end:
+        raise JobsError(f"clip {clip.name}: frames = [{clip.first}, {clip.end}], but it has {length} frames")
+    return clip.first, end
+
+
+def read_jobs(path: str | Path) -> dict[str, Any]:
+    """The text of a job file as data, with its patterns resolved to files and its paths in full.
+
+    Raises:
+        JobsError: It cannot be read, or a pattern matches nothing.
+    """
+    path = Path(path)
+    label = str(path)
+    text = read_text(path, JobsError, expected="TOML")
+    check_depth(bracket_depth(text), label, JobsError)
+    try:
+        data = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise JobsError(f"{label}: not valid TOML: {reason(error)}") from error
+    folder = path.absolute().parent
+    clips = data.get("clip")
+    if not isinstance(clips, list) or not clips:
+        raise JobsError(f'{label}: [[clip]] is missing: name at least one clip, such as scene = "desk"')
+    data["clip"] = [made for index, clip in enumerate(clips) for made in _resolved(label, folder, index, clip)]
+    data["folder"] = str(folder)
+    return data
+
+
+def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[str, Any]]:
+    """One entry for each file that a clip's path matches."""
+    table = Table(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
+    pattern = table.text("path")
+    if pattern is None or not glob.has_magic(pattern) or (folder / pattern).exists():
+        return [dict(table.data)]
+    found = sorted(glob.glob(pattern, root_dir=folder, recursive=True))
+    if not found:
+        table.fail("path", f"no file in {folder} matches")
+    if "name" in table and len(found) > 1:
+        table.fail("name", f"the pattern of path matches {len(found)} files, each named by its own; leave name out")
+    return [{**table.data, "path": name} for name in found]
+
+
+def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
+    """What ``read_jobs`` read, checked: every scene is loaded, every file looked for.
+
+    Args:
+        data: Of the file.
+        label: What messages call it.
+
+    Raises:
+        JobsError: A key is wrong or missing.
+        SceneError: A scene, or a file that it names, cannot be used.
+    """
+    folder = Path(data.get("folder", "."))
+    top = Table(label, folder, "", data, ("schema", "run", "clip", "dataset", "folder"))
+    if data.get("schema") != SCHEMA:
+        top.fail("schema", f"expected {SCHEMA}")
+    settings = _read_settings(Table(label, folder, "run", data.get("run", {}), _RUN_KEYS))
+    names: dict[str, int] = {}
+    clips = []
+    for index, entry in enumerate(data["clip"]):
+        clips.append(_read_clip(Table(label, folder, f"clip[{index}]", entry, _CLIP_KEYS), names))
+    dataset = None if "dataset" not in data else read_dataset(label, folder, data["dataset"])
+    if dataset is not None and settings.light == "preroll":
+        raise JobsError(
+            f'{label}: run.light = "preroll": a data set needs light that is captured once; "follow" or "fixed"'
+        )
+    jobs = JobFile(settings, tuple(clips), dataset)
+    for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
+        base = scene_of(jobs, scene)
+        if dataset is not None:
+            check_dataset(label, dataset, base)
+    return jobs
+
+
+def _read_settings(table: Table) -> Settings:
+    quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
+    size = table.integer("segment_frames", 0, low=1) if "segment_frames" in table else None
+    return Settings(quality, table.choice("light", LIGHTS, LIGHTS[0]), size, table.integer("preroll", 48, low=0))
+
+
+def _read_clip(table: Table, names: dict[str, int]) -> Clip:
+    """One clip; ``names`` holds how often a name was used."""
+    scene = table.text("scene") or "desk"
+    source, light, calibration = (table.path(key) for key in ("path", "light", "calibration"))
+    if source is not None and not (is_file(source) or is_folder(source)):
+        table.fail("path", f"there is no file or folder {source}")
+    for key, file in (("light", light), ("calibration", calibration)):
+        if file is not None and not is_file(file):
+            table.fail(key, f"there is no file {file}")
+    in_folder = table.folder / scene
+    if is_file(in_folder):
+        scene = str(in_folder)
+    name = table.text("name")
+    if name is not None and (not _NAME.fullmatch(name) or name in names):
+        table.fail("name", "expected letters, digits, dots and dashes that no other clip has")
+    if name is None:
+        stem = re.sub(r"[^A-Za-z0-9._-]+", "-", (source or Path(scene)).stem).strip(".-") or "clip"
+        name = stem[:80]
+        while name in names:
+            names[stem[:80]] += 1
+            name = f"{stem[:80]}-{names[stem[:80]]}"
+    names[name] = names.get(name, 0) + 1
+    first, end = table.pair("frames", (0, 0), low=0)
+    if "frames" in table and first == end:
+        table.fail("frames", "expected [first, behind the last], at least one frame")
+    return Clip(name, scene, source, light, calibration, first, end if "frames" in table else None)
+
+
+@functools.lru_cache(maxsize=256)
+def _load_scene(name: str) -> Scene:
+    return load_scene(Path(name) if is_file(name) else name)
+
+
+def scene_of(jobs: JobFile, clip: int) -> Scene:
+    """The scene of a clip, with its camera and its light.
+
+    Raises:
+        SceneError: It cannot be used.
+        JobsError: It names no source that can be read again.
+    """
+    spec = jobs.clips[clip]
+    scene = _load_scene(spec.scene)
+    if spec.calibration is not None:
+        scene = dataclasses.replace(scene, camera=load_calibration(spec.calibration, scene.camera.transfer))
+    if spec.light is not None:
+        captured = scene.captured or CapturedLight(spec.light)
+        scene = dataclasses.replace(scene, captured=dataclasses.replace(captured, file=spec.light))
+    own = scene.source
+    if spec.source is None and (own is None or own.path is None):
+        raise JobsError(f"clip {spec.name}: scene {spec.scene} names no recording; give the clip a path")
+    if spec.source is None and own is not None and own.exposures:
+        raise JobsError(f"clip {spec.name}: its frames alternate between exposures, which a farm does not light")
+    if scene.pose is not None and spec.source is not None and scene.has_marker:
+        raise SceneError(f"clip {spec.name}: scene {spec.scene} gives poses of its own recording; leave path out")
+    return scene
+
+
+def source_of(jobs: JobFile, clip: int) -> tuple[Path, float | None]:
+    """File or folder of a clip's frames, and the rate at which they are shown instead of their own, if any."""
+    spec, own = jobs.clips[clip], scene_of(jobs, clip).source
+    if spec.source is not None:
+        return spec.source, None
+    assert own is not None
+    assert own.path is not None
+    return own.path, own.fps
+
+
+def dumps(data: dict[str, Any]) -> str:
+    """What ``read_jobs`` gave, as JSON."""
+    return json.dumps(data, indent=1)

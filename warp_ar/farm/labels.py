@@ -1,0 +1,282 @@
+"""What is known of every picture of a data set, in the folders and files of BOP, with a COCO file beside them.
+
+A variation is a BOP scene: ``rgb``, ``depth``, ``mask`` (whole silhouettes) and ``mask_visib``, ``scene_gt.json``,
+``scene_gt_info.json`` and ``scene_camera.json``; beside them ``normals``, ``scene_light.json`` (the light of each
+frame), ``scene_gt_coco.json`` and ``scene.toml``, which shows the variation with ``python -m warp_ar.live``. Masks,
+depth and normals are those of the pixel's centre.
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar.device import exclusive
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SinkError, reason
+from warp_ar.farm.catalogue import ObjectSpec
+from warp_ar.farm.lighting import Lit
+from warp_ar.kernels.object_masks import trace_object_masks
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.output.folder_sink import PNG_OPTIONS
+from warp_ar.scene import Scene
+
+DEPTH_SCALE = 0.1
+"""Millimetres of a step of a depth map; 0 is nothing that is modelled, and whatever is beyond 6.5 m."""
+LAYERS = ("image", "ids", "depth", "normals")
+"""Outputs that labels are made from."""
+_THREADS = 2
+_WAITING = 64
+"""Pictures that may wait to be compressed."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+class LabelWriter:
+    """Writes the pictures and labels of one variation."""
+
+    def __init__(self, folder: Path, scene: Scene, kinds: Sequence[int], catalogue: Sequence[ObjectSpec]) -> None:
+        """Make the folders.
+
+        Args:
+            folder: Of the variation; it is there.
+            scene: The variation's, with its camera at the size of the frames.
+            kinds: Number in the catalogue of each object.
+            catalogue: What objects are drawn from.
+        """
+        self._folder, self._scene, self._kinds, self._catalogue = folder, scene, kinds, catalogue
+        self._threads = ThreadPoolExecutor(_THREADS, "warp_ar-labels")
+        self._pending: collections.deque[Future[None]] = collections.deque()
+        self._tables: dict[str, dict[str, Any]] = {name: {} for name in ("gt", "gt_info", "camera", "light")}
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+        self._masks: Any = None
+        self._light: tuple[int | None, list[list[float]] | None] | None = None
+        for name in ("rgb", "depth", "normals", "mask", "mask_visib"):
+            (folder / name).mkdir()
+
+    def __enter__(self) -> LabelWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._threads.shutdown(wait=True, cancel_futures=error is not None)
+
+    def write(self, lit: Lit, key: int | None) -> None:
+        """Take a frame that was just lit.
+
+        Args:
+            lit: The frame; no other has been lit by its pipeline since.
+            key: Number of the environment in the clip's survey; None: it is the same in all frames.
+
+        Raises:
+            SinkError: A file cannot be written.
+        """
+        assert lit.result is not None
+        assert lit.pose is not None
+        number, layers = lit.frame.index, lit.result.layers
+        whole = self._trace(lit.pipeline)
+        visible = layers["ids"]
+        self._put(f"rgb/{number:06d}.png", cv2.cvtColor(lit.image, cv2.COLOR_RGB2BGR))
+        depth = layers["depth"] * (1e3 / DEPTH_SCALE)
+        depth = np.where(np.isfinite(depth) & (depth < 65535.5), depth, 0.0)
+        self._put(f"depth/{number:06d}.png", np.rint(depth).astype(np.uint16))
+        normals = layers["normals"] @ lit.pose.rotation.T.astype(np.float32)
+        codes = (
+            np.rint((0.5 + 0.5 * np.clip(normals, -1.0, 1.0)) * 65535.0) * (layers["normals"] != 0).any(2)[..., None]
+        )
+        self._put(f"normals/{number:06d}.png", np.ascontiguousarray(codes[..., ::-1]).astype(np.uint16))
+        self._note_frame(lit)
+        self._note_light(lit, key)
+        poses, infos = [], []
+        for index, kind in enumerate(self._kinds):
+            silhouette = (whole >> np.uint64(index)) & np.uint64(1) != 0
+            seen = visible == index
+            self._put(f"mask/{number:06d}_{index:06d}.png", silhouette.astype(np.uint8) * 255)
+            self._put(f"mask_visib/{number:06d}_{index:06d}.png", seen.astype(np.uint8) * 255)
+            poses.append(self._pose(lit, index, kind))
+            infos.append(_info(silhouette | seen, seen, depth > 0.0))
+            if infos[-1]["px_count_visib"]:
+                self._annotate(number, kind, seen, infos[-1])
+        self._tables["gt"][str(number)] = poses
+        self._tables["gt_info"][str(number)] = infos
+
+    def _trace(self, pipeline: Pipeline) -> npt.NDArray[np.uint64]:
+        """Which objects are behind each pixel."""
+        arrays = pipeline.arrays
+        with exclusive(pipeline.device), wp.ScopedDevice(pipeline.device):
+            if self._masks is None:
+                self._masks = wp.zeros(arrays["rays"].shape, dtype=wp.uint64)
+            trace_object_masks(arrays["params"], arrays["rays"], arrays["ray_scene"], self._masks)
+            return np.array(self._masks.numpy())
+
+    def _pose(self, lit: Lit, index: int, kind: int) -> dict[str, Any]:
+        """From the model's millimetres to the camera's."""
+        assert lit.pose is not None
+        rotation, position = self._scene.objects[index].pose_at(lit.frame.time)
+        placed = lit.pose.rotation @ rotation
+        return {
+            "cam_R_m2c": _numbers(placed.ravel()),
+            "cam_t_m2c": _numbers(1e3 * lit.pose.apply(position)),
+            "obj_id": kind + 1,
+        }
+
+    def _note_frame(self, lit: Lit) -> None:
+        assert lit.pose is not None
+        camera, number = self._scene.camera, lit.frame.index
+        self._tables["camera"][str(number)] = {
+            "cam_K": _numbers(camera.matrix().ravel()),
+            "cam_dist": _numbers(camera.distortion),
+            "cam_R_w2c": _numbers(lit.pose.rotation.ravel()),
+            "cam_t_w2c": _numbers(1e3 * lit.pose.translation),
+            "depth_scale": DEPTH_SCALE,
+        }
+        self._images.append(
+            {"id": number, "file_name": f"rgb/{number:06d}.png", "width": camera.width, "height": camera.height}
+        )
+
+    def _note_light(self, lit: Lit, key: int | None) -> None:
+        """The environment as radiance in nine spherical harmonics, and the virtual lights where they are now."""
+        if self._light is None or self._light[0] != key:
+            environment = lit.pipeline.arrays.get("environment")
+            harmonics = None
+            if environment is not None:
+                with exclusive(lit.pipeline.device):
+                    harmonics = [_numbers(row) for row in _harmonics(environment.numpy())]
+            self._light = key, harmonics
+        lights = []
+        for light in self._scene.lights:
+            position, direction = light.pose_at(lit.frame.time)
+            lights.append(
+                {
+                    "kind": light.kind,
+                    "intensity": light.intensity,
+                    "color": list(light.color),
+                    "position": _numbers(position),
+                    "direction": _numbers(direction),
+                    "radius": light.radius,
+                    "inner_angle": light.inner_angle,
+                    "outer_angle": light.outer_angle,
+                }
+            )
+        self._tables["light"][str(lit.frame.index)] = {
+            "environment_key": key,
+            "environment_harmonics": self._light[1],
+            "exposure_scale": self._scene.exposure.scale,
+            "lights": lights,
+        }
+
+    def _annotate(self, number: int, kind: int, seen: Mask, info: dict[str, Any]) -> None:
+        self._annotations.append(
+            {
+                "id": len(self._annotations) + 1,
+                "image_id": number,
+                "category_id": kind + 1,
+                "iscrowd": 0,
+                "area": info["px_count_visib"],
+                "bbox": info["bbox_visib"],
+                "segmentation": {"size": list(seen.shape), "counts": run_lengths(seen)},
+                "visib_fract": info["visib_fract"],
+            }
+        )
+
+    def _put(self, name: str, picture: npt.NDArray[Any]) -> None:
+        """Have a picture compressed and written."""
+        while self._pending and (self._pending[0].done() or len(self._pending) >= _WAITING):
+            self._pending.popleft().result()
+        self._pending.append(self._threads.submit(_write_png, self._folder / name, picture))
+
+    def finish(self) -> int:
+        """Wait for the pictures, write the tables; returns the number of frames.
+
+        Raises:
+            SinkError: A file cannot be written.
+        """
+        while self._pending:
+            self._pending.popleft().result()
+        coco = {
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": categories(self._catalogue),
+        }
+        names = {**{f"scene_{name}": table for name, table in self._tables.items()}, "scene_gt_coco": coco}
+        for name, table in names.items():
+            path = self._folder / f"{name}.json"
+            try:
+                path.write_text(json.dumps(table), encoding="utf-8")
+            except OSError as error:
+                raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+        return len(self._images)
+
+
+def categories(catalogue: Sequence[ObjectSpec]) -> list[dict[str, Any]]:
+    """What labels mean, as COCO has it."""
+    return [{"id": index + 1, "name": spec.name, "supercategory": "object"} for index, spec in enumerate(catalogue)]
+
+
+def run_lengths(mask: Mask) -> list[int]:
+    """A mask as COCO's run lengths: columns one after another, first the pixels that are not set."""
+    flat = mask.T.ravel().view(np.uint8)
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    counts = np.diff(np.concatenate([[0], ends, [len(flat)]])).tolist()
+    return [0, *counts] if flat[0] else list(counts)
+
+
+def _info(whole: Mask, seen: Mask, measured: Mask) -> dict[str, Any]:
+    """BOP's numbers of one object in one picture; ``whole`` holds what is in the picture, not what is beside it."""
+    pixels, visible = int(whole.sum()), int(seen.sum())
+    return {
+        "bbox_obj": _box(whole),
+        "bbox_visib": _box(seen),
+        "px_count_all": pixels,
+        "px_count_valid": int((whole & measured).sum()),
+        "px_count_visib": visible,
+        "visib_fract": visible / pixels if pixels else 0.0,
+    }
+
+
+def _box(mask: Mask) -> list[int]:
+    """x, y, width, height of what is set, in pixels; -1 where nothing is."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return [-1, -1, -1, -1]
+    return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
+
+
+def _numbers(values: Any) -> list[float]:
+    return [round(float(v), 9) for v in values]
+
+
+def _harmonics(environment: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Coefficients (9, 3) of a map's radiance in the real spherical harmonics of order 0 to 2.
+
+    In the order and with the factors of Ramamoorthi and Hanrahan, "An Efficient Representation for Irradiance
+    Environment Maps", 2001: 1; y, z, x; xy, yz, 3zz - 1, xz, xx - yy.
+    """
+    height = len(environment)
+    x, y, z = np.moveaxis(latlong_directions(height), -1, 0)
+    factors = (0.282095, 0.488603, 0.488603, 0.488603, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274)
+    terms = (np.ones_like(x), y, z, x, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y)
+    basis = np.stack([f * t for f, t in zip(factors, terms, strict=True)]) * texel_solid_angles(height)
+    return np.asarray(np.einsum("nhw,hwc->nc", basis, environment.astype(np.float64)))
+
+
+def _write_png(path: Path, picture: npt.NDArray[Any]) -> None:
+    done, data = cv2.imencode(".png", picture, PNG_OPTIONS if picture.ndim == 3 else ())
+    if not done:
+        raise SinkError(f"{path} cannot be encoded as PNG")
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error

@@ -1,0 +1,264 @@
+"""What has been done, kept so that nothing is lost and nothing done twice.
+
+``manifest.jsonl`` has one line for each job that is done or has failed for good, and one for each try that failed. A
+line is appended by one write and synchronised; a line that a crash cut off is cut away when the file is opened again.
+A job's outputs are written aside, and moved to their place by one rename when they are whole, with a ``record.json``
+that says of what job they are: outputs without a line are taken over, a line without outputs is forgotten.
+
+Only one driver at a time has a run: it holds a lock on the folder, which its death frees.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from warp_ar.errors import UsageError, WarpArError, reason
+from warp_ar.files import write_whole
+
+MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
+ASIDE = ".aside"
+"""Folder of outputs that are not whole yet."""
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+
+class RunError(WarpArError):
+    """A run cannot go on."""
+
+
+def is_no_space(error: BaseException | None) -> bool:
+    """Whether an error, or what caused it, is a full disk."""
+    while error is not None:
+        if getattr(error, "errno", None) in _NO_SPACE:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+class Manifest:
+    """The lines of a run, and what they say."""
+
+    def __init__(self, folder: Path, *, write: bool) -> None:
+        """Read what is there.
+
+        Args:
+            folder: Of the run.
+            write: Whether lines will be added; else a line that is being written is left alone.
+
+        Raises:
+            RunError: It cannot be read, or a line in its middle is damaged.
+        """
+        self.path = folder / MANIFEST
+        self.done: dict[str, dict[str, Any]] = {}
+        """Records of jobs that are done, by their keys."""
+        self.failed: dict[str, str] = {}
+        """Reasons of jobs that failed for good."""
+        self.tries: dict[str, int] = {}
+        """Tries that failed of jobs that are neither."""
+        self._file = -1
+        try:
+            data = self.path.read_bytes() if self.path.exists() else b""
+        except OSError as error:
+            raise RunError(f"{self.path} cannot be read: {reason(error)}") from error
+        whole = data[: data.rfind(b"\n") + 1]
+        for number, line in enumerate(whole.splitlines(), 1):
+            try:
+                self._take(json.loads(line))
+            except (ValueError, KeyError, TypeError) as error:
+                raise RunError(
+                    f"{self.path}: line {number} is damaged ({reason(error)}); remove the line and resume"
+                ) from error
+        if write:
+            self._open(len(whole))
+
+    def _open(self, size: int) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
+        try:
+            self._file = os.open(self.path, flags, 0o666)
+            os.ftruncate(self._file, size)
+        except OSError as error:
+            raise RunError(f"{self.path} cannot be written: {reason(error)}") from error
+        self._size = size
+
+    def _take(self, line: dict[str, Any]) -> None:
+        key = line["job"]
+        match line["state"]:
+            case "done":
+                self.done[key] = {
+                    name: line.get(name) for name in ("frames", "bytes", "length", "found") if name in line
+                }
+                self.failed.pop(key, None)
+            case "failed":
+                self.failed[key] = line["reason"]
+            case "try":
+                self.tries[key] = self.tries.get(key, 0) + 1
+            case "again":
+                self.failed.pop(key, None)
+                self.tries.pop(key, None)
+                self.done.pop(key, None)
+
+    def add(self, state: str, key: str, **values: Any) -> None:
+        """Append a line: ``done``, ``failed``, ``try``, or ``again`` for a job whose outputs have gone.
+
+        Raises:
+            RunError: It cannot be written; the file is as it was.
+        """
+        line = {"state": state, "job": key, **values}
+        data = (json.dumps(line) + "\n").encode()
+        try:
+            written = os.write(self._file, data)
+            if written < len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(self._file)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._size)
+            raise RunError(f"{self.path} cannot be written: {reason(error)}") from error
+        self._size += len(data)
+        self._take(line)
+
+    def close(self) -> None:
+        """Let the file go."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Have a run for oneself.
+
+    Raises:
+        RunError: Another driver has it.
+    """
+    import fcntl
+
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
+    file = os.open(folder / LOCK, flags, 0o666)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RunError(f"{folder} is being worked on by another driver; see: farm status {folder}") from error
+        yield
+    finally:
+        os.close(file)
+
+
+def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
+    """Make a run's folder and write what it is to do.
+
+    Raises:
+        UsageError: The folder holds something else.
+        RunError: It cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / RUN).exists():
+            raise UsageError(f"{folder} holds a run already; go on with: farm resume {folder}, or name another folder")
+        if left := [name for name in os.listdir(folder) if name != LOCK]:
+            raise UsageError(f"{folder} is not empty (it holds {left[0]}); name a new folder")
+        text = json.dumps({"program": "warp_ar", "version": version, "jobs": data})
+        write_whole(folder / RUN, text.encode())
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {reason(error)}") from error
+
+
+def load_run(folder: Path) -> tuple[dict[str, Any], str]:
+    """What a run is to do, and the version that began it.
+
+    Raises:
+        UsageError: There is no run in the folder.
+        RunError: It is damaged.
+    """
+    path = folder / RUN
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return data["jobs"], str(data["version"])
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"{folder} holds no run ({RUN} is missing); begin one with: farm run JOBS.toml --output {folder}"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path} cannot be read: {reason(error)}") from error
+
+
+def clear_aside(folder: Path) -> None:
+    """Remove what workers that died left."""
+    shutil.rmtree(folder / ASIDE, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def aside(folder: Path, token: str) -> Iterator[Path]:
+    """An empty folder for outputs that are not whole yet; it is gone afterwards, wherever they were moved to."""
+    path = folder / ASIDE / token
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir(parents=True)
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
+    """Move a folder of outputs to its place; if another worker was first, its outputs stay, for they are the same.
+
+    Args:
+        part: The folder, on the same disk.
+        place: Where it goes.
+        key: Of the job.
+
+    Returns:
+        Bytes, and a digest over names and contents.
+    """
+    size, digest = 0, hashlib.sha256()
+    for path in sorted(path for path in part.rglob("*") if path.is_file()):
+        digest.update(path.relative_to(part).as_posix().encode() + b"\0")
+        with open(path, "rb") as stream:
+            digest.update(hashlib.file_digest(stream, "sha256").digest())
+            os.fsync(stream.fileno())
+        size += path.stat().st_size
+    told = {"job": key, "bytes": size, "sha256": digest.hexdigest()}
+    (part / RECORD).write_text(json.dumps(told), encoding="utf-8")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        part.rename(place)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY) or record_at(place, key) is None:
+            raise
+    _sync_folder(place.parent)
+    return told
+
+
+def publish_file(part: Path, place: Path) -> None:
+    """Move one file to its place, which it takes from a file that stood there."""
+    with open(part, "rb") as stream:
+        os.fsync(stream.fileno())
+    place.parent.mkdir(parents=True, exist_ok=True)
+    part.replace(place)
+    _sync_folder(place.parent)
+
+
+def _sync_folder(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        file = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+
+def record_at(place: Path, key: str) -> dict[str, Any] | None:
+    """The record of whole outputs of a job, or None."""
+    try:
+        told = json.loads((place / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return told if isinstance(told, dict) and told.get("job") == key else None

@@ -1,0 +1,249 @@
+"""Workers as processes of this machine: one per GPU, or per group of cores.
+
+A worker is told of jobs and tells of frames through a pipe; frames and results never pass through it. Should the driver
+die, however it dies, the pipe ends and the worker with it. Each keeps to its own cores, and BLAS to one thread, so that
+results do not depend on how many workers there are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import multiprocessing
+import multiprocessing.connection
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from warp_ar.device import usable_cores
+from warp_ar.farm.jobs import Job
+from warp_ar.farm.version import program_version
+from warp_ar.farm.work import Context, Outcome, Work
+
+TELL_SECONDS = 0.5
+"""Between two messages about frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Event:
+    """What a worker has to say."""
+
+    worker: int
+    kind: str
+    """``ready`` (with its version), ``frames`` (with their number), ``outcome``, or ``died`` (with how)."""
+    value: Any = None
+
+
+class Pool(Protocol):
+    """Workers, wherever they are."""
+
+    size: int
+    """How many."""
+    names: Sequence[str]
+    """What each is: its device."""
+
+    def give(self, worker: int, job: Job, arguments: Any) -> None:
+        """Hand a job to a worker that has none."""
+
+    def wait(self, seconds: float) -> list[Event]:
+        """What was said since the last call; waits that long at most for something."""
+
+    def close(self) -> None:
+        """End every worker at once."""
+
+
+def devices_of(device: str, workers: int | None) -> list[str]:
+    """Device of each worker.
+
+    Args:
+        device: ``auto``, ``cpu`` or ``cuda``.
+        workers: How many; None: one per GPU, or one per four cores.
+    """
+    from warp_ar.device import resolve_device
+
+    first = resolve_device(device)
+    if first.is_cpu:
+        return ["cpu"] * (workers or max(1, usable_cores() // 4))
+    import warp as wp
+
+    found = [str(gpu) for gpu in wp.get_cuda_devices()] if device in ("auto", "cuda") else [str(first)]
+    return [found[n % len(found)] for n in range(workers or len(found))]
+
+
+def cores_of(workers: int) -> list[list[int]]:
+    """Cores of each worker: as evenly as they go, and shared where there are more workers than cores."""
+    if not hasattr(os, "sched_getaffinity"):
+        return [[] for _ in range(workers)]
+    cores = sorted(os.sched_getaffinity(0))
+    if workers >= len(cores):
+        return [[cores[n % len(cores)]] for n in range(workers)]
+    ends = [round(n * len(cores) / workers) for n in range(workers + 1)]
+    return [cores[a:b] for a, b in itertools.pairwise(ends)]
+
+
+class ProcessPool:
+    """Workers as processes, started anew where they die."""
+
+    def __init__(self, context: Context, devices: Sequence[str]) -> None:
+        """Start them.
+
+        Args:
+            context: Of the run; each worker gets its own device and number.
+            devices: Of each worker.
+        """
+        self.size, self.names = len(devices), list(devices)
+        self._context, self._cores = context, cores_of(len(devices))
+        self._spawn = multiprocessing.get_context("spawn")
+        self._workers: list[tuple[Any, Any]] = []
+        for worker in range(self.size):
+            self._workers.append(self._start(worker))
+
+    def pids(self) -> list[int]:
+        """Processes of the workers."""
+        return [process.pid for process, _ in self._workers]
+
+    def _start(self, worker: int) -> tuple[Any, Any]:
+        mine, theirs = self._spawn.Pipe()
+        context = dataclasses.replace(self._context, device=self.names[worker], worker=worker)
+        process = self._spawn.Process(
+            target=_serve, args=(theirs, context, self._cores[worker]), name=f"warp_ar-farm-{worker}", daemon=True
+        )
+        with _environment(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1"):
+            process.start()
+        theirs.close()
+        return process, mine
+
+    def give(self, worker: int, job: Job, arguments: Any) -> None:
+        """As ``Pool.give``; that the worker has died is told by the next ``wait``."""
+        with contextlib.suppress(OSError):
+            self._workers[worker][1].send((job, arguments))
+
+    def wait(self, seconds: float) -> list[Event]:
+        """As ``Pool.wait``; a worker that died has been replaced."""
+        pipes: dict[Any, int] = {pipe: worker for worker, (_, pipe) in enumerate(self._workers)}
+        events: list[Event] = []
+        heard: list[Any] = multiprocessing.connection.wait(list(pipes), seconds)
+        for pipe in heard:
+            worker = pipes[pipe]
+            try:
+                while pipe.poll():
+                    kind, value = pipe.recv()
+                    events.append(Event(worker, kind, value))
+            except (EOFError, OSError):
+                events.append(Event(worker, "died", self._end(worker)))
+                self._workers[worker] = self._start(worker)
+        return events
+
+    def _end(self, worker: int) -> int:
+        """Exit code of a worker whose pipe has ended."""
+        process, pipe = self._workers[worker]
+        pipe.close()
+        process.join(5.0)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+        return int(process.exitcode or 0)
+
+    def close(self) -> None:
+        """As ``Pool.close``."""
+        for process, pipe in self._workers:
+            pipe.close()
+            process.kill()
+        for process, _ in self._workers:
+            process.join()
+
+
+@contextlib.contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    """Environment variables for processes that are started within."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _serve(pipe: Any, context: Context, cores: Sequence[int]) -> None:
+    """A worker's process: does jobs until its pipe ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver decides what an interrupt ends
+    if cores:
+        os.sched_setaffinity(0, cores)
+    _write_to_log(context.folder / "log" / f"worker-{context.worker}.log")
+    import cv2
+
+    cv2.setNumThreads(max(1, len(cores)))
+    jobs: queue.SimpleQueue[tuple[Job, Any]] = queue.SimpleQueue()
+
+    def listen() -> None:
+        try:
+            while True:
+                jobs.put(pipe.recv())
+        except (EOFError, OSError):
+            os._exit(1)  # the driver is gone: what is half done is nobody's
+
+    threading.Thread(target=listen, name="warp_ar-pipe", daemon=True).start()
+    work = Work(context)
+    _say(pipe, "ready", program_version())
+    while True:
+        job, arguments = jobs.get()
+        _say(pipe, "outcome", work.do(job, Teller(lambda frames: _say(pipe, "frames", frames)), arguments))
+
+
+class Teller:
+    """Passes on how many frames are done, not too often."""
+
+    def __init__(self, say: Any) -> None:
+        """Call ``say`` with a number now and then."""
+        self._say, self._last = say, time.monotonic()
+
+    def __call__(self, frames: int) -> None:
+        """Note that so many are done."""
+        now = time.monotonic()
+        if now - self._last >= TELL_SECONDS:
+            self._last = now
+            self._say(frames)
+
+
+def _say(pipe: Any, kind: str, value: str | int | Outcome) -> None:
+    try:
+        pipe.send((kind, value))
+    except OSError:
+        os._exit(1)
+
+
+def _write_to_log(path: Path) -> None:
+    """Have what native code prints go to a file."""
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        for stream in (1, 2):
+            os.dup2(file, stream)
+        os.close(file)
+        sys.stdout = sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  (for as long as the process lives)
+
+
+def words_of_exit(code: int) -> str:
+    """How a process ended."""
+    if code >= 0:
+        return f"its worker ended with exit code {code}"
+    with contextlib.suppress(ValueError):
+        return f"its worker was ended by {signal.Signals(-code).name}"
+    return f"its worker was ended by signal {-code}"
+
+
+def is_from_outside(code: int) -> bool:
+    """Whether a process was ended by somebody else: an operator, the system that ran out of memory, a node's end."""
+    outside = {getattr(signal, name, None) for name in ("SIGKILL", "SIGTERM", "SIGHUP", "SIGINT")}
+    return code < 0 and -code in {int(number) for number in outside if number is not None}

@@ -1,0 +1,82 @@
+"""Where a run stands, from its folder alone: a driver need not be there."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from warp_ar.errors import printable
+from warp_ar.farm.manifest import PROGRESS, Manifest, load_run
+
+STALE_SECONDS = 15.0
+"""Since the last word of a driver, after which it is taken to be gone."""
+
+
+def read_status(folder: Path) -> dict[str, Any]:
+    """What is done, what has failed, and what is being done.
+
+    Raises:
+        UsageError: There is no run.
+        RunError: It cannot be read.
+    """
+    data, version = load_run(folder)
+    manifest = Manifest(folder, write=False)
+    progress: dict[str, Any] = {}
+    try:
+        progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        progress = {}
+    kinds: dict[str, int] = {}
+    for key in manifest.done:
+        kind = key.rsplit("/", 1)[1].split("-")[0]
+        kinds[kind] = kinds.get(kind, 0) + 1
+    return {
+        "version": version,
+        "clips": len(data["clip"]),
+        "done": kinds,
+        "frames": sum(
+            int(record.get("frames") or 0)
+            for key, record in manifest.done.items()
+            if key.rsplit("/", 1)[1].startswith(("segment", "variation"))
+        ),
+        "bytes": sum(int(record.get("bytes") or 0) for record in manifest.done.values()),
+        "failed": manifest.failed,
+        "progress": progress,
+        "running": bool(progress) and time.time() - float(progress.get("time", 0)) < STALE_SECONDS,
+    }
+
+
+def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:
+    """The same in words."""
+    done = ", ".join(f"{count} {kind}{'s' if count != 1 else ''}" for kind, count in sorted(status["done"].items()))
+    lines = [f"{folder}: {status['clips']} clips; done: {done or 'nothing yet'}"]
+    lines.append(
+        f"{status['frames']} frames lit, {status['bytes'] / 1e6:.1f} MB written, {len(status['failed'])} jobs failed"
+    )
+    lines += [f"failed: {key}: {why}" for key, why in sorted(status["failed"].items())[:20]]
+    if len(status["failed"]) > 20:
+        lines.append(f"and {len(status['failed']) - 20} more; all are in {folder / 'manifest.jsonl'}")
+    progress = status["progress"]
+    if not status["running"]:
+        return [
+            *lines,
+            f"no driver is at work; go on with: farm resume {folder}" if progress else "no driver has begun",
+        ]
+    lines.append(
+        f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {progress['clips_surveyed']} clips surveyed"
+    )
+    for number, worker in enumerate(progress["workers"]):
+        what = f"{worker['job']}, frame {worker['frames']}" if worker["job"] else "waiting"
+        lines.append(f"worker {number} on {worker['device']}: {worker['fps']:.1f} frames/s, {what}")
+    left = progress.get("seconds_left")
+    lines.append("time left: too early to say" if left is None else f"time left: {words_of_seconds(left)}")
+    return [printable(line) for line in lines]
+
+
+def words_of_seconds(seconds: float) -> str:
+    """A duration."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

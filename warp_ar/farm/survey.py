@@ -1,0 +1,256 @@
+"""The first, cheap pass over a clip: where its camera stood in every frame, and by what light.
+
+All segments and variations of the clip start from it: poses are given, the light is given, and so a frame's picture
+does not depend on which frames were lit before it. The file is a ZIP of NumPy arrays, as ``numpy.load`` reads it:
+
+- ``ticks`` (n,) int64 and ``tick`` (2,) int64: time stamps of the frames, and the seconds of a tick as a fraction;
+- ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
+- ``saturation`` (3,) int64: codes at which the camera's channels saturate;
+- ``size`` (2,) int64: width and height of the frames in pixels;
+- ``keys`` (k,) int64: numbers of the frames from which on ``light_000000`` ... hold, each float32 (h, 2 h, 3), and
+  ``emitters_000000`` ... where the quality finds their places.
+
+A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
+value``) since the last key: the tolerance within which stages that read the environment do not run again either.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fractions
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.device import exclusive
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SceneError, SourceError, reason
+from warp_ar.farm.frames import FrameIndex, index_frames, open_part
+from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
+from warp_ar.input.sources import open_source
+from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
+from warp_ar.light.captured import Light, find_emitters
+from warp_ar.scene import CapturedLight, Pose, Scene
+from warp_ar.stages.features import has_environment
+
+Map = npt.NDArray[np.float32]
+
+NAME = "survey.npz"
+LIGHT = "light.exr"
+"""The environment at the clip's end, with the emitters that were found."""
+_MANTISSA = 12
+"""Bits of a radiance that are kept: a relative error of 2^-13, a hundredth of what a key may be off; the rest is noise
+that does not compress."""
+
+
+class Survey:
+    """What a survey found; maps are read when they are asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open the survey of a folder.
+
+        Raises:
+            SourceError: It is damaged or not there.
+        """
+        self._path = folder / NAME
+        self.light_file = folder / LIGHT
+        try:
+            # Opened here: of a damaged file NumPy leaves its own open.
+            with open(self._path, "rb") as stream, np.load(stream) as values:
+                numerator, denominator = (int(v) for v in values["tick"])
+                tick = fractions.Fraction(numerator, denominator)
+                self.index = FrameIndex(values["ticks"], tick, bool(values["seekable"]))
+                self.poses: npt.NDArray[np.float64] = values["poses"]
+                self.saturation: npt.NDArray[np.int64] = values["saturation"]
+                self.keys: npt.NDArray[np.int64] = values["keys"]
+                width, height = (int(v) for v in values["size"])
+                self.size = width, height
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
+
+    def pose(self, frame: int) -> Pose | None:
+        """Where the camera stood; None where the marker was lost."""
+        row = self.poses[frame]
+        return None if np.isnan(row[0]) else Pose(row[:9].reshape(3, 3), row[9:])
+
+    def key_of(self, frame: int) -> int:
+        """Number of the map that holds for a frame."""
+        return max(int(np.searchsorted(self.keys, frame, side="right")) - 1, 0)
+
+    def light(self, key: int) -> tuple[Map, npt.NDArray[Any] | None]:
+        """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known."""
+        with np.load(self._path) as values:
+            name = f"emitters_{key:06d}"
+            return np.asarray(values[f"light_{key:06d}"], np.float32), values.get(name)
+
+
+class _Writer:
+    """A ZIP of arrays that is the same for the same arrays."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+
+    def add(self, name: str, values: npt.ArrayLike) -> None:
+        buffer = io.BytesIO()
+        np.save(buffer, np.asarray(values), allow_pickle=False)
+        info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+        info.compress_type = zipfile.ZIP_DEFLATED
+        self._file.writestr(info, buffer.getvalue(), compresslevel=1)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Callable[[int], None]) -> dict[str, Any]:
+    """Survey a clip.
+
+    Args:
+        jobs: The job file.
+        clip: Number of the clip.
+        folder: Where to write; it is there, and empty.
+        device: ``cpu`` or ``cuda:N``.
+        tell: Called with the frames that have been looked at.
+
+    Returns:
+        Frames of the clip, and those whose marker was found.
+
+    Raises:
+        WarpArError: The clip or its scene cannot be used.
+    """
+    path, fps = source_of(jobs, clip)
+    index = index_frames(path, fps)
+    first, end = lit_range(jobs.clips[clip], index.length)
+    scene = scene_of(jobs, clip)
+    poses = np.full((index.length, 12), np.nan)
+    look = _Look(jobs, scene, folder, poses)
+    writer = _Writer(folder / NAME)
+    try:
+        if jobs.settings.light != "preroll":
+            _look_at_frames(jobs, clip, look, index, writer, device, tell)
+        writer.add("ticks", index.ticks)
+        writer.add("tick", [index.tick.numerator, index.tick.denominator])
+        writer.add("seekable", index.seekable)
+        writer.add("poses", poses)
+        with open_source(path, fps=fps) as source:
+            writer.add("size", source.size)
+        writer.add("saturation", look.saturation)
+        writer.add("keys", look.keys)
+    finally:
+        writer.close()
+    found = int(np.isfinite(poses[first:end, 0]).sum())
+    if jobs.settings.light != "preroll" and not found:
+        raise SourceError(f"{path}: no marker was found in frames {first} to {end - 1}: nothing can be placed there")
+    return {"length": index.length, "found": found, "keys": len(look.keys)}
+
+
+@dataclasses.dataclass
+class _Look:
+    """What is gathered while frames flow."""
+
+    jobs: JobFile
+    scene: Scene
+    folder: Path
+    poses: npt.NDArray[np.float64]
+    keys: list[int] = dataclasses.field(default_factory=list)
+    saturation: npt.NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.full(3, 255))
+    last: Map | None = None
+    emitters: npt.NDArray[Any] | None = None
+    """Of the last key, as records of ``Emitter``."""
+
+    @property
+    def captures(self) -> bool:
+        """Whether the light is the frames' own, not a file's."""
+        return self.scene.captured is None and has_environment(self.scene)
+
+    def take(self, frame: int, environment: Map, pipeline: Pipeline, writer: _Writer) -> None:
+        """Keep an environment if it has moved since the last one that was kept, or its emitters have."""
+        emitters = None
+        if "emitters" in pipeline.arrays:
+            with exclusive(pipeline.device):
+                emitters = np.array(pipeline.arrays["emitters"].numpy())
+        if self.last is not None:
+            tolerated = CHANGE_FLOOR + CHANGE_SHARE * np.abs(self.last)
+            same = emitters is None or (self.emitters is not None and emitters.tobytes() == self.emitters.tobytes())
+            if same and not (np.abs(environment - self.last) > tolerated).any():
+                return
+        self.last, self.emitters = _rounded(environment), emitters
+        writer.add(f"light_{len(self.keys):06d}", self.last)
+        if emitters is not None:
+            writer.add(f"emitters_{len(self.keys):06d}", emitters)
+        self.keys.append(frame)
+
+
+def _look_at_frames(
+    jobs: JobFile,
+    clip: int,
+    look: _Look,
+    index: FrameIndex,
+    writer: _Writer,
+    device: str,
+    tell: Callable[[int], None],
+) -> None:
+    """Follow the camera and the light through the clip."""
+    path, fps = source_of(jobs, clip)
+    first, end = lit_range(jobs.clips[clip], index.length)
+    given = look.scene.pose
+    if given is not None:
+        for number in range(first, end):
+            rotation, translation = given.at(number)
+            look.poses[number] = (*np.ravel(rotation), *np.ravel(translation))
+        if not look.captures:
+            return
+    outputs = ("pose", "environment") if look.captures else ("pose",)
+    environment: Map | None = None
+    with open_part(path, index, first, end, fps) as source:
+        pipeline = Pipeline(
+            look.scene,
+            device=device,
+            quality=jobs.settings.quality,
+            size=source.size,
+            outputs=outputs,
+            synchronous=True,
+        )
+        with pipeline:
+            for frame in source:
+                pose = None if given is None else Pose(*given.at(frame.index))
+                result = pipeline(frame.image, time_seconds=frame.time, pose=pose)
+                if result.pose is not None:
+                    look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
+                    environment = result.environment if look.captures else None
+                    if environment is not None and jobs.settings.light == "follow":
+                        look.take(frame.index, environment, pipeline, writer)
+                tell(frame.index - first + 1)
+            look.saturation = pipeline.inputs.saturation.levels
+            if environment is None:
+                return
+            if jobs.settings.light == "fixed":
+                look.take(first, environment, pipeline, writer)
+    kept = _rounded(environment)
+    emitters = find_emitters(kept, np.zeros_like(kept), 0.0)
+    Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
+
+
+def _rounded(values: Map) -> Map:
+    """Values with the last bits of their mantissa rounded away."""
+    drop = 23 - _MANTISSA
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    return ((bits + np.uint32(1 << (drop - 1))) & np.uint32(0xFFFFFFFF << drop & 0xFFFFFFFF)).view(np.float32)
+
+
+def lit_scene(jobs: JobFile, clip: int, survey: Survey) -> Scene:
+    """The scene of a clip, lit by what its survey captured.
+
+    Raises:
+        SceneError: The light cannot be read.
+    """
+    scene = scene_of(jobs, clip)
+    if scene.captured is not None or not has_environment(scene):
+        return scene
+    if not survey.light_file.is_file():
+        raise SceneError(f"{survey.light_file} is not there; remove its folder and resume")
+    return dataclasses.replace(scene, captured=CapturedLight(survey.light_file))

@@ -1,0 +1,210 @@
+"""What a worker does with a job, in whatever process or actor it runs: files in, files out, a record back."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from warp_ar.errors import WarpArError, reason
+from warp_ar.farm.dataset_files import write_dataset_files
+from warp_ar.farm.draws import NoPlace, draw_variation
+from warp_ar.farm.frames import mean_rate, shown_ticks
+from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
+from warp_ar.farm.labels import LAYERS, LabelWriter
+from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
+from warp_ar.farm.part_video import PartSink, join_parts
+from warp_ar.farm.survey import lit_scene, survey_clip
+from warp_ar.farm.version import program_version
+from warp_ar.scene import SourceSpec, dumps_scene
+
+PART = "frames.mp4"
+"""A segment's frames."""
+
+LEAST_FREE = 1 << 20
+"""Bytes below which a disk is full, whatever a library says of its failure."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What all jobs of a run share."""
+
+    jobs: JobFile
+    folder: Path
+    """Of the run."""
+    device: str
+    """``cpu`` or ``cuda:N``."""
+    worker: int = 0
+    """Number of the worker."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of a job."""
+
+    state: str
+    """``done``, ``failed``, or ``full``: the disk is."""
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Of the manifest's line."""
+    reason: str = ""
+    """What went wrong, on one line."""
+
+
+class Work:
+    """Does one job after another; one for each worker."""
+
+    def __init__(self, context: Context) -> None:
+        """Do nothing yet."""
+        self.context = context
+        self._lighter = Lighter(context.jobs, context.folder, context.device)
+
+    def __enter__(self) -> Work:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let threads go."""
+        self._lighter.close()
+
+    def do(self, job: Job, tell: Callable[[int], None], arguments: Any = None) -> Outcome:
+        """Do a job as a whole; what goes wrong is told, not raised.
+
+        Args:
+            job: The job.
+            tell: Called with the frames that are done.
+            arguments: Of jobs that need to know more: the places of finished variations.
+        """
+        context = self.context
+        key, start = job.key(context.jobs), time.perf_counter()
+        log = context.folder / "log" / f"{key}.log"
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            values = self._do(job, tell, arguments)
+        except Exception as error:  # whatever it is, it is this job's alone, and its reason is kept
+            known = isinstance(error, WarpArError | NoPlace)
+            told = str(error) if known else f"{type(error).__name__}: {reason(error)}"
+            _note(log, f"failed: {told}", "" if known else traceback.format_exc())
+            full = is_no_space(error) or _free_bytes(context.folder) < LEAST_FREE
+            return Outcome("full" if full else "failed", reason=told)
+        seconds = time.perf_counter() - start
+        frames = int(values.get("frames", 0))
+        _note(log, f"done: {frames} frames in {seconds:.2f} s by worker {context.worker} on {context.device}")
+        return Outcome("done", {**values, "seconds": round(seconds, 3), "worker": context.worker})
+
+    def _do(self, job: Job, tell: Callable[[int], None], arguments: Any) -> dict[str, Any]:
+        context, jobs = self.context, self.context.jobs
+        key, place = job.key(jobs), context.folder / job.place(jobs)
+        with aside(context.folder, f"{key.replace('/', '.')}.{context.worker}") as part:
+            match job.kind:
+                case "survey":
+                    values = survey_clip(jobs, job.clip, part, context.device, tell)
+                case "segment":
+                    values = self._light_segment(job, part, tell)
+                case "variation":
+                    values = self._light_variation(job, part, tell)
+                case "join":
+                    values = self._join(job, part / place.name)
+                    publish_file(part / place.name, place)
+                    shutil.rmtree(context.folder / "parts" / jobs.clips[job.clip].name, ignore_errors=True)
+                    return {**values, "bytes": place.stat().st_size}
+                case _:
+                    found = [Path(name) for name in arguments]
+                    values = write_dataset_files(jobs, found, part, context.folder, program_version())
+                    _replace_models(part / "models", place.parent / "models")
+                    for name in ("datasheet.md", place.name):
+                        publish_file(part / name, place.parent / name)
+                    return {**values, "bytes": place.stat().st_size}
+            return {**values, **{k: v for k, v in publish(part, place, key).items() if k != "job"}}
+
+    def _light_segment(self, job: Job, part: Path, tell: Callable[[int], None]) -> dict[str, Any]:
+        survey = self._lighter.survey(job.clip)
+        ticks, tick = shown_ticks(survey.index, source_of(self.context.jobs, job.clip)[1])
+        count = 0
+        rate = mean_rate(ticks, tick)
+        with PartSink(part / PART, ticks[job.first : job.end].tolist(), tick, rate) as sink:
+            for lit in self._lighter.light(job):
+                sink.write(lit.image)
+                count += 1
+                tell(count)
+        return {"frames": count}
+
+    def _light_variation(self, job: Job, part: Path, tell: Callable[[int], None]) -> dict[str, Any]:
+        jobs, dataset = self.context.jobs, self.context.jobs.dataset
+        assert dataset is not None
+        survey = self._lighter.survey(job.clip)
+        base = lit_scene(jobs, job.clip, survey)
+        base = dataclasses.replace(base, camera=base.camera.scaled_to(*survey.size), source=None)
+        poses = [pose for pose in map(survey.pose, range(job.first, job.end, dataset.every)) if pose is not None]
+        drawn = draw_variation(base, dataset, job.clip, job.number, poses)
+        # By its own light: where the run keeps what was captured is no part of a data set.
+        path, fps = source_of(jobs, job.clip)
+        own = scene_of(jobs, job.clip).captured
+        shown = dataclasses.replace(drawn.scene, source=SourceSpec(path=path, fps=fps), captured=own)
+        (part / "scene.toml").write_text(dumps_scene(shown), encoding="utf-8")
+        with LabelWriter(part, drawn.scene, drawn.kinds, dataset.catalogue) as labels:
+            lit_frames = self._lighter.light(job, drawn.scene, outputs=LAYERS, every=dataset.every)
+            for count, lit in enumerate(lit_frames, 1):
+                if lit.result is not None:
+                    labels.write(lit, survey.key_of(lit.frame.index) if len(survey.keys) else None)
+                tell(count)
+            return {"frames": labels.finish()}
+
+    def _join(self, job: Job, output: Path) -> dict[str, Any]:
+        jobs = self.context.jobs
+        survey = self._lighter.survey(job.clip)
+        path, fps = source_of(jobs, job.clip)
+        ticks, tick = shown_ticks(survey.index, fps)
+        first, end = lit_range(jobs.clips[job.clip], survey.index.length)
+        segments = [
+            job_of_clip(jobs, job.clip, number, survey.index.length)
+            for number in range(jobs_of_clip(jobs, job.clip, survey.index.length))
+        ]
+        count = join_parts(
+            [self.context.folder / segment.place(jobs) / PART for segment in segments],
+            [int(ticks[segment.first]) for segment in segments],
+            tick,
+            output,
+            recording=path if path.is_file() and fps is None else None,
+            zero=int(ticks[first]) if first else 0,
+            until=float(int(ticks[end]) * tick) if end < survey.index.length else None,
+        )
+        if count != end - first:
+            raise WarpArError(f"{output.name} has {count} frames, not {end - first}; remove its parts and resume")
+        return {"frames": count}
+
+
+def _free_bytes(folder: Path) -> int:
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return LEAST_FREE
+
+
+def _replace_models(part: Path, place: Path) -> None:
+    """Move a folder of models to its place; what stood there goes."""
+    shutil.rmtree(place, ignore_errors=True)
+    part.rename(place)
+
+
+def _note(log: Path, line: str, more: str = "") -> None:
+    """Add to a job's log; a disk that is full loses the line, not the job."""
+    try:
+        with open(log, "a", encoding="utf-8") as stream:
+            stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")
+    except OSError:
+        return
+
+
+def places_of(jobs: JobFile, done: Sequence[Job]) -> list[str]:
+    """Places of finished variations, as the last job of a data set is told them."""
+    return [job.place(jobs).as_posix() for job in done]

@@ -1,0 +1,279 @@
+"""A shot as binary glTF 2.0 (``.glb``), with the lights of KHR_lights_punctual.
+
+glTF is y-up: the node ``shot`` turns the marker's world, z up, and everything else stands below it as in the scene. A
+camera of glTF looks at its picture's middle and has square pixels but for its aspect; what it cannot say, and the
+lens's distortion, stand in its ``extras``, as does the file of the environment in those of the asset. Intensities are
+told as candela and lux of camera values: a white surface that faces a light of intensity I at distance d has radiance
+I / (pi d^2).
+
+References:
+    Khronos Group, "glTF 2.0 Specification", KHR_lights_punctual, KHR_materials_specular.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SinkError, reason
+from warp_ar.files import write_whole
+from warp_ar.output.shot import Body, Look, Matrix, Shot, encode_texture, key_frames
+from warp_ar.scene.description import Light
+from warp_ar.signature import PROGRAM
+
+GLTF_SUFFIX = ".glb"
+
+_FLOAT, _INDEX = 5126, 5125
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+"""Quaternion, x first, that turns z up to y up."""
+_DIELECTRIC = 0.04
+"""Reflectance straight on of what is no metal."""
+
+
+def write_glb(path: Path, shot: Shot) -> list[Path]:
+    """Write a shot as glTF.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        SinkError: It cannot be written.
+    """
+    builder = _Builder(shot)
+    try:
+        write_whole(path, builder.encode())
+    except OSError as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+    return [path]
+
+
+def quaternions(rotations: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Unit quaternions, x first, of rotations (n, 3, 3), each on the side of the one before.
+
+    The largest of the four components is found from the diagonal, the others by it [Shepperd 1978].
+    """
+    r = rotations
+    trace = np.trace(r, axis1=1, axis2=2)
+    squares = np.stack([1 + 2 * np.diagonal(r, axis1=1, axis2=2)[:, k] - trace for k in range(3)] + [1 + trace], -1)
+    sums = {(0, 1): r[:, 0, 1] + r[:, 1, 0], (0, 2): r[:, 0, 2] + r[:, 2, 0], (1, 2): r[:, 1, 2] + r[:, 2, 1]}
+    differences = (r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1])
+    products = np.empty((len(r), 4, 4))
+    for k in range(4):
+        products[:, k, k] = squares[:, k]
+    for (a, b), values in sums.items():
+        products[:, a, b] = products[:, b, a] = values
+    for k, values in enumerate(differences):
+        products[:, k, 3] = products[:, 3, k] = values
+    found = np.take_along_axis(products, squares.argmax(-1)[:, None, None], 1)[:, 0]
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    for k in range(1, len(found)):
+        if found[k] @ found[k - 1] < 0.0:
+            found[k] = -found[k]
+    return found
+
+
+class _Builder:
+    """Collects nodes, accessors and bytes."""
+
+    def __init__(self, shot: Shot) -> None:
+        self._shot = shot
+        self._bytes = bytearray()
+        extras = {"plate": None if shot.plate is None else shot.plate.as_posix(), "fps": shot.fps}
+        if shot.environment is not None:
+            extras["environment"] = shot.environment.name
+        self._tree: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": PROGRAM, "extras": extras},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"name": "shot", "rotation": _Y_UP, "children": []}],
+            "bufferViews": [],
+            "accessors": [],
+            "extensionsUsed": [],
+        }
+        self._channels: list[dict[str, Any]] = []
+        self._samplers: list[dict[str, Any]] = []
+        self._times: dict[tuple[float, ...], int] = {}
+        self._add_camera()
+        for body in shot.bodies():
+            self._add_body(body)
+        for index, light in enumerate(shot.scene.lights):
+            self._add_light(index, light)
+
+    def encode(self) -> bytes:
+        """The file."""
+        tree = self._tree
+        if self._channels:
+            tree["animations"] = [{"name": "shot", "channels": self._channels, "samplers": self._samplers}]
+        if not tree["extensionsUsed"]:
+            del tree["extensionsUsed"]
+        tree["buffers"] = [{"byteLength": len(self._bytes)}]
+        text = json.dumps(tree, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        data = bytes(self._bytes) + bytes(-len(self._bytes) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def _view(self, data: bytes, target: int | None = None) -> int:
+        self._bytes += bytes(-len(self._bytes) % 4)
+        view = {"buffer": 0, "byteOffset": len(self._bytes), "byteLength": len(data)}
+        self._tree["bufferViews"].append(view if target is None else {**view, "target": target})
+        self._bytes += data
+        return len(self._tree["bufferViews"]) - 1
+
+    def _accessor(self, values: npt.NDArray[Any], *, indices: bool = False, bounds: bool = False) -> int:
+        values = np.ascontiguousarray(values, np.uint32 if indices else np.float32)
+        lanes = 1 if values.ndim == 1 else values.shape[1]
+        target = 34963 if indices else 34962 if lanes > 1 and not bounds else None
+        entry: dict[str, Any] = {
+            "bufferView": self._view(values.tobytes(), target),
+            "componentType": _INDEX if indices else _FLOAT,
+            "count": len(values),
+            "type": _TYPES[lanes],
+        }
+        if bounds:
+            entry["min"], entry["max"] = (
+                np.atleast_1d(values.min(axis=0)).tolist(),
+                np.atleast_1d(values.max(axis=0)).tolist(),
+            )
+        self._tree["accessors"].append(entry)
+        return len(self._tree["accessors"]) - 1
+
+    def _use(self, extension: str) -> None:
+        if extension not in self._tree["extensionsUsed"]:
+            self._tree["extensionsUsed"].append(extension)
+
+    def _add_node(self, node: dict[str, Any], placements: dict[int, Matrix]) -> None:
+        """A node below the root, placed by its frames."""
+        index = len(self._tree["nodes"])
+        self._tree["nodes"][0]["children"].append(index)
+        self._tree["nodes"].append(node)
+        if not placements:
+            return
+        matrices = np.stack(list(placements.values()))
+        scale = np.cbrt(np.linalg.det(matrices[0, :3, :3]))
+        turns = quaternions(matrices[:, :3, :3] / scale)
+        node["translation"], node["rotation"] = matrices[0, :3, 3].tolist(), turns[0].tolist()
+        if abs(scale - 1.0) > 1e-12:
+            node["scale"] = [float(scale)] * 3
+        if len(matrices) > 1:
+            times = self._time_accessor(tuple(frame / self._shot.fps for frame in placements))
+            for path, values in (("translation", matrices[:, :3, 3]), ("rotation", turns)):
+                self._samplers.append({"input": times, "interpolation": "LINEAR", "output": self._key_values(values)})
+                target = {"node": index, "path": path}
+                self._channels.append({"sampler": len(self._samplers) - 1, "target": target})
+
+    def _time_accessor(self, seconds: tuple[float, ...]) -> int:
+        if seconds not in self._times:
+            self._times[seconds] = self._accessor(np.array(seconds), bounds=True)
+        return self._times[seconds]
+
+    def _key_values(self, values: npt.NDArray[Any]) -> int:
+        values = np.ascontiguousarray(values, np.float32)
+        self._tree["accessors"].append(
+            {
+                "bufferView": self._view(values.tobytes()),
+                "componentType": _FLOAT,
+                "count": len(values),
+                "type": _TYPES[values.shape[1]],
+            }
+        )
+        return len(self._tree["accessors"]) - 1
+
+    def _add_camera(self) -> None:
+        camera = self._shot.camera
+        self._tree["cameras"] = [
+            {
+                "type": "perspective",
+                "perspective": {
+                    "yfov": 2.0 * math.atan(0.5 * camera.height / camera.fy),
+                    "aspectRatio": camera.width / camera.fx / (camera.height / camera.fy),
+                    "znear": 0.01,
+                    "zfar": 1000.0,
+                },
+                "extras": {
+                    "size": [camera.width, camera.height],
+                    "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+                    "distortion": list(camera.distortion),
+                },
+            }
+        ]
+        self._add_node({"name": "camera", "camera": 0}, self._shot.camera_placements())
+
+    def _add_body(self, body: Body) -> None:
+        mesh = body.mesh
+        attributes = {
+            "POSITION": self._positions(mesh.vertices),
+            "NORMAL": self._accessor(mesh.normals),
+        }
+        if mesh.uvs is not None:
+            # v runs down the picture.
+            attributes["TEXCOORD_0"] = self._accessor(mesh.uvs * np.array([1.0, -1.0]) + np.array([0.0, 1.0]))
+        primitive = {
+            "attributes": attributes,
+            "indices": self._accessor(mesh.faces.reshape(-1), indices=True),
+            "material": self._add_material(body.name, body.look, textured=mesh.uvs is not None),
+        }
+        self._tree.setdefault("meshes", []).append({"name": body.name, "primitives": [primitive]})
+        node = {"name": body.name, "mesh": len(self._tree["meshes"]) - 1, "extras": {"proxy": body.proxy}}
+        self._add_node(node, dict(enumerate(key_frames(body.placements))))
+
+    def _positions(self, vertices: npt.NDArray[np.float32]) -> int:
+        index = self._accessor(vertices, bounds=True)
+        self._tree["bufferViews"][self._tree["accessors"][index]["bufferView"]]["target"] = 34962
+        return index
+
+    def _add_material(self, name: str, look: Look, *, textured: bool) -> int:
+        surface: dict[str, Any] = {
+            "baseColorFactor": [*look.base_color, 1.0],
+            "metallicFactor": look.metallic,
+            "roughnessFactor": look.roughness,
+        }
+        if look.texture is not None and textured:
+            image = {"bufferView": self._view(encode_texture(look.texture)), "mimeType": "image/png"}
+            self._tree.setdefault("images", []).append(image)
+            self._tree.setdefault("textures", []).append({"source": len(self._tree["images"]) - 1})
+            surface["baseColorTexture"] = {"index": len(self._tree["textures"]) - 1}
+        material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        if look.specular is not None:
+            self._use("KHR_materials_specular")
+            factor = max(look.specular) / _DIELECTRIC
+            # A factor goes to 1 at most; what is beyond is the colour's, which may be any.
+            strength = min(1.0, factor)
+            color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in look.specular]
+            specular = {"specularFactor": strength, "specularColorFactor": color}
+            material["extensions"] = {"KHR_materials_specular": specular}
+        self._tree.setdefault("materials", []).append(material)
+        return len(self._tree["materials"]) - 1
+
+    def _add_light(self, index: int, light: Light) -> None:
+        self._use("KHR_lights_punctual")
+        entry: dict[str, Any] = {
+            "name": f"light_{index}",
+            "type": light.kind,
+            "color": list(_bounded(light.color)),
+            "intensity": light.intensity * max(1.0, *light.color),
+        }
+        if light.kind == "spot":
+            outer = min(math.radians(light.outer_angle), math.pi / 2.0)
+            inner = min(math.radians(light.inner_angle), outer - 1e-6)
+            entry["spot"] = {"innerConeAngle": max(0.0, inner), "outerConeAngle": outer}
+        if light.radius or light.attenuation != (0.0, 0.0, 1.0):
+            entry["extras"] = {"radius": light.radius, "attenuation": list(light.attenuation)}
+        lights = self._tree.setdefault("extensions", {}).setdefault("KHR_lights_punctual", {"lights": []})["lights"]
+        lights.append(entry)
+        node = {"name": f"light_{index}", "extensions": {"KHR_lights_punctual": {"light": len(lights) - 1}}}
+        self._add_node(node, dict(enumerate(key_frames(self._shot.light_placements(light)))))
+
+
+def _bounded(color: Sequence[float]) -> Sequence[float]:
+    """A colour within 0..1; the light's intensity has taken its largest channel."""
+    most = max(1.0, *color)
+    return [value / most for value in color]

@@ -1,0 +1,207 @@
+"""``python -m warp_ar.reference SCENE``: one frame by path tracing, with the standard error of every pixel.
+
+The frames before it run through the pipeline, which finds the light; then paths are followed from the frame's camera
+until enough are. ``--compare`` shows what the pipeline's own picture of that frame lacks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
+from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
+from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.errors import SinkError, SourceError, UsageError, reason
+from warp_ar.files import write_whole
+from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.scene import Scene, load_scene
+from warp_ar.session import calibrated, with_light
+from warp_ar.signature import PROGRAM, sign_png
+from warp_ar.stages.quality import PRESETS
+
+SUFFIXES = (".png", ".exr")
+STEP = 8
+"""Samples per pixel between two reports of progress."""
+MAGNIFIED = 8
+"""Factor on differences that are shown."""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = Parser(
+        prog="python -m warp_ar.reference",
+        description="One frame of a scene by path tracing, in the light that the pipeline finds, with standard errors.",
+    )
+    add = parser.add_argument
+    add("scene", nargs="?", default="desk", metavar="SCENE", help="a scene file, or a bundled scene's name")
+    add("--frame", type=int, default=0, metavar="N", help="which frame, from 0; those before it bring the light")
+    text = "paths per pixel, at most (default: %(default)s)"
+    add("--samples", type=int, default=DEFAULT_SAMPLES, metavar="N", help=text)
+    text = "stop at this relative standard error of what virtual things change, such as 0.01"
+    add("--error", type=float, metavar="E", help=text)
+    add("--output", type=Path, metavar="FILE", help=".png: the picture; .exr: linear radiance and its standard error")
+    text = "write the pipeline's picture, the reference and their difference side by side"
+    add("--compare", type=Path, metavar="FILE.png", help=text)
+    text = f"of the pipeline that finds the light: {', '.join(PRESETS)} (default: high)"
+    add("--quality", default="high", metavar="NAME", help=text)
+    add("--source", metavar="PATH|INDEX", help="frames from here, not the scene's own")
+    add("--light", metavar="FILE", help="captured light (OpenEXR) instead of what a mirror ball shows")
+    add("--calibration", metavar="FILE|exif", help="camera calibration instead of the scene's numbers")
+    add("--size", metavar="WxH", help="of the picture; frames are averaged down to it (default: the frames')")
+    add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
+    add("--seed", type=int, default=0, metavar="N", help="of the random numbers (default: 0)")
+    add("--overwrite", action="store_true", help="replace files that this program did not write")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: trace(make_parser().parse_args(arguments)), (SourceError, SinkError))
+
+
+def trace(options: argparse.Namespace) -> int:
+    """Find the light, follow paths, write what is asked for."""
+    size = _check(options)
+    scene = load_scene(options.scene)
+    if options.calibration is not None:
+        scene = calibrated(scene, options.calibration, options.source)
+    if options.light is not None:
+        scene = with_light(scene, options.light)
+    writes = {f"--{name}": getattr(options, name) for name in ("output", "compare")}
+    writes = {name: path for name, path in writes.items() if path is not None}
+    check_places({"the scene": _read_by(scene, options)}, writes)
+    replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
+    console = Console(stderr=True)
+    known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
+    tracer = known.tracer(device=options.device, size=size, seed=options.seed)
+    picture = render(tracer, options.samples, options.error, console)
+    if options.output is not None:
+        write_picture(options.output, picture)
+    if options.compare is not None:
+        write_png(options.compare, side_by_side(known, picture))
+    for text in filter(None, replaced):
+        say(text)
+    print(summary(known, picture, str(tracer.device)))
+    return EXIT_DONE
+
+
+def _check(options: argparse.Namespace) -> tuple[int, int] | None:
+    """The size that is asked for; complain about options that cannot be."""
+    if options.samples < 1:
+        raise UsageError(f"--samples {options.samples}: expected 1 or more")
+    if options.error is not None and not options.error > 0.0:
+        raise UsageError(f"--error {options.error:g}: expected a number above 0, such as 0.01")
+    if options.output is not None and options.output.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"--output {options.output} ends in {options.output.suffix!r}; use {', '.join(SUFFIXES)}")
+    if options.compare is not None and options.compare.suffix.lower() != ".png":
+        raise UsageError(f"--compare {options.compare} ends in {options.compare.suffix!r}; use .png")
+    if options.size is None:
+        return None
+    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
+    if match is None:
+        raise UsageError(f"--size {options.size}: expected width x height, such as 320x240")
+    return int(match[1]), int(match[2])
+
+
+def _read_by(scene: Scene, options: argparse.Namespace) -> list[Path]:
+    """Files and folders that the run reads."""
+    named = [options.source, options.light, options.calibration]
+    return [*files_of(dataclasses.replace(scene)), *(Path(name) for name in named if name is not None)]
+
+
+def render(tracer: PathTracer, samples: int, error: float | None, console: Console) -> TracedPicture:
+    """Follow paths, showing how far that is."""
+    text = TextColumn("{task.description}")
+    with Progress(text, BarColumn(), TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("reflectance", total=samples)
+        tracer.prepare()
+        for picture in tracer.render(samples, error=error, step=STEP):
+            shown = f"{picture.samples} samples, error {picture.relative_error:.2%}"
+            total = samples
+            if error is not None and picture.relative_error > error:
+                # The error falls with the root of the samples.
+                total = min(samples, round(picture.samples * (picture.relative_error / error) ** 2))
+            bar.update(task, completed=picture.samples, description=shown, total=total)
+    return picture
+
+
+def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:
+    """What was done, in one line."""
+    height, width = picture.image.shape[:2]
+    difference = _lit_at(known, picture) - picture.image
+    rms = float(np.sqrt((difference**2).mean()))
+    return (
+        f"{known.scene.name}: {width}x{height}, {picture.samples} samples a pixel on {device} in "
+        f"{picture.seconds:.1f} s; relative standard error {picture.relative_error:.2%}; "
+        f"the pipeline's picture differs by {rms:.2f} codes rms"
+    )
+
+
+def side_by_side(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.uint8]:
+    """The pipeline's picture, the reference, and grey plus their difference, magnified, (H, 3 W, 3)."""
+    lit = _lit_at(known, picture)
+    parts = lit, picture.image.astype(np.float64), 127.5 + MAGNIFIED * (lit - picture.image)
+    return np.clip(np.round(np.concatenate(parts, axis=1)), 0, 255).astype(np.uint8)
+
+
+def _lit_at(known: KnownFrame, picture: TracedPicture) -> npt.NDArray[np.float64]:
+    """The pipeline's picture at the size of the reference."""
+    size = picture.image.shape[1::-1]
+    return np.asarray(cv2.resize(known.lit.astype(np.float64), size, interpolation=cv2.INTER_AREA))
+
+
+def write_picture(path: Path, picture: TracedPicture) -> None:
+    """Write a picture as the ending of ``path`` says; EXR has channels R, G, B and error.R, error.G, error.B.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    if path.suffix.lower() == ".png":
+        write_png(path, picture.image)
+        return
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "software": PROGRAM,
+        "samples": picture.samples,
+    }
+    channels = {name: np.ascontiguousarray(picture.radiance[..., c]) for c, name in enumerate("RGB")}
+    channels |= {f"error.{name}": np.ascontiguousarray(picture.error[..., c]) for c, name in enumerate("RGB")}
+    image = OpenEXR.File(header, channels)
+    _write(path, lambda part: image.write(str(part)))
+
+
+def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
+    """Write an RGB picture as PNG.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    done, data = cv2.imencode(".png", image[..., ::-1])
+    if not done:
+        raise SinkError(f"{path} cannot be encoded as PNG")
+    _write(path, sign_png(data.tobytes()))
+
+
+def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, data)
+    except (RuntimeError, OSError) as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

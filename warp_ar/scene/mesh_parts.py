@@ -1,0 +1,251 @@
+"""Parts of a mesh file, checked, placed and joined into one mesh with a material per triangle."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import SceneError
+from warp_ar.scene.description import LambertMaterial
+from warp_ar.scene.geometry import Mesh, creased_normals, make_mesh, smooth_normals, tangent_frames
+from warp_ar.scene.mesh_materials import MeshMaterial, TextureUse
+
+Array = npt.NDArray[np.float64]
+
+LARGEST: Final = 1e12
+"""Below this the square of a position, and what a scene's scale may do to it, stay in single precision."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshPart:
+    """Triangles of one material."""
+
+    vertices: Array
+    """(n, 3)."""
+    faces: npt.NDArray[np.int64]
+    """(m, 3)."""
+    normals: Array
+    """Unit, (n, 3)."""
+    uvs: tuple[Array | None, Array | None] = (None, None)
+    """Two sets of texture coordinates, (n, 2), v up."""
+    colors: Array | None = None
+    """Linear RGBA, (n, 4)."""
+    tangents: Array | None = None
+    """As ``Mesh.tangents``, (n, 4)."""
+    material: MeshMaterial | None = None
+    """None: the file says nothing."""
+    source: npt.NDArray[np.int64] | None = None
+    """Which of the vertices that it was made from each vertex is, (n,); None: they are the same."""
+
+    @classmethod
+    def checked(
+        cls,
+        label: str,
+        vertices: Array,
+        faces: npt.NDArray[np.int64],
+        normals: Array | None,
+        *,
+        uvs: tuple[Array | None, Array | None] = (None, None),
+        colors: Array | None = None,
+        tangents: Array | None = None,
+        material: MeshMaterial | None = None,
+        crease: float | None = None,
+    ) -> MeshPart:
+        """A part of numbers from a file.
+
+        Args:
+            label: The file, for messages.
+            vertices: (n, 3).
+            faces: (m, 3).
+            normals: (n, 3) of any length; those that are none are computed, all where this is None.
+            uvs: Of (n, 2), as ``uvs``; a set that is not finite is left out.
+            colors: As ``colors``.
+            tangents: As ``tangents``; left out where they are not finite.
+            material: As ``material``.
+            crease: Angle in degrees from which on edges are sharp where normals are computed; None: all are smooth.
+
+        Raises:
+            SceneError: A vertex is not finite or a face has an index out of range.
+        """
+        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+            wrong = int(faces.max() if faces.max() >= len(vertices) else faces.min())
+            raise SceneError(f"{label}: a face has vertex index {wrong}; there are {len(vertices)} vertices from 0 on")
+        finite = (np.abs(vertices) < LARGEST).all(axis=1)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise SceneError(f"{label}: vertex {row} is {vertices[row].tolist()}; it must be finite, below {LARGEST:g}")
+        uvs = (_finite(uvs[0], len(vertices), 1e9), _finite(uvs[1], len(vertices), 1e9))
+        colors, tangents = _finite(colors, len(vertices), 1e9), _finite(tangents, len(vertices), 1e9)
+        if normals is None and crease is not None:
+            where, computed = creased_normals(vertices, faces, crease)
+            part = cls(vertices, faces, np.zeros_like(vertices), uvs, colors, None, material)._taken(where)
+            return dataclasses.replace(part, normals=computed.astype(np.float64))._with_tangents()
+        smooth = smooth_normals(vertices, faces).astype(np.float64)
+        if normals is None:
+            normals = smooth
+        else:
+            with np.errstate(over="ignore", invalid="ignore"):
+                length = np.linalg.norm(normals, axis=1, keepdims=True)
+                usable = np.isfinite(length) & (length > 0.0)
+                normals = np.where(usable, normals / np.where(usable, length, 1.0), smooth)
+        return cls(vertices, faces, normals, uvs, colors, tangents, material)._with_tangents()
+
+    def _taken(self, where: npt.NDArray[np.int64]) -> MeshPart:
+        """The same triangles, each with corners of its own: corner k of face f was vertex ``where[3 f + k]``."""
+
+        def take(values: Array | None) -> Array | None:
+            return None if values is None else values[where]
+
+        return dataclasses.replace(
+            self,
+            vertices=self.vertices[where],
+            faces=np.arange(len(where), dtype=np.int64).reshape(-1, 3),
+            normals=self.normals[where],
+            uvs=(take(self.uvs[0]), take(self.uvs[1])),
+            colors=take(self.colors),
+            tangents=take(self.tangents),
+            source=where if self.source is None else self.source[where],
+        )
+
+    def _with_tangents(self) -> MeshPart:
+        """With tangents if its material has a normal map, without if not."""
+        use = None if self.material is None else self.material.normal
+        uvs = None if use is None else self.uvs[use.uv_set]
+        if use is None or uvs is None:
+            return dataclasses.replace(self, tangents=None)
+        if self.tangents is not None:
+            across = self.tangents[:, :3] - (self.tangents[:, :3] * self.normals).sum(1, keepdims=True) * self.normals
+            length = np.linalg.norm(across, axis=1, keepdims=True)
+            if (length > 1e-6).all():
+                side = np.where(self.tangents[:, 3:] < 0.0, -1.0, 1.0)
+                return dataclasses.replace(self, tangents=np.concatenate([across / length, side], axis=1))
+        a, b, _, d, e, _ = use.transform
+        # Where the picture is turned, so are the frames: their u is that of the picture.
+        turned = uvs @ np.array([[a, b], [d, e]]).T
+        where, frames = tangent_frames(self.vertices, self.faces, self.normals, turned)
+        return dataclasses.replace(self._taken(where), tangents=frames.astype(np.float64))
+
+    def moved(self, transform: Array) -> MeshPart | None:
+        """The part under a transform (4, 4); None where that makes nothing of it."""
+        linear = transform[:3, :3]
+        determinant = float(np.linalg.det(linear))
+        if not np.isfinite(determinant) or determinant == 0.0:
+            return None
+        vertices = self.vertices @ linear.T + transform[:3, 3]
+        # The cofactors are the inverse's transpose but for a factor, and do not overflow where that does.
+        cofactors = np.stack([np.cross(linear[(k + 1) % 3], linear[(k + 2) % 3]) for k in range(3)])
+        turned = self.normals @ (cofactors * np.sign(determinant)).T
+        normals = _unit(turned, self.normals)
+        tangents = self.tangents
+        if tangents is not None:
+            side = tangents[:, 3:] * np.sign(determinant)
+            tangents = np.concatenate([_unit(tangents[:, :3] @ linear.T, tangents[:, :3]), side], axis=1)
+        faces = self.faces[:, ::-1] if determinant < 0.0 else self.faces
+        return dataclasses.replace(self, vertices=vertices, faces=faces, normals=normals, tangents=tangents)
+
+    def bent(self, transforms: Array) -> MeshPart:
+        """The part with a transform (n, 4, 4) for each of the vertices that it was made from."""
+        if self.source is not None:
+            transforms = transforms[self.source]
+        linear = transforms[:, :3, :3]
+        vertices = np.einsum("nij,nj->ni", linear, self.vertices) + transforms[:, :3, 3]
+        normals = _unit(np.einsum("nij,nj->ni", linear, self.normals), self.normals)
+        tangents = self.tangents
+        if tangents is not None:
+            along = _unit(np.einsum("nij,nj->ni", linear, tangents[:, :3]), tangents[:, :3])
+            tangents = np.concatenate([along, tangents[:, 3:]], axis=1)
+        return dataclasses.replace(self, vertices=vertices, normals=normals, tangents=tangents)
+
+
+def join_parts(
+    label: str, parts: list[MeshPart], images: list[npt.NDArray[np.uint8]], notes: list[str], *, spans: bool = True
+) -> Mesh:
+    """One mesh of all parts.
+
+    Args:
+        label: The file, for messages.
+        parts: One or more.
+        images: What their materials name, RGBA.
+        notes: As ``Mesh.notes``.
+        spans: Whether to look through the pictures for what roughness and metallic they give.
+
+    Raises:
+        SceneError: A vertex lies too far off after all transforms.
+    """
+    vertices = np.concatenate([part.vertices for part in parts])
+    if not (np.abs(vertices) < LARGEST).all():
+        raise SceneError(f"{label}: its nodes put a vertex beyond {LARGEST:g}")
+    materials: dict[MeshMaterial, int] = {}
+    said = any(part.material is not None for part in parts) or any(part.colors is not None for part in parts)
+    numbers = []
+    for part in parts:
+        material = _without_lost(part, notes) if said else MeshMaterial()
+        numbers.append(np.full(len(part.faces), materials.setdefault(material, len(materials)), dtype=np.int32))
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    known = tuple(_with_spans(material, images) if spans else material for material in materials)
+    return make_mesh(
+        vertices,
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
+        np.concatenate([part.normals for part in parts]),
+        _filled(parts, [part.uvs[0] for part in parts], (0.0, 0.0)),
+        uvs_second=_filled(parts, [part.uvs[1] for part in parts], (0.0, 0.0)),
+        colors=_filled(parts, [part.colors for part in parts], (1.0, 1.0, 1.0, 1.0)),
+        tangents=_filled(parts, [part.tangents for part in parts], (1.0, 0.0, 0.0, 1.0)),
+        triangle_materials=np.concatenate(numbers) if len(known) > 1 else None,
+        materials=known if said else (),
+        images=tuple(images),
+        notes=tuple(notes),
+    )
+
+
+def _without_lost(part: MeshPart, notes: list[str]) -> MeshMaterial:
+    """A part's material without textures for which the part has no coordinates."""
+    if part.material is None:
+        # Vertex colours are what the surface reflects, no factor of some other colour.
+        white = LambertMaterial((1.0, 1.0, 1.0))
+        return MeshMaterial() if part.colors is None else MeshMaterial(surface=white)
+    material = part.material
+    for field in dataclasses.fields(material):
+        use = getattr(material, field.name)
+        if isinstance(use, TextureUse) and part.uvs[use.uv_set] is None:
+            gone: dict[str, Any] = {field.name: None}
+            material = dataclasses.replace(material, **gone)
+            notes.append("a texture on triangles without texture coordinates")
+    notes[:] = dict.fromkeys(notes)
+    return material
+
+
+def _with_spans(material: MeshMaterial, images: list[npt.NDArray[np.uint8]]) -> MeshMaterial:
+    use = material.metallic_roughness
+    if use is None:
+        return material
+    low, high = (getattr(images[use.image][..., 1:3], name)(axis=(0, 1)) / 255.0 for name in ("min", "max"))
+    roughness, metallic = zip(low.tolist(), high.tolist(), strict=True)
+    return dataclasses.replace(material, roughness_span=roughness, metallic_span=metallic)
+
+
+def _filled(parts: list[MeshPart], values: list[Array | None], default: tuple[float, ...]) -> Array | None:
+    """Values of all parts' vertices, the default where a part has none; None where none has."""
+    if all(value is None for value in values):
+        return None
+    return np.concatenate(
+        [
+            np.tile(default, (len(part.vertices), 1)) if value is None else value
+            for part, value in zip(parts, values, strict=True)
+        ]
+    )
+
+
+def _finite(values: Any, count: int, largest: float) -> Array | None:
+    if values is None or len(values) != count or not (np.abs(values) < largest).all():
+        return None
+    return np.asarray(values, dtype=np.float64)
+
+
+def _unit(vectors: Array, other: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    usable = np.isfinite(length) & (length > 0.0)
+    return np.where(usable, vectors / np.where(usable, length, 1.0), other)

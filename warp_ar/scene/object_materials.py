@@ -1,0 +1,187 @@
+"""What virtual objects are made of: the scene's material, or those of the mesh's file.
+
+An object has one or more ``MeshMaterial``: its own file's, or the scene's alone. Where a scene gives a material to a
+mesh whose file has pictures of its base colour, these multiply the material's first colour, triangle by triangle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_ar.scene.description import (
+    Color,
+    FileMaterial,
+    LambertMaterial,
+    Material,
+    MetallicRoughnessMaterial,
+    MirrorMaterial,
+    Object,
+    PhongMaterial,
+    Scene,
+)
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.mesh_cache import load_kept_mesh
+from warp_ar.scene.mesh_materials import MeshMaterial
+
+_LOG = logging.getLogger(__name__)
+_NO_FILE = (MeshMaterial(),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """What of an object's mesh decides which kernels and light its scene calls for."""
+
+    materials: tuple[MeshMaterial, ...]
+    """One or more, in the order of ``Mesh.materials``."""
+    detailed: bool
+    """Whether kernels must ask the triangle: it has several materials, pictures, colours, alpha or emission."""
+    holed: bool
+    """Whether rays may pass through some triangles."""
+    bumpy: bool
+    """Whether a material has a normal map."""
+
+
+def mesh_of(item: Object) -> Mesh | None:
+    """The mesh that an object of shape ``mesh`` shows; None for other shapes.
+
+    Raises:
+        SceneError: Its file cannot be read.
+    """
+    if item.shape != "mesh":
+        return None
+    if item.mesh is not None:
+        return item.mesh
+    assert item.file is not None
+    return file_mesh(item.file)
+
+
+def file_mesh(path: Path) -> Mesh:
+    """The mesh of a file, kept as long as the file is the same; says once what of it is not shown.
+
+    Raises:
+        SceneError: It cannot be read.
+    """
+    try:
+        status = path.stat()
+        stamp = status.st_mtime_ns, status.st_size
+    except OSError:
+        stamp = 0, 0  # reading it says what is wrong
+    return _read_mesh(path, stamp)
+
+
+@functools.lru_cache(maxsize=4)
+def _read_mesh(path: Path, stamp: tuple[int, int]) -> Mesh:
+    mesh = load_kept_mesh(path)
+    if mesh.notes:
+        _say(path, mesh.notes)
+    return mesh
+
+
+@functools.cache
+def _say(path: Path, notes: tuple[str, ...]) -> None:
+    _LOG.warning("%s: not shown: %s", path, ", ".join(notes))
+
+
+def look_of(item: Object) -> Look:
+    """What an object is made of.
+
+    Raises:
+        SceneError: Its mesh cannot be read.
+    """
+    mesh = mesh_of(item)
+    if mesh is None:
+        surface = LambertMaterial() if isinstance(item.material, FileMaterial) else item.material
+        materials: tuple[MeshMaterial, ...] = (MeshMaterial(surface=surface),)
+    elif isinstance(item.material, FileMaterial):
+        materials = mesh.materials or _NO_FILE
+        if _is_closed(mesh):
+            materials = tuple(dataclasses.replace(material, double_sided=True) for material in materials)
+    else:
+        bases = [material.base for material in mesh.materials] if mesh.uvs is not None else []
+        materials = tuple(MeshMaterial(surface=item.material, base=base) for base in bases or [None])
+    own = isinstance(item.material, FileMaterial)
+    pictured = any(isinstance(value, Path) for material in materials for value in vars(material.surface).values())
+    plain = all(material.plain for material in materials) and len(set(materials)) == 1
+    colored = own and mesh is not None and mesh.colors is not None
+    return Look(
+        materials=materials,
+        detailed=pictured or colored or not plain,
+        holed=any(material.alpha != "opaque" or not material.double_sided for material in materials),
+        bumpy=any(material.normal is not None for material in materials),
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _is_closed(mesh: Mesh) -> bool:
+    """Whether nobody outside of a mesh sees a triangle from behind: every edge has its way back."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    _, place = np.unique(corners, axis=0, return_inverse=True)
+    faces = place.reshape(-1, 3).astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    count = len(corners)
+    there = np.sort((faces * count + np.roll(faces, -1, axis=1)).ravel())
+    back = np.sort((np.roll(faces, -1, axis=1) * count + faces).ravel())
+    return np.array_equal(there, back)
+
+
+def scene_materials(scene: Scene) -> tuple[MeshMaterial, ...]:
+    """Materials of all virtual objects, one after another.
+
+    Raises:
+        SceneError: A mesh cannot be read.
+    """
+    return tuple(material for item in scene.objects for material in look_of(item).materials)
+
+
+def is_detailed(scene: Scene) -> bool:
+    """Whether any object's triangles or points must be asked for what they are made of.
+
+    Raises:
+        SceneError: A mesh cannot be read.
+    """
+    return any(look_of(item).detailed for item in scene.objects)
+
+
+def _is_black(color: Color) -> bool:
+    return not isinstance(color, Path) and not any(color)
+
+
+def reflects_diffusely(material: MeshMaterial | Material) -> bool:
+    """Whether a material shows the environment's irradiance."""
+    surface: Any = material
+    least = 1.0
+    if isinstance(material, MeshMaterial):
+        if material.unlit:
+            return False
+        surface, least = material.surface, material.metallic_span[0]
+    match surface:
+        case LambertMaterial():
+            return not _is_black(surface.base_color)
+        case PhongMaterial():
+            return not _is_black(surface.diffuse)
+        case MetallicRoughnessMaterial():
+            return least * surface.metallic < 1.0 and not _is_black(surface.base_color)
+    return isinstance(surface, FileMaterial)
+
+
+def reflects_glossily(material: MeshMaterial | Material) -> bool:
+    """Whether a material shows the environment's prefiltered light."""
+    surface: Any = material
+    if isinstance(material, MeshMaterial):
+        if material.unlit:
+            return False
+        surface = material.surface
+    match surface:
+        case PhongMaterial():
+            return not _is_black(surface.specular)
+        case MirrorMaterial():
+            return not _is_black(surface.base_color)
+        case MetallicRoughnessMaterial():
+            return True
+    return False

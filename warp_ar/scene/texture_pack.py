@@ -1,0 +1,186 @@
+"""Pictures of materials packed for the device: mip levels, one after another, each picture once.
+
+A level's texel is the mean of the linear values that it covers. Colours under a mask are weighted by alpha, so that
+what is cut away does not bleed in, and a mask's alpha is scaled level by level until as much of it is there as in the
+picture itself: leaves stay as dense from afar [Cas10].
+
+References:
+    [Cas10] Castano, "Computing Alpha Mipmaps", 2010.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.kernels import structs
+from warp_ar.scene.mesh_files import load_texture
+from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse
+
+FloatArray = npt.NDArray[np.float32]
+ByteArray = npt.NDArray[np.uint8]
+
+_WRAPS: Final = {"repeat": structs.REPEATED, "clamp": structs.CLAMP, "mirror": structs.MIRRORED}
+
+
+def _decode_table() -> FloatArray:
+    code = np.arange(256) / 255.0
+    encoded = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    return np.concatenate([code, encoded]).astype(np.float32)
+
+
+DECODE: Final = _decode_table()
+"""Value of each linear code, then of each sRGB-encoded one (IEC 61966-2-1), (512,)."""
+
+
+def linear_texture(texture: ByteArray) -> FloatArray:
+    """Linear RGB of an sRGB-encoded picture, (h, w, 3)."""
+    linear: FloatArray = DECODE[256:][texture]
+    return linear
+
+
+def encode_texture(linear: npt.NDArray[Any], *, encoded: bool) -> ByteArray:
+    """Codes whose values are nearest to linear ones, any shape."""
+    if not encoded:
+        return np.asarray(np.round(np.clip(linear, 0.0, 1.0) * 255.0), dtype=np.uint8)
+    values = DECODE[256:]
+    codes: ByteArray = np.searchsorted(0.5 * (values[1:] + values[:-1]), linear).astype(np.uint8)
+    return codes
+
+
+def mip_levels(picture: ByteArray, *, encoded: bool, cutoff: float | None = None) -> list[ByteArray]:
+    """A picture and its smaller copies down to one texel.
+
+    Args:
+        picture: (h, w, 4) RGBA.
+        encoded: Whether RGB is sRGB-encoded; alpha never is.
+        cutoff: Of a mask; None: alpha cuts nothing away.
+
+    Returns:
+        Levels, each half as wide and high as the one before, rounded down, at least 1.
+    """
+    levels = [picture]
+    height, width = picture.shape[:2]
+    if max(height, width) == 1:
+        return levels
+    first = DECODE[256 * encoded :][:256]
+    values = np.concatenate([first[picture[..., :3]], picture[..., 3:].astype(np.float32) / 255.0], axis=2)
+    masked = cutoff is not None and picture[..., 3].min() < 255
+    covered = float((values[..., 3] >= (cutoff or 0.0)).mean())
+    if masked:
+        values[..., :3] *= values[..., 3:]
+    while max(height, width) > 1:
+        height, width = max(height // 2, 1), max(width // 2, 1)
+        values = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, 4)
+        shown = values.copy()
+        if masked:
+            shown[..., :3] /= np.maximum(shown[..., 3:], 1e-6)
+            threshold = float(np.quantile(shown[..., 3], 1.0 - covered)) if 0.0 < covered < 1.0 else cutoff or 0.0
+            shown[..., 3] *= (cutoff or 0.0) / threshold if threshold > 0.0 else 1.0
+        color = encode_texture(np.minimum(shown[..., :3], 1.0), encoded=encoded)
+        alpha = encode_texture(shown[..., 3:], encoded=False)
+        levels.append(np.concatenate([color, alpha], axis=2))
+    return levels
+
+
+class TexturePack:
+    """Collects the pictures that a scene's materials name."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        self.records: list[dict[str, Any]] = []
+        """Fields of ``structs.Texture``."""
+        self.texels: list[npt.NDArray[np.uint32]] = []
+        """Texels of the pictures, one array each."""
+        self._kept: list[Any] = []  # pictures, so that their ids stay theirs
+        self._places: dict[Any, dict[str, Any]] = {}
+        self._uses: dict[Any, int] = {}
+        self._size = 0
+
+    def add(
+        self,
+        use: TextureUse | None,
+        images: tuple[ByteArray, ...],
+        *,
+        encoded: bool,
+        cutoff: float | None = None,
+        path: Path | None = None,
+    ) -> int:
+        """Index of the record of a texture, -1 for none.
+
+        Args:
+            use: A picture of a mesh's file.
+            images: The pictures of that file.
+            encoded: Whether RGB is sRGB-encoded.
+            cutoff: As ``mip_levels``.
+            path: A picture of the scene instead, or one to multiply it by.
+        """
+        if use is None and path is None:
+            return -1
+        image = None if use is None else images[use.image]
+        place_key = (id(image), path, encoded, cutoff)
+        use = use or TextureUse(0)
+        key = (place_key, use.uv_set, use.transform, use.wrap, use.nearest)
+        if key not in self._uses:
+            if place_key not in self._places:
+                self._kept.append(image)
+                self._places[place_key] = self._place(_picture(image, path), encoded=encoded, cutoff=cutoff)
+            self._uses[key] = len(self.records)
+            self.records.append({**self._places[place_key], **_reading(use, self._places[place_key])})
+        return self._uses[key]
+
+    def _place(self, picture: ByteArray, *, encoded: bool, cutoff: float | None) -> dict[str, Any]:
+        levels = mip_levels(picture, encoded=encoded, cutoff=cutoff)
+        place = {
+            "offset": self._size,
+            "width": picture.shape[1],
+            "height": picture.shape[0],
+            "levels": len(levels),
+            "decode": 256 * encoded,
+        }
+        for level in levels:
+            self.texels.append(np.ascontiguousarray(level).view("<u4").ravel())
+            self._size += level.shape[0] * level.shape[1]
+        return place
+
+
+def _reading(use: TextureUse, place: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a record that say how a picture is read."""
+    a, b, c, d, e, f = use.transform
+    area = abs(a * e - b * d) if use.transform != IDENTITY else 1.0
+    return {
+        "wrap_u": _WRAPS[use.wrap[0]],
+        "wrap_v": _WRAPS[use.wrap[1]],
+        "nearest": int(use.nearest),
+        "uv_set": use.uv_set,
+        "row_u": (a, b, c),
+        "row_v": (d, e, f),
+        "size": math.sqrt(area * place["width"] * place["height"]),
+    }
+
+
+def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
+    """Picture of a file, of the scene, or their product in linear light."""
+    if path is None:
+        assert image is not None
+        return image
+    own = load_texture(path)
+    if image is None:
+        return np.concatenate([own, np.full((*own.shape[:2], 1), 255, np.uint8)], axis=2)
+    height, width = (max(image.shape[axis], own.shape[axis]) for axis in (0, 1))
+    first, second = (
+        cv2.resize(linear_texture(picture), (width, height), interpolation=cv2.INTER_LINEAR)
+        for picture in (own, np.ascontiguousarray(image[..., :3]))
+    )
+    alpha = cv2.resize(image[..., 3], (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.concatenate([encode_texture(first * second, encoded=True), alpha.reshape(height, width, 1)], axis=2)
+
+
+def mask_cutoff(material: MeshMaterial) -> float | None:
+    """What ``mip_levels`` is to know of a material's base colour."""
+    return {"opaque": None, "mask": material.cutoff, "blend": 0.5}[material.alpha]

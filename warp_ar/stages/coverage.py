@@ -1,0 +1,50 @@
+"""Which surfaces share a pixel, and how much of it each covers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from warp_ar.kernels.coverage import count_coverage, make_count_coverage_kernel
+from warp_ar.kernels.structs import vec8
+from warp_ar.scene.ray_scene import trace_config
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.variants import trace_variant
+
+
+class Coverage(Stage):
+    """Counts the samples of pixels along edges by the surface that they show."""
+
+    name: ClassVar[str] = "coverage"
+    summary: ClassVar[str] = "share of each pixel that objects, proxies and balls cover"
+    unread: ClassVar[str] = NOT_ASKED
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="counts of up to 16 samples, exact",
+        bound=0.0,
+        cause="none: shares are multiples of 1/16; edges fall to either side",
+        measured=0.0,
+        rows=(17,),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Left out by the graph where it is not asked for."""
+        return Wiring(("pose", "objects", "surface_ids"), ("coverage",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """Four numbers of surfaces and their shares per pixel."""
+        width, height = self.request.size
+        return {"coverage": ArraySpec((height, width), vec8)}
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over all pixels."""
+        config = trace_variant(trace_config(self.request.scene), device)
+        samples = self.request.quality.edge_samples
+        make_count_coverage_kernel(config, samples)
+        inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes", "surface_ids", "coverage"))
+
+        def launch(rows: Rows | None) -> None:
+            count_coverage(config, samples, *inputs, rows=rows)
+
+        return [Pass(launch, rows=self.request.size[1])]

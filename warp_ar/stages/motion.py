@@ -1,0 +1,57 @@
+"""How far what each pixel shows has moved since the frame before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels.motion import find_motion, remember
+from warp_ar.kernels.structs import FrameParams, Shape
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+
+
+class Motion(Stage):
+    """Projects each pixel's point by the camera of this frame and by that of the frame before."""
+
+    name: ClassVar[str] = "motion"
+    summary: ClassVar[str] = "motion of each pixel's surface since the frame before, in pixels"
+    unread: ClassVar[str] = NOT_ASKED
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; 0 to the bit where nothing moves",
+        bound=1e-3,
+        cause="difference of two projections: 1e-7 of a place in the picture over a motion of a few pixels",
+        measured=5.1e-6,
+        rows=(17,),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Left out by the graph where it is not asked for; runs in every frame, for the clock does."""
+        return Wiring(("pose", "objects", "clock", "surface_ids", "position"), ("motion",))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The motion, and the frame before."""
+        width, height = self.request.size
+        count = max(1, len(self.request.scene.objects))
+        return {
+            "motion": ArraySpec((height, width), wp.vec2),
+            "motion_params": ArraySpec((1,), FrameParams, FrameParams()),
+            "motion_objects": ArraySpec((count,), Shape, Shape()),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over all pixels, then what the next frame needs of this one."""
+        params, scene = arrays["params"], arrays["ray_scene"]
+        before, objects = arrays["motion_params"], arrays["motion_objects"]
+        surfaces = arrays["surface_ids"], arrays["position"], arrays["motion"]
+
+        def launch(rows: Rows | None) -> None:
+            find_motion(params, before, scene, objects, *surfaces, rows=rows)
+
+        return [
+            Pass(launch, rows=self.request.size[1]),
+            Pass(lambda rows: remember(params, scene, before, objects)),
+        ]

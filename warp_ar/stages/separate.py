@@ -1,0 +1,94 @@
+"""The layers of the picture apart, for whoever composes it elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels.expose import ExposeConfig
+from warp_ar.kernels.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
+from warp_ar.stages.shared.layers import composite_config, layers_of
+from warp_ar.stages.shared.variants import composite_variant
+
+SOURCES: Mapping[str, str] = {
+    "objects": "virtual",
+    "shadow_ratio": "shadow_ratio",
+    "added_light": "physical_added",
+    "mirror_ball": "mirrored",
+}
+"""Resource that a layer is taken from."""
+
+
+class Separate(Stage):
+    """Writes the layers that are asked for, neutral where they do not reach."""
+
+    name: ClassVar[str] = "separate"
+    summary: ClassVar[str] = "layers of the picture that were asked for, and the frame as linear radiance"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32, as the picture is made of",
+        bound=2e-6,
+        cause="one product of a clipped pixel's guess; layers are copied",
+        measured=1.2e-7,
+        rows=(6, 17),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Reads only what the layers that are asked for are made of."""
+        asked = [name for name in PICTURE_LAYERS if features.request.asks_for(LAYERS[name].resource)]
+        if not asked:
+            return LeftOut(NOT_ASKED)
+        reads = ["pose"] if any(name in SOURCES for name in asked) else []
+        reads += [SOURCES[name] for name in asked if SOURCES.get(name) in features.layers]
+        if "plate" in asked:
+            reads.append("frame")
+            # The guess of clipped pixels depends on the exposure's scale.
+            reads += ["image"] if features.exposed else []
+            reads += ["summed_area"] if features.boxed else []
+            reads += ["declipped"] if features.declipped else []
+        return Wiring(tuple(reads), tuple(LAYERS[name].resource for name in asked))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The layers that are asked for."""
+        width, height = self.request.size
+        return {
+            name: ArraySpec((height, width), wp.vec4 if name == LAYERS["objects"].resource else wp.vec3)
+            for name in self.wiring.writes
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over all pixels."""
+        features, reads = self.features, self.wiring.reads
+        config = ExposeConfig(
+            features.request.quality.method("expose") if features.boxed else self._plain(),
+            composite_variant(composite_config(features.layers), device),
+        )
+        make_separate_layers_kernel(config)
+        out = SeparateLayers()
+        for name in PICTURE_LAYERS:
+            if LAYERS[name].resource in self.wiring.writes:
+                setattr(out, name, arrays[LAYERS[name].resource])
+        layers = layers_of({name: arrays[name] for name in SOURCES.values() if name in reads})
+        plate = "plate" in self.wiring.writes
+        inputs = (
+            arrays["params"],
+            arrays["frame"],
+            arrays["decode"],
+            layers,
+            arrays["summed_area"] if "summed_area" in reads else None,
+            arrays["declipped"] if "declipped" in reads else None,
+            arrays["expose_scale"] if plate and features.exposed else None,
+        )
+
+        def launch(rows: Rows | None) -> None:
+            separate_layers(config, *inputs, out, rows=rows)
+
+        return [Pass(launch, rows=self.request.size[1])]
+
+    def _plain(self) -> Any:
+        return "declipped" if self.features.declipped else "plain"

@@ -1,0 +1,60 @@
+"""The modelled surface that each pixel shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_ar.kernels.surfaces import make_surfaces, make_trace_surfaces_kernel, trace_surfaces
+from warp_ar.kernels.visibility import VisibleObjects
+from warp_ar.scene.ray_scene import trace_config
+from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import find_visible
+from warp_ar.stages.shared.variants import trace_variant
+
+
+class Surfaces(Stage):
+    """Finds number, depth, normal and place of the surface at every pixel's centre."""
+
+    name: ClassVar[str] = "surfaces"
+    summary: ClassVar[str] = "depth, normal and place of the object, proxy or ball that each pixel shows"
+    unread: ClassVar[str] = NOT_ASKED
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; points put back onto their surfaces",
+        bound=3e-5,
+        cause="twenty roundings at a grazing angle of 3 degrees",
+        measured=2.1e-5,
+        rows=(17,),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Left out by the graph where nothing is asked for that it tells."""
+        hits = ("hit_object", "hits") if features.request.scene.objects else ()
+        return Wiring(("pose", "objects", *hits), ("surface_ids", "depth", "normals", "position"))
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """One surface per pixel."""
+        width, height = self.request.size
+        return {
+            "surface_ids": ArraySpec((height, width), wp.int32, -1),
+            "depth": ArraySpec((height, width), wp.float32),
+            "normals": ArraySpec((height, width), wp.vec3),
+            "position": ArraySpec((height, width), wp.vec3),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """One pass over all pixels."""
+        config = trace_variant(trace_config(self.request.scene), device)
+        make_trace_surfaces_kernel(config)
+        inputs = tuple(arrays[name] for name in ("params", "rays", "ray_scene", "probes"))
+        visible = find_visible(arrays) if "hits" in self.wiring.reads else VisibleObjects()
+        out = make_surfaces(*(arrays[name] for name in self.wiring.writes))
+
+        def launch(rows: Rows | None) -> None:
+            trace_surfaces(config, *inputs, visible, out, rows=rows)
+
+        return [Pass(launch, rows=self.request.size[1])]

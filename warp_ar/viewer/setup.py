@@ -1,0 +1,217 @@
+"""What is wrong with the set-up whose frames are shown, said in words while they are lit; and the ball, measured."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import math
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.errors import UsageError, WarpArError
+from warp_ar.input.ball_measure import measure_ball
+from warp_ar.input.check_pictures import Look, look_at, why_unseen
+from warp_ar.input.checkup import check_look
+from warp_ar.input.finding import Finding
+from warp_ar.input.grey_response import measure_grey_response
+from warp_ar.input.response import write_response
+from warp_ar.input.tracking import TrackState
+from warp_ar.scene import Camera, Probe, Scene
+from warp_ar.viewer.controls import Controls, Notify
+
+Image = npt.NDArray[np.uint8]
+
+KEPT: Final = 24
+"""Frames that are looked at: the newest, ``STEP_SECONDS`` from each other."""
+STEP_SECONDS: Final = 0.4
+LOST_SECONDS: Final = 1.5
+"""How long the marker must not have been seen before it is looked at why."""
+AGAIN_SECONDS: Final = 3.0
+"""How often that is looked at."""
+RESPONSE: Final = "response.txt"
+"""Name of a measured response's file."""
+FEWEST: Final = 3
+"""Frames without which nothing is measured."""
+
+
+class SetupChecks:
+    """Keeps some of the frames and looks at them on a helper's thread. The thread of the frames calls ``note``."""
+
+    def __init__(self, controls: Controls, helper: Executor, notify: Notify, folder: Path) -> None:
+        """Start without frames.
+
+        Args:
+            controls: What is shown, and where measurements go.
+            helper: Looks at the frames, beside them.
+            notify: Takes ``message`` whenever it has changed.
+            folder: Where a measured response is kept.
+        """
+        self._folder = folder
+        self._controls, self._helper, self._notify = controls, helper, notify
+        self._frames: collections.deque[tuple[Image, float]] = collections.deque(maxlen=KEPT)
+        self._of: object = None
+        self._busy: Future[None] | None = None
+        self._step: str | None = None
+        self._waits = False
+        self._work: dict[str, Callable[[Scene, Look], None]] = {
+            "check": self._check,
+            "ball": self._ball,
+            "response": self._response,
+        }
+        self._seen = self._looked = 0.0
+        self._findings: list[Finding] | None = None
+        self._measured: dict[str, str] = {}
+        self._failed: str | None = None
+        self.missing: Finding | None = None
+        """Why the marker is not seen, in words; None while it is."""
+
+    def note(self, image: Image, state: TrackState | None, now: float) -> None:
+        """Take notice of a frame.
+
+        Args:
+            image: As the camera gave it, RGB.
+            state: Whether the marker was seen; None where nothing looked for it.
+            now: Seconds on a clock that does not jump.
+        """
+        feed = self._controls.feed
+        of = (feed.source, self._controls.wanted.scene.marker)
+        if self._of is None or of != self._of:
+            self._of = of
+            self._frames.clear()
+            self._seen, self.missing = now, None
+        if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
+            self._frames.append((image, now))
+        self._begin()
+        if state in (None, TrackState.TRACKED):
+            self._seen, self.missing = now, None
+        elif now - self._seen > LOST_SECONDS and now - self._looked > AGAIN_SECONDS and not self._is_busy:
+            self._looked = now
+            self._busy = self._helper.submit(self._say_why)
+
+    @property
+    def _is_busy(self) -> bool:
+        return self._busy is not None and not self._busy.done()
+
+    def _shown(self) -> tuple[Scene, Camera]:
+        wanted, feed = self._controls.wanted, self._controls.feed
+        width, height = feed.source.size
+        camera = self._controls.camera_of(feed, wanted).scaled_to(width, height)
+        return dataclasses.replace(wanted.scene, camera=camera), camera
+
+    def _say_why(self) -> None:
+        try:
+            scene, camera = self._shown()
+            look = look_at(scene.marker, camera, list(self._frames)[-4:])
+            self.missing = None if look.views else why_unseen(scene.marker, look)
+        except (WarpArError, IndexError):
+            self.missing = None  # the source has changed meanwhile
+
+    def step(self, name: str) -> None:
+        """Begin to look at the frames, or to measure by them, as soon as there are enough.
+
+        Raises:
+            UsageError: It is at that already.
+        """
+        if self._step is not None:
+            raise UsageError("the frames are being looked at already: wait until that is done")
+        if name not in self._work:
+            raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
+        self._step, self._waits = name, True
+        self._notify(self.message())
+
+    def _begin(self) -> None:
+        """Do what was asked for, if there are enough frames."""
+        if self._waits and self._step is not None and len(self._frames) >= FEWEST:
+            self._waits = False
+            self._busy = self._helper.submit(self._run, self._work[self._step])
+
+    def _run(self, work: Callable[[Scene, Look], None]) -> None:
+        self._failed = None
+        try:
+            scene, camera = self._shown()
+            work(scene, look_at(scene.marker, camera, list(self._frames)))
+        except WarpArError as error:
+            self._failed = str(error)
+        finally:
+            self._step = None
+            self._notify(self.message())
+
+    def _check(self, scene: Scene, look: Look) -> None:
+        self._findings = check_look(scene, look, views=2)
+
+    def _ball(self, scene: Scene, look: Look) -> None:
+        """Measure the first mirror ball and put it where it stands."""
+        if not scene.probes:
+            raise UsageError("the scene has no mirror ball: use the printed card, or add one to its file")
+        if len(look.views) < FEWEST:
+            raise UsageError("the marker was seen in too few frames to measure the ball by")
+        probe, *others = scene.probes
+        found = measure_ball(look.views, look.camera, probe, scene.proxies, others)
+        x, y, z = (round(value, 5) for value in found.center)
+        ball = dataclasses.replace(probe, center=(x, y, z), radius=round(found.radius, 5))
+        self._controls.change(lambda w: dataclasses.replace(w, scene=_with_ball(w.scene, ball)), "measure the ball")
+        moved = 1e3 * math.dist(found.center, probe.center)
+        radius = f"{1e3 * found.radius:.1f} mm"
+        radius += (
+            " as typed (the views are too alike to tell it: move the camera around)"
+            if found.radius_deviation is None
+            else f" ± {2e3 * found.radius_deviation:.1f} mm"
+        )
+        self._measured["ball"] = (
+            f"The ball's centre was {moved:.1f} mm off; it is known to ± {2e3 * found.deviation:.1f} mm now. "
+            f"Its radius: {radius}."
+        )
+
+    def _response(self, scene: Scene, look: Look) -> None:
+        """Measure how the camera encodes light, by the card's greys."""
+        found = measure_grey_response(look.images)
+        path = self._folder / RESPONSE
+        write_response(found.curve, path)
+        camera = dataclasses.replace(scene.camera, transfer=path)
+        self._controls.change(lambda w: w.with_camera(camera), "measure the response")
+        middle = found.curve[128].mean()
+        self._measured["response"] = (
+            f"Code 128 is {middle:.3f} of clipping ± {2 * found.deviation[128].max():.0%} (sRGB: 0.216), by "
+            f"{found.views} pictures. Several exposures, or lamps on and off, tell it better."
+        )
+
+    def response_file(self) -> bytes:
+        """The measured response.
+
+        Raises:
+            UsageError: None was measured.
+        """
+        if "response" not in self._measured:
+            raise UsageError("no response was measured here")
+        return (self._folder / RESPONSE).read_bytes()
+
+    def message(self) -> dict[str, Any]:
+        """What was found and measured."""
+        findings = None
+        if self._findings is not None:
+            findings = [
+                {"name": f.name, "text": f.text, "cost": f.cost, "remedy": f.remedy, "error": f.error}
+                for f in self._findings
+            ]
+        return {
+            "type": "setup",
+            "busy": self._step,
+            "findings": findings,
+            "frames": len(self._frames),
+            "measured": dict(self._measured),
+            "failed": self._failed,
+        }
+
+    def missing_record(self) -> dict[str, str] | None:
+        """Why the marker is not seen, as plain data."""
+        missing = self.missing
+        return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
+
+
+def _with_ball(scene: Scene, ball: Probe) -> Scene:
+    return dataclasses.replace(scene, probes=(ball, *scene.probes[1:]))

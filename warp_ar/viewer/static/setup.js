@@ -1,0 +1,105 @@
+// Setting up one's own desk: the card, its sizes, what is missing, the measurements, and what is wrong.
+
+import { el } from "./panels.js";
+
+const $ = (id) => document.getElementById(id);
+const DICTIONARIES = ["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250", "DICT_5X5_50", "DICT_5X5_100", "DICT_5X5_250", "DICT_6X6_50", "DICT_6X6_250", "DICT_7X7_50", "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11"];
+const millimetres = (metres) => Number((1000 * metres).toFixed(2));
+
+export class SetupPanel {
+  #connection;
+  #scene = null;
+  #state = {};
+  #frame = null;
+
+  constructor(connection) {
+    this.#connection = connection;
+    $("use-card").addEventListener("click", () => {
+      const [radius, ruler] = [$("ball-radius"), $("ruler")].map((input) => input.valueAsNumber / 1000);
+      if (Number.isFinite(radius) && Number.isFinite(ruler)) connection.send("card", { radius, ruler });
+    });
+    $("use-marker").addEventListener("click", () => {
+      connection.set("marker", 0, "dictionary", $("marker-dictionary").value);
+      if (Number.isInteger($("marker-id").valueAsNumber)) connection.set("marker", 0, "id", $("marker-id").valueAsNumber);
+      if (Number.isFinite($("marker-size").valueAsNumber)) connection.set("marker", 0, "size", $("marker-size").valueAsNumber / 1000);
+    });
+    $("measure-ball").addEventListener("click", () => connection.send("setup", { step: "ball" }));
+    $("measure-response").addEventListener("click", () => connection.send("setup", { step: "response" }));
+    $("check").addEventListener("click", () => connection.send("setup", { step: "check" }));
+    $("marker-dictionary").replaceChildren(...DICTIONARIES.map((name) => el("option", { value: name }, name)));
+  }
+
+  set scene(scene) {
+    const before = JSON.stringify([this.#scene?.marker, this.#scene?.probes]);
+    this.#scene = scene;
+    const { marker, probes } = scene;
+    const own = marker.board === null;
+    const size = (metres) => `${millimetres(metres)} mm`;
+    $("marker-note").textContent = marker.ruler !== null
+      ? `The scene uses the printed card${Math.abs(marker.ruler - 0.1) > 1e-6 ? `, whose rulers are ${size(marker.ruler)}` : ""}${probes.length ? `; the ball's radius is ${size(probes[0].radius)}` : ""}.`
+      : own
+        ? `The scene expects another marker: number ${marker.id} of ${marker.dictionary}, ${size(marker.size)} wide.`
+        : `The scene expects a board of its own: ${marker.board}.`;
+    // What is typed stays until the scene says otherwise.
+    if (before === JSON.stringify([marker, probes])) return;
+    if (probes.length) $("ball-radius").value = millimetres(probes[0].radius);
+    $("ruler").value = millimetres(marker.ruler ?? 0.1);
+    if (!DICTIONARIES.includes(marker.dictionary)) $("marker-dictionary").append(el("option", { value: marker.dictionary }, marker.dictionary));
+    $("marker-dictionary").value = marker.dictionary;
+    $("marker-id").value = marker.id;
+    $("marker-size").value = millimetres(marker.size);
+    this.#say();
+  }
+
+  set state(state) {
+    this.#state = state;
+    this.#say();
+  }
+
+  frame(frame) {
+    if (this.#frame?.state === frame.state && !!this.#frame?.plan === !!frame.plan) return;
+    this.#frame = frame;
+    this.#say();
+  }
+
+  /** What is seen, or what is missing and what to do. */
+  #say() {
+    const { missing, camera } = this.#state;
+    const seen = this.#frame?.state;
+    const what = this.#scene?.marker.board ? "the whole card" : "the whole black square of the marker";
+    const words = missing
+      ? `${sentence(missing.text)} ${missing.name === "marker.other" ? "Press “Use the card with these sizes” if it is the printed card." : sentence(missing.remedy)}`
+      : seen === "tracked"
+        ? "The marker is seen. Go on with the camera."
+        : seen
+          ? `The marker is not seen: ${what}, with the white around it, must be in the picture, flat, sharp and lit.`
+          : camera
+            ? "The camera's picture is not lit yet."
+            : "This is the scene's own clip: press “My camera” to show your desk.";
+    put("seen-note", words);
+    $("guide").hidden = !(missing || (camera && seen && seen !== "tracked"));
+    put("guide", words, true);
+    const guessed = this.#state.lens === "guessed" ? "Guessed so far: the camera’s field of view" : this.#state.lens === "estimated" ? "Estimated: the camera’s focal length" : "";
+    $("guess").hidden = !guessed;
+    put("guess", guessed);
+  }
+
+  set message({ busy, findings, measured, failed }) {
+    for (const id of ["measure-ball", "measure-response", "check"]) $(id).disabled = busy !== null;
+    const words = (step, idle) => (busy === step ? "Looking at the frames …" : measured[step] ?? idle);
+    put("ball-note", words("ball", "Centre and radius are solved for together, from the frames of the last seconds: move the camera around the ball, then press."));
+    put("response-note", words("response", "How the camera encodes light, told by the card's grey patches under different exposures or light."));
+    $("response-file").hidden = !measured.response;
+    const count = findings?.length ?? 0;
+    put("check-note", busy === "check" ? "Looking at the frames …" : failed ? sentence(failed) : !findings ? "Units, card, camera, ball and light are looked at in the frames of the last seconds." : count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.");
+    $("findings").replaceChildren(...(findings ?? []).map((one) => el("li", {}, sentence(one.text), el("small", {}, `Spoils: ${one.cost}.`), el("small", {}, `To do: ${one.remedy}.`))));
+  }
+}
+
+const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
+
+/** Text of an element, set only where it changes: what is set anew is read out anew. */
+function put(id, text, inside = false) {
+  const element = inside ? $(id).firstElementChild : $(id);
+  if (element.textContent !== text) element.textContent = text;
+}
