@@ -52,7 +52,7 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     """Kernel of ``filter_ratio`` for tiles of so many cells along."""
     wide, narrow = side // 2, side // 4
     width = 2 * wide + 1
-    # Values, not ``wp.static`` of a loop's variable: Warp would translate the whole kernel to tell whether it is cached.
+    # Values: for a ``wp.static`` of a loop's variable Warp translates the kernel to tell whether it is cached.
     weights = wp.types.vector(length=width, dtype=wp.float32)
     wide_weights = weights(*(window_weight(a - wide, wide) for a in range(width)))
     narrow_weights = weights(*(window_weight(a - wide, narrow) for a in range(width)))

@@ -580,8 +580,8 @@ def _make_any_of_both(kinds: tuple[int, ...], detail: bool) -> wp.Function:
     def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
         objects = scene.objects.shape[0]
         for index in range(objects + scene.proxies.shape[0]):
-            shape = Shape()
-            if index < objects:
+            shape = Shape()  # no ternary: in a kernel it reads both arrays, beyond their ends
+            if index < objects:  # noqa: SIM108
                 shape = scene.objects[index]
             else:
                 shape = scene.proxies[index - objects]
