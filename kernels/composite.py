@@ -156,6 +156,21 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
         }
     };
 
+    // Colour and coverage of N pixels, coverage three times: value 3 k + c of pixel k is number 4 k + c.
+    typedef float Lanes __attribute__((vector_size(64), aligned(4)));
+    auto spread = [](float* colour, float* coverage, const float* at) {
+        const Lanes p = *(const Lanes*)at, q = *(const Lanes*)(at + 16);
+        const Lanes s = *(const Lanes*)(at + 32), t = *(const Lanes*)(at + 48);
+        Lanes* into = (Lanes*)colour;
+        into[0] = __builtin_shufflevector(p, q, 0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, 16, 17, 18, 20);
+        into[1] = __builtin_shufflevector(q, s, 5, 6, 8, 9, 10, 12, 13, 14, 16, 17, 18, 20, 21, 22, 24, 25);
+        into[2] = __builtin_shufflevector(s, t, 10, 12, 13, 14, 16, 17, 18, 20, 21, 22, 24, 25, 26, 28, 29, 30);
+        into = (Lanes*)coverage;
+        into[0] = __builtin_shufflevector(p, q, 3, 3, 3, 7, 7, 7, 11, 11, 11, 15, 15, 15, 19, 19, 19, 23);
+        into[1] = __builtin_shufflevector(q, s, 7, 7, 11, 11, 11, 15, 15, 15, 19, 19, 19, 23, 23, 23, 27, 27);
+        into[2] = __builtin_shufflevector(s, t, 11, 15, 15, 15, 19, 19, 19, 23, 23, 23, 27, 27, 27, 31, 31, 31);
+    };
+
     int start = width, stop = 0;
     const Layer* all[4] = {&objects, &added, &ratio, &mirrored};
     for (const Layer* layer : all)
@@ -169,37 +184,33 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     for (int j = start; j < stop; j += N) {
         const int count = width - j < N ? width - j : N;
         const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirrored, j)};
-        float covered[3 * N] = {}, left[3 * N], a[3 * N] = {}, m[3 * N] = {}, r[3 * N];
-        unsigned changed[3 * N] = {};
-        unsigned touched = 0;
+        float covered[3 * N] = {}, alpha[3 * N] = {}, a[3 * N] = {}, m[3 * N] = {}, r[3 * N];
+        unsigned changed[3 * N];
+        unsigned touched = 0, whole = 1;
         if (any[0] || any[1] || any[2] || any[3]) {
-            for (int i = 0; i < 3 * N; ++i) left[i] = r[i] = 1.0f;
-            if (any[0]) {
+            for (int i = 0; i < 3 * N; ++i) r[i] = 1.0f;
+            if (j >= objects.start && j + N <= objects.stop) {
+                spread(covered, alpha, objects.at + 4 * j);
+            } else if (any[0]) {
                 const int first = objects.start > j ? objects.start - j : 0;
                 const int last = objects.stop < j + N ? objects.stop - j : N;
                 for (int k = first; k < last; ++k) {
                     const float* at = objects.at + 4 * (j + k);
                     for (int c = 0; c < 3; ++c) {
                         covered[3 * k + c] = at[c];
-                        left[3 * k + c] = 1.0f - at[3];
+                        alpha[3 * k + c] = at[3];
                     }
-                    changed[3 * k] = at[3] != 0.0f;
                 }
-                for (int i = 0; i < 3 * N; ++i) changed[i] |= covered[i] != 0.0f;
             }
-            if (any[1]) {
-                take(a, added, j, 0.0f);
-                for (int i = 0; i < 3 * N; ++i) changed[i] |= a[i] != 0.0f;
+            if (any[1]) take(a, added, j, 0.0f);
+            if (any[2]) take(r, ratio, j, 1.0f);
+            if (any[3]) take(m, mirrored, j, 0.0f);
+            for (int i = 0; i < 3 * N; ++i) {
+                changed[i] = (covered[i] != 0.0f) | (alpha[i] != 0.0f) | (a[i] != 0.0f);
+                changed[i] |= (r[i] != 1.0f) | (m[i] != 0.0f);
+                touched |= changed[i];
+                whole &= changed[i];
             }
-            if (any[2]) {
-                take(r, ratio, j, 1.0f);
-                for (int i = 0; i < 3 * N; ++i) changed[i] |= r[i] != 1.0f;
-            }
-            if (any[3]) {
-                take(m, mirrored, j, 0.0f);
-                for (int i = 0; i < 3 * N; ++i) changed[i] |= m[i] != 0.0f;
-            }
-            for (int i = 0; i < 3 * N; ++i) touched |= changed[i];
         }
         if (touched == 0) {
             memcpy(out + 3 * j, codes + 3 * j, 3 * count);
@@ -217,7 +228,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
             value = value + a[i];
             value = value + m[i];
             value = value > 0.0f ? value : 0.0f;
-            value = left[i] * value;
+            value = (1.0f - alpha[i]) * value;
             value = value + covered[i];
             x[i] = value > 0.0f ? (value < 1.0f ? value : 1.0f) : 0.0f;  // NaN is not above 0
             key[i] = 3 * static_cast<wp::int32>(__builtin_sqrtf(x[i]) * static_cast<float>(keys - 1));
@@ -237,9 +248,13 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
             for (int i = 0; i < 3 * N; ++i)
                 if (steps[i] != static_cast<float>(static_cast<wp::int32>(steps[i])))
                     while (x[i] >= table[3 * (2 * keys + found[i]) + i % 3]) ++found[i];
-        for (int k = 0; k < 3 * N; k += 3) {
-            const bool kept_code = (changed[k] | changed[k + 1] | changed[k + 2]) == 0;
-            for (int i = k; i < k + 3; ++i) code[i] = kept_code ? code[i] : static_cast<unsigned char>(found[i]);
+        if (whole) {
+            for (int i = 0; i < 3 * N; ++i) code[i] = static_cast<unsigned char>(found[i]);
+        } else {
+            for (int k = 0; k < 3 * N; k += 3) {
+                const bool kept_code = (changed[k] | changed[k + 1] | changed[k + 2]) == 0;
+                for (int i = k; i < k + 3; ++i) code[i] = kept_code ? code[i] : static_cast<unsigned char>(found[i]);
+            }
         }
         memcpy(out + 3 * j, code, 3 * count);
     }
