@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import weakref
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -160,6 +161,21 @@ def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
 
 
+_SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
+
+
+def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
+    """``make_ray_mesh`` of a file's mesh, one for all scenes of a device for as long as any of them holds it.
+
+    A mesh that a program made itself may change in its hands: each scene has its own of that.
+    """
+    by_device = _SHARED.setdefault(mesh, weakref.WeakValueDictionary())
+    known = by_device.get(str(device))
+    if known is None:
+        known = by_device[str(device)] = make_ray_mesh(mesh, device)
+    return known
+
+
 class HostScene:
     """The host's side of a scene: owns what the device's ``RayScene`` points to, and moves what is animated."""
 
@@ -291,7 +307,7 @@ class HostScene:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
             mesh = key if isinstance(key, Mesh) else file_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
-            ray_mesh = make_ray_mesh(mesh, device)
+            ray_mesh = shared_ray_mesh(mesh, device) if isinstance(key, Path) else make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
         return self._meshes[key]

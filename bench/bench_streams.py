@@ -1,0 +1,153 @@
+"""Many cameras in one process: what a further pipeline costs, frames a second of all, and how long each frame takes.
+
+A stream is a pipeline and a thread that hands it the frames of ``desk``, tracking included, and waits for each
+picture. ``latency_ms`` runs from the time at which the camera has a frame to the picture on the host. A camera that
+finds its stream busy drops the frame. Before anything is timed all streams must show the same picture.
+
+``WARP_AR_BENCH`` may name rows, frames a second of each camera (0: the next frame is there when the last picture is)
+and numbers of streams, as in ``1080,60,1,4,16``; usual are ``240,0,1,2,4`` on CPU and ``1080,60,1,4,16`` on CUDA.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import resource
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from bench.bench_frame import Clip, clip
+from bench.common import report
+from warp_ar.engine.pipeline import Pipeline
+
+USUAL = {"cpu": "240,0,1,2,4", "cuda": "1080,60,1,4,16"}
+SIZES = {240: (320, 240), 480: (640, 480), 1080: (1920, 1080), 2160: (3840, 2160)}
+WARM_UP = 12
+FRAMES = 60
+"""Of each stream that are timed; ten seconds' worth of a camera's."""
+CLIP_RATE = 24.0
+LEAST_SIZE = 1 << 20
+
+
+@dataclasses.dataclass
+class Stream:
+    """One camera: its pipeline, and what was measured of its frames."""
+
+    pipeline: Pipeline
+    latency_ms: list[float] = dataclasses.field(default_factory=list)
+    dropped: int = 0
+    error: BaseException | None = None
+
+    def show(self, frames: Clip, index: int, rate: float) -> np.ndarray:
+        """The picture of a frame, by the camera's clock."""
+        image = frames.images[index % len(frames.images)]
+        return self.pipeline.submit(image, time_seconds=index / (rate or CLIP_RATE)).image
+
+    def run(self, frames: Clip, count: int, rate: float, begin: threading.Barrier) -> None:
+        """Light so many frames after the warm-up; what fails is told by ``error``."""
+        try:
+            begin.wait()
+            start = time.perf_counter()
+            index = 0
+            while index < count:
+                due = start + index / rate if rate else time.perf_counter()
+                time.sleep(max(due - time.perf_counter(), 0.0))
+                self.show(frames, WARM_UP + index, rate)
+                now = time.perf_counter()
+                self.latency_ms.append((now - due) * 1e3)
+                # While this picture was made the camera took others: it goes on with the next that is to come.
+                following = max(index + 1, int(np.ceil((now - start) * rate))) if rate else index + 1
+                self.dropped += min(following, count) - index - 1
+                index = following
+        except BaseException as error:
+            self.error = error
+            begin.abort()
+
+
+def used_memory(device: Any) -> float:
+    """MB that this process holds: of the device, on CPU of the host."""
+    if device.is_cuda:
+        return (device.total_memory - device.free_memory) / LEAST_SIZE
+    if sys.platform == "linux":
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * resource.getpagesize() / LEAST_SIZE
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / LEAST_SIZE
+
+
+def open_streams(
+    frames: Clip, count: int, device: Any, close: contextlib.ExitStack
+) -> tuple[list[Stream], list[tuple[float, float, float]]]:
+    """Streams whose first pictures were made; for each milliseconds by the clock and of all threads, and MB."""
+    streams: list[Stream] = []
+    costs: list[tuple[float, float, float]] = []
+    first = None
+    for _ in range(count):
+        wp.synchronize_device(device)
+        begin, busy, before = time.perf_counter(), time.process_time(), used_memory(device)
+        stream = Stream(close.enter_context(Pipeline(frames.scene, device=str(device))))
+        picture = stream.show(frames, 0, 0.0)
+        spent = time.perf_counter() - begin, time.process_time() - busy
+        costs.append((spent[0] * 1e3, spent[1] * 1e3, used_memory(device) - before))
+        first = picture.copy() if first is None else first
+        np.testing.assert_array_equal(picture, first)
+        streams.append(stream)
+    return streams, costs
+
+
+def time_streams(streams: list[Stream], frames: Clip, rate: float) -> tuple[float, float]:
+    """Run all side by side; returns seconds by the clock and of all threads."""
+    count = round(10 * rate) if rate else FRAMES
+    for index in range(1, WARM_UP):
+        pictures = [stream.show(frames, index, rate) for stream in streams]
+    for picture in pictures:
+        np.testing.assert_array_equal(picture, pictures[0])
+    barrier = threading.Barrier(len(streams) + 1)
+    threads = [threading.Thread(target=stream.run, args=(frames, count, rate, barrier)) for stream in streams]
+    for thread in threads:
+        thread.start()
+    with contextlib.suppress(threading.BrokenBarrierError):  # whoever broke it says why
+        barrier.wait()
+    begin, busy = time.perf_counter(), time.process_time()
+    for thread in threads:
+        thread.join()
+    spent = time.perf_counter() - begin, time.process_time() - busy
+    for stream in streams:
+        if stream.error is not None:
+            raise stream.error
+    return spent
+
+
+def main(device: str) -> None:
+    """Every number of streams in turn, each with pipelines of its own."""
+    target = wp.get_device(device)
+    asked = os.environ.get("WARP_AR_BENCH") or USUAL["cuda" if target.is_cuda else "cpu"]
+    rows, rate, *counts = (int(part) for part in asked.split(","))
+    frames = clip("desk", SIZES[rows])
+    with Pipeline(frames.scene, device=device) as pipeline:
+        pipeline.warm_up()  # compiles what is missing
+        pipeline(frames.images[0])
+    for count in counts:
+        with contextlib.ExitStack() as close:
+            streams, costs = open_streams(frames, count, target, close)
+            wall, busy = time_streams(streams, frames, float(rate))
+        latency = [value for stream in streams for value in stream.latency_ms]
+        start_ms, start_busy, megabytes = np.median(costs[1:] or costs, axis=0).tolist()
+        report(
+            f"streams {count} of {rows} rows, {rate or 'as many'} frames a second each",
+            latency,
+            device,
+            p99_ms=round(float(np.percentile(latency, 99)), 3),
+            fps=round(len(latency) / wall, 1),
+            dropped=sum(stream.dropped for stream in streams),
+            processor_ms=round(busy * 1e3 / len(latency), 2),
+            further_start_ms=round(start_ms),
+            further_start_processor_ms=round(start_busy),
+            further_mb=round(megabytes, 1),
+            cores=os.cpu_count(),
+        )
