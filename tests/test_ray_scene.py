@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
+import weakref
 
 import cv2
 import numpy as np
@@ -131,6 +133,26 @@ def test_mesh_is_moved_to_its_middle_and_back(device, tmp_path):
     # One file is loaded once, however often it stands in the scene.
     assert records(host, "objects")["mesh"][0] == records(host, "objects")["mesh"][1]
     assert host.ray_scene.vertex_normals.shape == (3,)
+
+
+def test_scenes_share_the_mesh_of_a_file(device, tmp_path):
+    """Two scenes hold one tree of a file's mesh; a file that changed is another, and nobody's is kept."""
+    path = tmp_path / "one.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    scene = scenes.Scene(CAMERA, objects=(scenes.Object("mesh", file=path),))
+    target = wp.get_device(device)
+    first, second = HostScene(scene, target), HostScene(scene, target)
+    shared = records(first, "objects")["mesh"][0]
+    assert records(second, "objects")["mesh"][0] == shared
+    path.write_text("v 0 0 0\nv 2 0 0\nv 0 2 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    third = HostScene(scene, target)
+    assert records(third, "objects")["mesh"][0] != shared
+    kept = weakref.ref(next(iter(first._meshes.values()))[1])
+    del first
+    assert kept() is not None
+    del second
+    gc.collect()
+    assert kept() is None
 
 
 def test_ray_mesh_keeps_the_true_corners(device):
