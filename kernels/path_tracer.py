@@ -277,8 +277,8 @@ def make_look_up_material() -> wp.Function:
         surface = Surface()
         if vertex.kind == OBJECT:
             hit = vertex.hit
-            material = scene.rays.objects[hit.shape].material
-            surface = surface_at(scene.rays, scene.dfg, material, hit.uv, wp.dot(hit.normal, wo))
+            # A cone without an angle: samples are many, and pictures are read at their finest level.
+            surface = surface_at(scene.rays, scene.dfg, hit, wp.dot(hit.normal, wo), 0.0)
         elif vertex.kind == BALL:
             surface.model = wp.static(int(MIRROR))
             surface.reflectance = scene.probes[vertex.index].reflectance
@@ -464,6 +464,8 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
             surface = look_up_material(scene, vertex, wo, reflectance)
+            if not only_light:
+                carried.radiance += wp.cw_mul(weight, surface.emission)
             if surface.model != wp.static(int(MIRROR)):
                 u = random_triple(key, k, SKY)
                 sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])

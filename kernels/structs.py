@@ -127,6 +127,10 @@ class Material:
     emissive_texture: wp.int32
 
 
+TEXTURES = tuple(name for name in Material.vars if name.endswith("_texture"))
+"""Fields of a material that are the index of a texture, or -1."""
+
+
 @wp.struct
 class Texture:
     """One use of a picture: where its texels lie, row 0 is v = 1 (the image's top), and how they are read."""

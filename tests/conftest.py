@@ -34,6 +34,13 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "atlas(row, stage, method): hard case that a test covers; see hard_cases")
 
 
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove what Warp keeps for threads that compiled kernels; at Python's end it would warn of it."""
+    from warp_ar.engine.modules import remove_header_folders
+
+    remove_header_folders()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Run a folder of tests in one process per core.

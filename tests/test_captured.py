@@ -19,6 +19,7 @@ from warp_ar.light.captured import (
     latlong_directions,
     texel_solid_angles,
 )
+from warp_ar.light.latlong_axes import DESCRIPTIONS, to_axes, world_from_marker
 from warp_ar.scene import dumps_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.session import with_light
@@ -100,6 +101,31 @@ NO_NUMBER = (
     '{"direction": [0, 0, 1], "solid_angle": NaN, "power": [1, 1, 1], "low": [1, 1, 1], "high": null, '
     '"distance": null, "origin": [0, 0, 0]}'
 )
+
+
+@pytest.mark.parametrize("axes", ["blender", "y-up", "opengl"])
+def test_a_map_in_other_axes_is_turned(tmp_path, axes):
+    """What lies in a direction of the marker's lies there again, emitters too."""
+    radiance = smooth(16).astype(np.float32)
+    direction = np.array([0.36, -0.48, 0.8])
+    emitter = CapturedEmitter(tuple(direction), 0.1, (1.0, 1.0, 1.0), (1.0, 1.0, 1.0), None)
+    turned = to_axes(radiance, axes)
+    assert np.abs(turned - radiance).max() > 0.1
+    light = Light(turned, np.ones(turned.shape[:2], np.float32), (emitter,))
+    path = tmp_path / "light.exr"
+    light.save(path)
+    with OpenEXR.File(str(path)) as file:
+        header = dict(file.header())
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    header["axes"] = DESCRIPTIONS[axes]
+    OpenEXR.File({k: v for k, v in header.items() if k not in ("channels",)}, channels).write(str(path))
+    found = Light.load(path)
+    assert np.array_equal(found.radiance, radiance)
+    assert np.allclose(world_from_marker(axes) @ found.emitters[0].direction, direction, atol=1e-5)
+    header["axes"] = "latlong, upside down"
+    OpenEXR.File({k: v for k, v in header.items() if k not in ("channels",)}, channels).write(str(path))
+    with pytest.raises(SceneError, match="axes is 'latlong, upside down'; expected one of"):
+        Light.load(path)
 
 
 @pytest.mark.parametrize(

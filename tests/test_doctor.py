@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 
 import cv2
+import imageio.v3
 import numpy as np
 import pytest
 
-from warp_ar import doctor
+from warp_ar import doctor, live
 from warp_ar.errors import SceneError
+from warp_ar.input import checkup
 from warp_ar.input.check_ball import check_balls
 from warp_ar.input.check_pictures import Look, check_pictures, take_look
 from warp_ar.input.check_print import check_print
@@ -285,6 +288,60 @@ def test_costs_are_measured_and_order_the_findings():
     findings = [Finding("ball.place", "", ""), Finding("marker.unseen", "", "")]
     assert [finding.name for finding in worst_first(findings)] == ["marker.unseen", "ball.place"]
     assert "FLIP" in findings[0].cost
+
+
+def lives_line(scene, monkeypatch, source=None):
+    """What ``live`` says first, and the names of all that its quick half finds, the worst first."""
+    said, names = [], []
+
+    def look(*arguments, **options):
+        found = check_up(*arguments, **options)
+        names.extend(finding.name for finding in found)
+        return found
+
+    monkeypatch.setattr(checkup, "check_up", look)
+    monkeypatch.setattr(live, "say", said.append)
+    live._quick_check(argparse.Namespace(scene="my_desk", source=source), scene)
+    return said, names
+
+
+@pytest.mark.parametrize("fault", NUMBERS)
+def test_lives_line_names_wrong_numbers(fault, monkeypatch):
+    name, change = NUMBERS[fault]
+    said, names = lives_line(dataclasses.replace(change(load_scene("desk")), source=None), monkeypatch)
+    assert name in names
+    texts = {f.name: f.text for f in check_scene(change(load_scene("desk")))}
+    assert said[0].startswith(texts[names[0]]), "it is not the worst that is said"
+    assert fault_errors()[names[0]]["error"] >= fault_errors()[name]["error"]
+    assert said[0].endswith("python -m warp_ar.doctor my_desk")
+
+
+SHOWN = {
+    "radius 10 % long": BALLS["radius 10 % long"],
+    "on the other side": BALLS["on the other side"],
+    "focal length of another size": SEEN["focal length of another size"],
+    "overexposed": PICTURES["overexposed"],
+    "underexposed": PICTURES["underexposed"],
+}
+
+
+@pytest.mark.parametrize("fault", SHOWN)
+def test_lives_line_names_what_frames_show(fault, monkeypatch, looks, tmp_path):
+    name, change = SHOWN[fault]
+    scene = load_scene("desk")
+    if fault in PICTURES:
+        for k, image in enumerate(looks["desk"].images[:12]):
+            imageio.v3.imwrite(tmp_path / f"{k:04d}.png", change(image, k))
+        said, names = lives_line(scene, monkeypatch, str(tmp_path))
+    else:
+        said, names = lives_line(change(scene), monkeypatch)
+    assert name in names
+    assert len(said) == 1
+    assert fault_errors()[names[0]]["error"] >= fault_errors()[name]["error"]
+
+
+def test_live_says_nothing_of_a_right_set_up(monkeypatch):
+    assert lives_line(load_scene("desk"), monkeypatch) == ([], [])
 
 
 def test_results_are_written_and_comments_stay(tmp_path):

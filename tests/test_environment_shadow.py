@@ -28,6 +28,7 @@ from warp_ar.kernels.structs import (
     LAMBERT,
     PLANE,
     SPHERE,
+    TEXTURES,
     Emitter,
     FrameParams,
     Material,
@@ -144,9 +145,7 @@ def run(
     scene = RayScene()
     objects = [{**item, "material": 0} for item in objects]
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    scene.materials = records(
-        Material, {"model": LAMBERT, "base_color": (albedo,) * 3, "base_texture": -1, "specular_texture": -1}
-    )
+    scene.materials = records(Material, {"model": LAMBERT, "base_color": (albedo,) * 3, **dict.fromkeys(TEXTURES, -1)})
     surroundings = DistantLight()
     surroundings.environment = wp.array(sky(), dtype=wp.vec3)
     surroundings.probes = records(Probe, *probes)

@@ -84,7 +84,7 @@ def test_whoever_is_killed_leaves_whole_files() -> None:
     done = subprocess.run(command, cwd=table.ROOT, check=False, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     rows = [line for line in done.stdout.splitlines() if signal.Signals.SIGKILL.name in line or "SIGTERM" in line]
-    assert len(rows) == 12
+    assert len(rows) == 14
     assert all(f"| {KILLS} | {KILLS} |" in row for row in rows), done.stdout
 
 

@@ -410,6 +410,14 @@ def test_a_picture_that_never_changes_ends_with_1(tmp_path: Path, capsys: pytest
     assert "no frame was changed" in said[-1]
 
 
+def test_exposures_that_are_not_merged_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    card_frames(tmp_path / "frames", 3)
+    (tmp_path / "frames" / "exposures.json").write_text("[0.016, 0.0159, 0.001]")
+    scene = write_scene(tmp_path, source='path = "frames"')
+    run(scene, "--headless", "--frames", 2)
+    assert "exposures 0.016, 0.0159 s, 1.01 times apart, count as one" in capsys.readouterr().err
+
+
 def test_a_guessed_camera_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_scene(tmp_path, body=PROBE + OBJECT)
     text = re.sub(r"(?m)^(width|height|fx|fy|cx|cy) = .*\n", "", scene.read_text())

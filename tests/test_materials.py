@@ -12,7 +12,7 @@ from tests.error_model import check_error
 from tests.reference import materials as reference
 from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe
 from warp_ar.kernels.prefilter import integrate_dfg
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene, Shape
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, TEXTURES, Hit, Material, RayScene, Shape
 
 MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)
 
@@ -93,9 +93,8 @@ def lobes(wi, wo, parameter, device):
 
 def material(**fields):
     record = np.zeros(1, np.dtype(Material.numpy_dtype()))
-    for name in record.dtype.names:
-        if name.endswith("_texture"):
-            record[name] = -1
+    for name in TEXTURES:
+        record[name] = -1
     record["base_color"] = record["specular"] = 1.0
     for name, value in fields.items():
         record[name] = value

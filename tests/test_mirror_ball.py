@@ -36,6 +36,7 @@ from warp_ar.kernels.structs import (
     POINT,
     SPHERE,
     SPOT,
+    TEXTURES,
     FrameParams,
     KeyLight,
     Light,
@@ -150,7 +151,7 @@ def run(
     )
     scene = RayScene()
     scene.objects, scene.proxies = records(Shape, *objects), records(Shape, *proxies)
-    scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **one} for one in materials])
+    scene.materials = records(Material, *[{**dict.fromkeys(TEXTURES, -1), **one} for one in materials])
     receiver = make_receiver(
         config.relight or RelightConfig(method, trace),
         make_picture(wp.array(frame, dtype=wp.vec3ub), tables()[0], wp.array(rays, dtype=wp.vec2)),

@@ -14,7 +14,18 @@ from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import near_field, shade
 from warp_ar.kernels.prefilter import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.structs import LAMBERT, MIRROR, PHONG, SPHERE, FrameParams, Material, RayScene, Shape, make_picture
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    MIRROR,
+    PHONG,
+    SPHERE,
+    TEXTURES,
+    FrameParams,
+    Material,
+    RayScene,
+    Shape,
+    make_picture,
+)
 from warp_ar.kernels.visibility import Hit, TraceConfig, VisibleObjects, make_visible, trace_pixels
 from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
@@ -72,7 +83,7 @@ def run(
     scene = RayScene()
     scene.objects = records(Shape, *[{**item, "material": k} for k, item in enumerate(objects)])
     scene.proxies = records(Shape, DESK)
-    scene.materials = records(Material, *[{"base_texture": -1, "specular_texture": -1, **m} for m in materials])
+    scene.materials = records(Material, *[{**dict.fromkeys(TEXTURES, -1), **m} for m in materials])
     surroundings = DistantLight()
     environment = sky() if environment is None else environment
     surroundings.environment = wp.array(environment, dtype=wp.vec3)
@@ -260,7 +271,7 @@ def average(found, normals, irradiance, mirrored, models=(LAMBERT, LAMBERT), rec
     config = near_field.NearFieldConfig(forms, COUNT, 4, 1, SIDE, False, False)
     scene = RayScene()
     scene.objects = records(Shape, *[{**sphere(BALL, RADIUS), "material": k} for k in range(len(models))])
-    scene.materials = records(Material, *[{"model": model, "base_texture": -1} for model in models])
+    scene.materials = records(Material, *[{"model": model, **dict.fromkeys(TEXTURES, -1)} for model in models])
     hits = np.zeros(found.shape, np.dtype(Hit.numpy_dtype()))
     hits["normal"] = normals
     estimate, near = near_light((height, width)), near_light((height, width))

@@ -83,7 +83,7 @@ def look(objects, origins, direction, device):
     return seen.numpy()
 
 
-def square(tmp_path: pathlib.Path, *, tilt: float = 0.0, uvs=None, **material) -> pathlib.Path:
+def square(tmp_path: pathlib.Path, *, uvs=None, **material) -> pathlib.Path:
     """An upright square around the origin, seen along +y."""
     made = Gltf()
     textures = {"baseColorTexture", "metallicRoughnessTexture"}
@@ -110,10 +110,6 @@ FORWARD = (0.0, 1.0, 0.0)
 
 def picture(seed=1, channels=4):
     return np.random.default_rng(seed).integers(0, 256, (16, 16, channels)).astype(np.uint8)
-
-
-def reference_of(values):
-    return {"index": values}
 
 
 def test_every_texture_reaches_the_surface(device, tmp_path):

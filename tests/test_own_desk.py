@@ -8,8 +8,10 @@ import numpy as np
 import pypdfium2
 
 from tests.rendered_room import look_at
-from warp_ar import calibrate, doctor, init
+from warp_ar import calibrate, doctor, init, live
 from warp_ar.input import sheet
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.output.sinks import read_environment
 from warp_ar.scene import Camera, load_scene
 
 FOCAL = 0.005
@@ -18,6 +20,10 @@ BALL_MM = 0.5
 """Of the radius: what a user is promised."""
 PER_METRE = 3000.0
 """Pixels per metre of the printed sheet: a third of a millimetre, finer than any camera here sees it."""
+LIGHT = 0.2
+"""Of the irradiance from any side: what a user is promised."""
+TINT = np.array([1.0, 0.97, 0.94])
+"""The camera's white balance, on codes."""
 ACROSS = 2
 """Rays per pixel along each side."""
 
@@ -101,8 +107,25 @@ class Desk:
             linear[rows, columns] = 0.85 * self.around(hit[None], mirrored[None])[0]
         linear = linear.reshape(height, ACROSS, width, ACROSS).mean((1, 3))
         codes = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-        noisy = 255 * codes[..., None] * [1.0, 0.97, 0.94] + self.rng.normal(0, 1.0, (height, width, 1))
+        noisy = 255 * codes[..., None] * TINT + self.rng.normal(0, 1.0, (height, width, 1))
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+    def light(self, height):
+        """What the camera would see from the ball's place, linear RGB by sRGB, (height, 2 height, 3)."""
+        across = 4
+        directions = latlong_directions(across * height)
+        linear = self.around(np.broadcast_to(self.center, directions.shape), directions)
+        linear = linear.reshape(height, across, 2 * height, across).mean((1, 3))
+        codes = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        codes = codes[..., None] * TINT
+        return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+
+
+def irradiance(environment, normal):
+    """Irradiance (3,) on a surface that faces along ``normal``."""
+    height = len(environment)
+    weight = np.clip(latlong_directions(height) @ normal, 0, None) * texel_solid_angles(height)
+    return (environment * weight[..., None]).sum((0, 1))
 
 
 SEED = 2
@@ -139,3 +162,12 @@ def test_from_an_empty_folder(tmp_path, capsys):
     assert np.linalg.norm(np.subtract(probe.center, desk.center)) * 1e3 < interval + BALL_MM
 
     assert doctor.main([str(folder)]) == 0, capsys.readouterr().out
+
+    environment = tmp_path / "environment"
+    arguments = [str(folder), "--headless", "--device", "cpu", "--quality", "low", "--save-environment"]
+    assert live.main([*arguments, str(environment)]) == 0, capsys.readouterr().err
+    found = read_environment(sorted(environment.iterdir())[-1])
+    truth = desk.light(found.shape[0])
+    for normal in (*np.eye(3), *-np.eye(3)):
+        ratio = irradiance(found, normal) / irradiance(truth, normal)
+        assert np.abs(ratio - 1).max() < LIGHT, (normal, ratio)

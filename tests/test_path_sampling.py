@@ -29,7 +29,7 @@ from warp_ar.kernels.path_sampling import (
 )
 from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.sampling import sample_cosine_hemisphere, sample_uniform_hemisphere
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, RayScene
+from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, Hit, RayScene
 from warp_ar.kernels.visibility import FAR
 
 HEIGHT = 16
@@ -98,7 +98,9 @@ def surface_kernel(
     """Albedo by the surface's draws and by uniform ones, and the integral of the density."""
     i = wp.tid()
     normal = wp.vec3(0.0, 0.0, 1.0)
-    surface = surface_of(scene, dfg, 0, wp.vec2(0.0, 0.0), wo[2])
+    hit = Hit()
+    hit.corner = -1
+    surface = surface_of(scene, dfg, hit, wo[2], 0.0)
     key = PathKey()
     key.sample = wp.uint32(i)
     u = random_triple(key, 0, 0)
@@ -244,11 +246,13 @@ MATTER = {
 def test_surfaces_are_drawn_as_their_density_says(name: str, device: str) -> None:
     fields, cosine = MATTER[name]
     records = np.zeros(1, np.dtype(structs.Material.numpy_dtype()))
-    records["base_texture"] = records["specular_texture"] = -1
+    for name in structs.TEXTURES:
+        records[name] = -1
     for field, value in fields.items():
         records[field] = value
     scene = RayScene()
     scene.materials = wp.array(records, dtype=structs.Material, device=device)
+    scene.objects = wp.zeros(1, dtype=structs.Shape, device=device)
     dfg = wp.zeros((32, 32), dtype=wp.vec2, device=device)
     integrate_dfg(dfg)
     estimates = wp.zeros((3, COUNT), dtype=wp.float32, device=device)

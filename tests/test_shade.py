@@ -66,9 +66,8 @@ def make_distant_light(models, device, radiance=1.0):
 
 def materials(*fields, device):
     records = np.zeros(len(fields), np.dtype(structs.Material.numpy_dtype()))
-    for name in records.dtype.names:
-        if name.endswith("_texture"):
-            records[name] = -1
+    for name in structs.TEXTURES:
+        records[name] = -1
     for record, values in zip(records, fields, strict=True):
         for name, value in values.items():
             record[name] = value

@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import av
 import cv2
@@ -16,10 +18,12 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.input.sources import open_source
 from warp_ar.output.folder_sink import FolderSink
-from warp_ar.output.sink import FRAMES_WAITING
+from warp_ar.output.layer_file import LayerFrame, LayerSink
+from warp_ar.output.sink import FRAMES_WAITING, ThreadedSink
 from warp_ar.output.sinks import (
     EnvironmentSink,
     NullSink,
@@ -436,37 +440,60 @@ def file_limit(size: int) -> Iterator[None]:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
 @pytest.mark.parametrize("limit", [0, 2_000, 30_000, 70_000, 150_000])
-@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
-def test_a_limit_of_files_leaves_whole_files_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
-    """Flat frames fit, those of noise do not in the end: a video by and by, a frame at once."""
-    noise_rows = 240 if name in ("frames", "light") else 48
-    threads = threading.active_count()
+@pytest.mark.parametrize("name", VIDEOS)
+def test_a_limit_of_files_leaves_whole_videos_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
     rng = np.random.default_rng(0)
-    sink = EnvironmentSink(tmp_path / name) if name == "light" else open_sink(tmp_path / name, fps=24)
+    sink = open_sink(tmp_path / name, fps=24)
 
     def fill() -> None:
         with sink:
-            for index in range(200):
-                image = np.full((noise_rows, 320, 3), index % 5, np.uint8)
-                if index >= 3:
-                    image = rng.integers(0, 256, image.shape, dtype=np.uint8)
-                sink.write(image.astype(np.float32) if name == "light" else image)
+            for _ in range(200):
+                sink.write(rng.integers(0, 256, (48, 320, 3), dtype=np.uint8))
 
     with file_limit(limit), pytest.raises(SinkError, match="File too large"):
         fill()
-    if name in ("frames", "light"):
-        assert sink.written == len(list((tmp_path / name).iterdir()))
-        assert sink.written == (3 if limit >= 30_000 else 0) or limit == 2_000  # where some flat frames fit
-        images = [read_environment(path) if name == "light" else path for path in (tmp_path / name).iterdir()]
-        assert name == "frames" or all(image.shape == (noise_rows, 320, 3) for image in images)
-        assert name == "light" or not images or len(levels(tmp_path / name)) == sink.written
-    elif (tmp_path / name).exists():
+    if (tmp_path / name).exists():
         assert len(levels(tmp_path / name)) == sink.written > 0
     else:
         assert sink.written == 0
     assert limit < 150_000 or sink.written > 0
     assert not list(tmp_path.rglob(".*"))
-    assert threading.active_count() <= threads
+
+
+FOLDERS = {
+    "frames": (lambda path: FolderSink(path), lambda image: image, lambda path: cv2.imread(str(path))),
+    "light": (lambda path: EnvironmentSink(path), lambda image: image.astype(np.float32), read_environment),
+    "layers": (
+        lambda path: LayerSink(path, pictures=("plate",)),
+        lambda image: LayerFrame({"plate": image.astype(np.float32)}, image, ()),
+        lambda path: OpenEXR.File(str(path)).parts[0].channels["plate"].pixels,
+    ),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("limit", [0, 700, 2_000, 2_500, 30_000])
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_limit_of_files_leaves_whole_frames_and_true_counts(tmp_path: pathlib.Path, name: str, limit: int) -> None:
+    """Three flat frames fit or not; the fourth, of noise, does not."""
+    opened, prepared, read = FOLDERS[name]
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    sink = opened(tmp_path / name)
+
+    def fill() -> None:
+        with sink:
+            for image in [*(np.full_like(noise, level) for level in (1, 2, 3)), noise]:
+                sink.write(prepared(image))
+
+    with file_limit(limit), pytest.raises(SinkError, match="File too large"):
+        fill()
+    paths = sorted(path for path in (tmp_path / name).iterdir() if path.is_file())
+    assert [read(path).shape for path in paths] == [(240, 320, 3)] * len(paths)
+    # Layers count where their pictures are there, too.
+    assert sink.written <= len(paths) if name == "layers" else sink.written == len(paths)
+    assert sink.written == 3 or limit < 30_000
+    assert sink.written == 0 or limit > 0
+    assert not list(tmp_path.rglob(".*"))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
@@ -636,3 +663,46 @@ def test_shared_environments_load(shared: pathlib.Path) -> None:
     paths = sorted((shared / "hdri").glob("*.exr"))
     assert paths
     assert read_environment(paths[0]).shape == (512, 1024, 3)
+
+
+# -------------------------------------------------------------------------------------------------------------- signals
+
+
+@pytest.mark.parametrize("name", [*VIDEOS, "frames", "light"])
+def test_a_signal_on_the_way_into_close_loses_nothing(tmp_path: pathlib.Path, name: str, monkeypatch) -> None:
+    """The exception may come up before the first line of ``close``, where that cannot catch it, or anywhere in it."""
+
+    def run(place: pathlib.Path, interrupted: str) -> None:
+        owner = ThreadPoolExecutor if interrupted in ("submit", "shutdown") else ThreadedSink
+        plain = getattr(owner, interrupted)
+
+        def interrupt(self: Any, *arguments: Any, **options: Any) -> Any:
+            if (interrupted == "close" or sink._closed) and not told:
+                told.append(True)
+                if interrupted == "submit":
+                    plain(self, *arguments, **options)  # the job is taken, and its ticket lost
+                raise Terminated
+            return plain(self, *arguments, **options)
+
+        def fill() -> None:
+            with sink:
+                for level in range(10):
+                    image = flat(20 * level)
+                    sink.write(image.astype(np.float32) if name == "light" else image)
+                patch.setattr(owner, interrupted, interrupt)
+
+        told: list[bool] = []
+        sink = EnvironmentSink(place) if name == "light" else open_sink(place, fps=24)
+        with monkeypatch.context() as patch, pytest.raises(Terminated), ended_by_signals():
+            fill()
+        assert told
+        assert sink.written == 10
+
+    for interrupted in ("close", "submit", "_settle", "_wait_out", "shutdown"):
+        place = tmp_path / interrupted / name
+        run(place, interrupted)
+        if name == "light":
+            assert len([read_environment(path) for path in place.iterdir()]) == 10
+        else:
+            assert levels(place) == pytest.approx([20 * level for level in range(10)], abs=VIDEO_LEVELS)
+        assert not list(place.parent.rglob(".*"))

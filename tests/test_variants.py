@@ -6,8 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
+import warp as wp
 
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import UsageError
 from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
 from warp_ar.stages.shared import variants
@@ -28,3 +30,15 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
             lit.append([pipeline(image, time_seconds=k / 24.0).image for k, image in enumerate(images)])
     np.testing.assert_array_equal(lit[0], lit[1])
     assert any((shown != image).any() for shown, image in zip(lit[0], images, strict=True)), "nothing was lit"
+
+
+def test_a_variable_decides_for_all_devices(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = wp.get_device(device)
+    monkeypatch.delenv(variants.VARIABLE, raising=False)
+    assert variants.shares_kernels(target) == target.is_cpu
+    for value, shared in (("shared", True), ("specialised", False)):
+        monkeypatch.setenv(variants.VARIABLE, value)
+        assert variants.shares_kernels(target) == shared
+    monkeypatch.setenv(variants.VARIABLE, "general")
+    with pytest.raises(UsageError, match="WARP_AR_KERNELS = 'general': expected shared or specialised"):
+        variants.shares_kernels(target)

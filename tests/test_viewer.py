@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import gc
+import io
 import json
 import math
 import random
@@ -14,6 +15,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -38,6 +40,7 @@ from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.input.card import card_size, draw_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import Synthetic, open_source
+from warp_ar.light.captured import Light as CapturedMap
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import (
     Animation,
@@ -61,6 +64,7 @@ from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.controls import Controls, Feed
+from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
@@ -1011,6 +1015,14 @@ class Page:
                 return self.socket.close_code, ""
 
 
+def encode_exr() -> bytes:
+    """A captured light."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "light.exr"
+        CapturedMap(np.full((8, 16, 3), 0.5, np.float32), np.ones((8, 16), np.float32)).save(path)
+        return path.read_bytes()
+
+
 @dataclasses.dataclass
 class Site:
     server: Server
@@ -1114,6 +1126,32 @@ async def test_downloads() -> None:
                 assert (await response.read()).startswith(start)
         async with site.session.get(f"{site.url}/download/recording.mp4") as response:
             assert response.status == 409
+
+
+@run
+async def test_files_are_dropped() -> None:
+    async with served() as site, site.page() as page:
+        await page.until("frame")
+        light = encode_exr()
+        async with site.session.post(f"{site.url}/drop/my%20light.exr", data=light) as response:
+            assert response.status == 200
+            assert "16x8" in await response.text()
+        while (told := (await page.until("scene"))[0]["scene"]["captured"]) is None:
+            pass
+        assert told.endswith("my_light.exr")
+        async with site.session.post(f"{site.url}/drop/x.exr", data=light[:60]) as response:
+            assert response.status == 422
+            assert (await response.text()).startswith("x.exr")
+        too_large = io.BytesIO(bytes(MOST_BYTES + 1))
+        with contextlib.suppress(aiohttp.ClientError, ConnectionError):  # refused before all of it was sent
+            async with site.session.post(f"{site.url}/drop/large.ply", data=too_large) as response:
+                assert response.status == 413
+        async with site.session.post(
+            f"{site.url}/drop/x.exr", data=light, headers={"Origin": "http://evil.example"}
+        ) as response:
+            assert response.status == 403
+        # The page goes on.
+        await page.until("frame")
 
 
 @run

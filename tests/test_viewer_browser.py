@@ -353,6 +353,35 @@ def test_saving(open_tab: Callable[..., Tab], tmp_path: Path) -> None:
     assert load_scene(tmp_path / "scene.toml").objects == load_scene("desk").objects
 
 
+def test_opening_light_and_a_mesh(open_tab: Callable[..., Tab], tmp_path: Path) -> None:
+    tab = open_tab()
+    page = tab.page
+    tab.until("document.getElementById('light-note').textContent.startsWith('Linear light')", "the light")
+    with page.expect_download() as download:
+        page.click("#save > summary")
+        page.click('#save [data-download="environment.exr"]')
+    download.value.save_as(tmp_path / "light.exr")
+    page.set_input_files("#open-file", str(tmp_path / "light.exr"))
+    tab.until("(warpAr.scene.captured ?? '').endsWith('light.exr')", "the light that was saved")
+    page.click("#undo")
+    tab.until("warpAr.scene.captured === null")
+    count = page.evaluate("warpAr.scene.objects.length")
+    # Dropped onto the picture: a tetrahedron of 80 mm.
+    mesh = "OFF\n4 4 0\n0 0 0\n80 0 0\n0 80 0\n0 0 80\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
+    drop = """text => {
+      const dataTransfer = new DataTransfer();
+      dataTransfer.items.add(new File([text], "corner.off"));
+      const event = new DragEvent("drop", { dataTransfer, bubbles: true, cancelable: true });
+      document.getElementById("figure").dispatchEvent(event);
+    }"""
+    page.evaluate(drop, mesh)
+    tab.until(f"warpAr.scene.objects.length === {count + 1}", "the mesh")
+    tab.until("document.getElementById('notices').textContent.includes('taken to be in millimetres')")
+    page.evaluate(drop.replace("corner.off", "corner.exe"), mesh)
+    tab.until("document.getElementById('notices').textContent.includes('corner.exe: expected a file that ends in')")
+    tab.errors = [error for error in tab.errors if "422" not in error]  # the refused one, which was asked for
+
+
 def test_the_browsers_camera_is_lit(open_tab: Callable[..., Tab], artefacts: Path) -> None:
     tab = open_tab()
     page = tab.page

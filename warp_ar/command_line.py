@@ -10,7 +10,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
-from warp_ar.errors import UsageError, WarpArError, printable
+from warp_ar.errors import SinkError, UsageError, WarpArError, printable
+from warp_ar.output.sink import close_open_sinks
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -69,13 +70,27 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed."""
+    """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed.
+
+    Once: who is ending already is not interrupted by the next of them.
+    """
+    ending = False
 
     def handle(*_: Any) -> None:
-        raise Terminated
+        nonlocal ending
+        if not ending:
+            ending = True
+            raise Terminated
 
     with handling(handle, "SIGTERM", "SIGHUP"):
-        yield
+        try:
+            yield
+        except BaseException:
+            ending = True
+            with contextlib.suppress(SinkError):  # what came first is told
+                close_open_sinks()
+            raise
+        ending = True
 
 
 @contextlib.contextmanager

@@ -164,6 +164,13 @@ def _add_page_options(group: argparse._ArgumentGroup) -> None:
         help="serve over TLS, without which browsers keep their camera from other machines; makes its own certificate",
     )
     add("--no-browser", action="store_true", help="only print the page's address")
+    add(
+        "--allow-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="let pages of this site, such as http://localhost:5173, ask for the light; may be given again",
+    )
 
 
 class _Stop:
@@ -197,7 +204,7 @@ def _check_places(options: argparse.Namespace, scene: Scene) -> None:
         reads["--calibration"] = [Path(options.calibration)]
     if options.light is not None:
         reads["--light"] = [Path(options.light)]
-    if source is not None:
+    if source is not None and "://" not in str(source):
         reads["the source"] = [Path(source)]
     names = {
         "output": "--output",
@@ -314,6 +321,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
 def _page_address(options: argparse.Namespace) -> Address:
     """Where the page is served, and with which token and certificate."""
     from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.shared_light import check_origin
     from warp_ar.viewer.tls import load_context, make_context
 
     known = options.token is not None or options.host in LOOPBACK
@@ -323,7 +331,8 @@ def _page_address(options: argparse.Namespace) -> Address:
     elif options.tls is not None:
         tls = load_context(Path(options.tls))
     port = DEFAULT_PORT if options.port is None else options.port
-    return Address(options.host, port, options.token if known else secrets.token_hex(16), tls)
+    origins = tuple(map(check_origin, options.allow_origin))
+    return Address(options.host, port, options.token if known else secrets.token_hex(16), tls, origins)
 
 
 def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
@@ -487,6 +496,8 @@ def light_clip(options: argparse.Namespace) -> int:
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
         _quick_check(options, session.scene)
+        for note in session.bracket_notes:
+            say(note)
         _compile(session, shown=not options.headless)
         source = session.source
         sink: Sink = NullSink()

@@ -14,6 +14,7 @@ from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
+from warp_ar.input.exposures import plan_bracket
 from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
@@ -125,11 +126,14 @@ class Session:
         self.pipeline: Pipeline | AutoPipeline
         self._switcher: PipelineSwitcher | None = None
         own = self.scene.source if source is None else None
+        self.bracket_notes: tuple[str, ...] = ()
+        """What of the source's exposures is not merged, and why, one line each."""
         shown = own.shown if own is not None else None
         try:
             if refine_ball:
                 self.scene, self.ball_fits = refine_balls(self.scene, self.source)
             size, exposures = self.source.size, self.source.exposures
+            self.bracket_notes = plan_bracket(exposures, shown).notes
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
                 self.pipeline = AutoPipeline(

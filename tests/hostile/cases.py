@@ -11,7 +11,7 @@ import socket
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from tests.hostile.corpus import READERS, SCENE, Reader
 from warp_ar.errors import SinkError
 from warp_ar.input.sources import open_source
 from warp_ar.output.environment_file import EnvironmentSink
-from warp_ar.output.sinks import open_sink, write_environment
+from warp_ar.output.layer_file import LayerFrame, LayerSink
+from warp_ar.output.sinks import Sink, open_sink, write_environment
 from warp_ar.scene import loads_scene
 
 DAMAGES = 28
@@ -350,7 +351,7 @@ def _source_name(what: str, name: str) -> Case:
     return Case("name of a source", what, lambda folder: lambda: take(folder))
 
 
-SINKS = ("clip.mp4", "clip.mkv", "clip.mov", "frames", "light", "one.exr")
+SINKS = ("clip.mp4", "clip.mkv", "clip.mov", "frames", "light", "layers", "one.exr", "one.hdr")
 PLACES: dict[str, Callable[[pathlib.Path], object]] = {
     **{what: make for what, make in NO_FILES.items() if what not in ("8 GiB of nothing", "no bytes", "a folder")},
     "a folder with a folder in it": lambda path: (path / "0000.png" / "x").mkdir(parents=True),
@@ -369,14 +370,21 @@ PICTURES: dict[str, object] = {
 
 
 def _write(path: pathlib.Path, name: str, image: object) -> None:
-    good = np.zeros((16, 16, 3), np.float32 if name in ("light", "one.exr") else np.uint8)
-    taken = good if image is None else image
-    if name == "one.exr":
+    good = np.zeros((16, 16, 3), np.float32 if name in ("light", "one.exr", "one.hdr") else np.uint8)
+    taken: Any = good if image is None else image
+    if name.startswith("one."):
         write_environment(path, taken)
         return
-    with EnvironmentSink(path) if name == "light" else open_sink(path, fps=24) as sink:
+    with _open(path, name) as sink:
         for _ in range(3):
-            sink.write(taken)
+            sink.write(LayerFrame({"plate": good.astype(np.float32)}, good, ()) if name == "layers" and image is None
+                       else taken)  # fmt: skip
+
+
+def _open(path: pathlib.Path, name: str) -> Sink:
+    if name == "layers":
+        return LayerSink(path, pictures=("plate",))
+    return EnvironmentSink(path) if name == "light" else open_sink(path, fps=24)
 
 
 def _place(name: str, what: str) -> Case:

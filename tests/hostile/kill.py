@@ -17,13 +17,17 @@ import tempfile
 import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
+import OpenEXR
 
 from warp_ar.command_line import Terminated, ended_by_signals
 from warp_ar.errors import WarpArError
+from warp_ar.exr_file import check_whole_exr
 from warp_ar.files import write_whole
 from warp_ar.input.sources import open_source
 from warp_ar.output.environment_file import EnvironmentSink
+from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.sinks import open_sink, read_environment
 
 SIZE = (96, 128)
@@ -47,6 +51,42 @@ def write_frames(place: pathlib.Path, count: int, brighter: int = 0) -> None:
         for index in range(count):
             image = frame(index, brighter)
             sink.write(image.astype(np.float32) if place.name == "light" else image)
+
+
+def layer_frame(index: int, brighter: int) -> LayerFrame:
+    """A frame's layers: two, one of them as a picture besides."""
+    image = frame(index, brighter)
+    ids = np.full(SIZE, brighter + index, np.int32)
+    return LayerFrame({"plate": image.astype(np.float32), "ids": ids}, image, ("a surface",))
+
+
+def write_layers(place: pathlib.Path, count: int, brighter: int = 0) -> None:
+    """Write a run's layers."""
+    with LayerSink(place, pictures=("plate",)) as sink:
+        for index in range(count):
+            sink.write(layer_frame(index, brighter))
+
+
+def check_layers(place: pathlib.Path, *, finished: bool) -> int:
+    """Frames of which all layers are there; an error says what is not whole."""
+    if not place.exists():
+        assert not finished
+        return 0
+    paths = sorted(place.glob("????.exr"))
+    found = []
+    for path in paths:
+        check_whole_exr(path)
+        with OpenEXR.File(str(path)) as file:
+            parts = {part.name(): part for part in file.parts}
+            level = int(np.median(parts["ids"].channels["ids.I"].pixels)) - 1
+            assert np.median(parts["plate"].channels["plate"].pixels) == level
+        found.append(level)
+    pictures = {path.stem: int(np.median(cv2.imread(str(path)))) for path in (place / "plate").glob("????.png")}
+    brighter = EARLIER if found and found[0] - int(paths[0].stem) else 0
+    assert found == [int(path.stem) + brighter for path in paths], found
+    # A picture is written after its frame's other layers.
+    assert pictures.items() <= {path.stem: level for path, level in zip(paths, found, strict=True)}.items()
+    return len(found)
 
 
 def write_reports(place: pathlib.Path, count: int, brighter: int = 0) -> None:
@@ -88,6 +128,7 @@ def check_report(place: pathlib.Path, *, finished: bool) -> int:
 Writer = Callable[[pathlib.Path, int, int], None]
 SINKS: dict[str, tuple[Writer, Callable[..., int]]] = {
     **dict.fromkeys(("clip.mp4", "clip.mov", "clip.mkv", "frames", "light"), (write_frames, check_frames)),
+    "layers": (write_layers, check_layers),
     "run.json": (write_reports, check_report),
 }
 

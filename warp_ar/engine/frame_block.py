@@ -1,4 +1,4 @@
-"""What changes per frame, in one small block of memory: camera, virtual lights, virtual objects.
+"""What changes per frame, in one small block of memory: camera, virtual lights, virtual objects, proxies.
 
 The block is written on the host and uploaded in one copy, so a captured CUDA graph sees new values without being
 captured again. The copy is asynchronous, out of pinned memory that is not written again before it is over.
@@ -21,15 +21,21 @@ _SLOTS = 4  # uploads that may be under way
 class FrameBlock:
     """Typed host views over one buffer, and the device arrays that alias its upload."""
 
-    def __init__(self, device: Any, lights: int, objects: int) -> None:
+    def __init__(self, device: Any, lights: int, objects: int, proxies: int = 0) -> None:
         """Allocate the block.
 
         Args:
             device: Warp device.
             lights: Number of virtual lights.
             objects: Number of virtual objects.
+            proxies: Number of proxies.
         """
-        layout = (("params", FrameParams, 1), ("lights", Light, lights), ("objects", Shape, objects))
+        layout = (
+            ("params", FrameParams, 1),
+            ("lights", Light, lights),
+            ("objects", Shape, objects),
+            ("proxies", Shape, proxies),
+        )
         offsets: list[int] = []
         size = 0
         for _, struct, count in layout:
@@ -53,11 +59,11 @@ class FrameBlock:
             self._device[name] = wp.array(ptr=pointer, dtype=struct, shape=(count,), device=device)
 
     def host(self, name: str) -> Any:
-        """Writable NumPy structured view of ``params``, ``lights`` or ``objects``."""
+        """Writable NumPy structured view of ``params``, ``lights``, ``objects`` or ``proxies``."""
         return self._host[name]
 
     def device_array(self, name: str) -> Any:
-        """Warp array of ``params``, ``lights`` or ``objects``; filled by ``upload``."""
+        """Warp array of ``params``, ``lights``, ``objects`` or ``proxies``; filled by ``upload``."""
         return self._device[name]
 
     def upload(self) -> None:

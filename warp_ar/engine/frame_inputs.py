@@ -16,6 +16,7 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
+from warp_ar.input.own_markers import Places
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
@@ -47,6 +48,8 @@ class SeenFrame:
     step: float
     """Seconds since the frame before that was lit."""
     timings: dict[str, StageTiming]
+    places: Places = dataclasses.field(default_factory=dict)
+    """Where the markers are that something rides on."""
 
 
 class FrameInputs:
@@ -65,8 +68,11 @@ class FrameInputs:
         self._camera, self._arrays = camera, arrays
         self.host_scene = HostScene(scene, device)
         self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
-        self.block = FrameBlock(device, len(scene.lights), len(scene.objects))
+        self.block = FrameBlock(device, len(scene.lights), len(scene.objects), len(scene.proxies))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
+        self.host_scene.ray_scene.proxies = self.block.device_array("proxies")
+        self.host_scene.write_proxies(self.block.host("proxies"))
+        self.block.upload()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         """The picture that stages read."""
         self.transfers = None if device.is_cpu else Transfers(shape, device)
@@ -148,7 +154,7 @@ class FrameInputs:
         self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
-        for name in touched:
+        for name in dict.fromkeys(touched):
             self._arrays.touch(name)
 
     def fix_saturation(self, levels: npt.NDArray[np.int64]) -> None:
@@ -169,8 +175,11 @@ class FrameInputs:
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
         """Move lights and objects to where they are now; gives the inputs that changed."""
-        lights = self.host_scene.write_lights(self.block.host("lights"), frame.seconds)
-        objects = self.host_scene.write_objects(self.block.host("objects"), frame.seconds)
+        scene, block, places = self.host_scene, self.block, frame.places
+        lights = scene.write_lights(block.host("lights"), frame.seconds, places)
+        objects = scene.write_objects(block.host("objects"), frame.seconds, places)
+        if scene.write_proxies(block.host("proxies"), places):
+            yield "pose"  # all that asks where the receiver is asks where the camera is
         if lights or frame.index == 0:
             yield "lights"
         if objects or frame.index == 0:

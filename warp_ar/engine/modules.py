@@ -8,6 +8,7 @@ options belong to the process, so that compilers with other flags would wait for
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import os
@@ -63,11 +64,15 @@ def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None
 
     if progress is not None:
         progress(0, len(modules))
-    with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
-        for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
-            job.result()
-            if progress is not None:
-                progress(done, len(modules))
+    try:
+        with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
+            for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
+                job.result()
+                if progress is not None:
+                    progress(done, len(modules))
+    finally:
+        if headers is not None:
+            headers.close()
 
 
 def _flags(module: Any) -> str:
@@ -98,6 +103,7 @@ class _Headers:
     differ in them alone share one. Where this Warp keeps or names headers otherwise, each thread parses them.
     """
 
+<<<<<<< HEAD
     def __init__(self, flags: Iterable[str]) -> None:
         """Find what is there, that of the caller's thread too.
 
@@ -105,14 +111,19 @@ class _Headers:
             flags: Of the modules that will be compiled.
         """
         runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
+=======
+    def __init__(self) -> None:
+>>>>>>> main
         self._folder_of_thread = (
-            getattr(runtime, "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
+            getattr(_runtime(), "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
         )
         self._flags = {*flags, str(wp.config.cpu_compiler_flags)}
         builtin = Path(wp.__file__).parent / "native" / "builtin.h"
         self._lock = threading.Lock()
         self._first: int | None = None
-        self._parsed = threading.Event()
+        self._parsed, self._over = threading.Event(), threading.Event()
+        self._watcher: threading.Thread | None = None
+        self._threads: set[int] = set()
         if self._folder_of_thread is None or not builtin.is_file():
             self._folder_of_thread = None
             return
@@ -134,14 +145,23 @@ class _Headers:
             return
         own = Path(self._folder_of_thread())
         with self._lock:
+            self._threads.add(threading.get_ident())
             first = self._first is None and not _headers_in(own) and not _headers_in(self._store)
             if first:
                 self._first = threading.get_ident()
+<<<<<<< HEAD
                 watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
         if first:
             watcher.start()
         else:
             if self._first is not None and not _headers_in(own):
+=======
+                self._parsing = own
+                self._watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
+                self._watcher.start()
+        if not first and not _headers_in(own):
+            if self._first is not None:
+>>>>>>> main
                 self._parsed.wait(_HEADER_WAIT)
             _copy_headers(self._store, own)
             self._rename(own, flags)
@@ -150,11 +170,12 @@ class _Headers:
     def _keep(self, own: Path) -> None:
         """Put what the first thread parses where others find it."""
         stop = time.monotonic() + _HEADER_WAIT
-        while time.monotonic() < stop and not _headers_in(own):
-            time.sleep(0.02)
+        while time.monotonic() < stop and not _headers_in(own) and not self._over.wait(0.02):
+            pass
         _copy_headers(own, self._store)
         self._parsed.set()
 
+<<<<<<< HEAD
     def _rename(self, own: Path, flags: str) -> None:
         """Have headers that were parsed with other flags of LLVM found with these."""
         wanted = _digest(flags)
@@ -180,6 +201,45 @@ def _digest(flags: str) -> str:
     for byte in "".join(f"{word}\0" for word in flags.split()).encode():
         value = (value ^ byte) * 0x100000001B3 % (1 << 64)
     return f"{value:016x}"
+=======
+    def close(self) -> None:
+        """When the threads are done: remove what Warp keeps for each of them."""
+        self._over.set()
+        if self._watcher is not None:
+            self._watcher.join()
+            _copy_headers(self._parsing, self._store)  # on a busy machine they come later than is waited for
+        # A thread of somebody else's may have got the identity of one that has ended.
+        alive = {thread.ident for thread in threading.enumerate()}
+        remove_header_folders(self._threads - alive)
+        # What other threads compile is left until the process ends; registered anew, this comes before Warp's own end.
+        atexit.unregister(remove_header_folders)
+        atexit.register(remove_header_folders)
+
+
+def remove_header_folders(threads: Iterable[int] | None = None) -> None:
+    """Remove the folders in which Warp keeps parsed headers, some megabytes for each thread that ever compiled.
+
+    Warp leaves them to the end of the process, where Python's development mode warns of them.
+
+    Args:
+        threads: Their identities; None means all.
+    """
+    runtime = _runtime()
+    folders, lock = getattr(runtime, "_pch_dirs", None), getattr(runtime, "_pch_dirs_lock", None)
+    if not isinstance(folders, dict) or lock is None:
+        return
+    with lock:
+        for thread in list(folders) if threads is None else threads:
+            folder = folders.pop(thread, None)
+            if folder is not None:
+                with contextlib.suppress(OSError):
+                    folder.cleanup()
+
+
+def _runtime() -> Any:
+    """What Warp keeps for the process; None before it is initialised, or where this Warp keeps it elsewhere."""
+    return getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
+>>>>>>> main
 
 
 def _headers_in(folder: Path) -> list[Path]:

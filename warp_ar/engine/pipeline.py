@@ -31,6 +31,7 @@ from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
+from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.ray_scene import skeleton
@@ -150,6 +151,7 @@ class Pipeline:
         self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
+        self._own_markers = OwnMarkers(self.scene, self.camera)
         self._begun = 0
         self._start_time: float | None = None
         self._last_time = 0.0
@@ -258,6 +260,8 @@ class Pipeline:
         self._shown = other._shown
         if (self.scene.marker, self.camera) == (other.scene.marker, other.camera) and other._tracker and self._tracker:
             self._tracker = other._tracker
+        if self.camera == other.camera and own_markers(self.scene) == own_markers(other.scene):
+            self._own_markers = other._own_markers
         with exclusive(self.device):
             self._light.take_over(other._light)
             self._scheduler.continue_from(other._scheduler)
@@ -457,15 +461,29 @@ class Pipeline:
         timings[TRACK] = StageTiming((time.perf_counter() - start) * 1e3, False)
         return track.pose, track.state
 
+    def _find_own_markers(self, image: Any, now: float, pose: Pose | None, timings: dict[str, StageTiming]) -> Places:
+        """Find the markers that something rides on."""
+        if not self._own_markers:
+            return {}
+        if isinstance(image, wp.array):
+            with exclusive(self.device):
+                image = image.numpy()
+        start = time.perf_counter()
+        places = self._own_markers.track(cast(Image, image), now, pose)
+        before = timings[TRACK].milliseconds if TRACK in timings else 0.0
+        timings[TRACK] = StageTiming(before + (time.perf_counter() - start) * 1e3, False)
+        return places
+
     def _look(self, image: Any, now: float, pose: Pose | None) -> tuple[SeenFrame, TrackState | None]:
         """Find the marker, go on with the clock."""
         timings: dict[str, StageTiming] = {}
         pose, state = self._track(image, now, pose, timings)
         lost = self._tracker is not None and pose is None
+        places = self._find_own_markers(image, now, pose, timings)
         seconds, step = now - (self._start_time or 0.0), max(now - self._lit_time, 0.0)
         self._last_time = self._lit_time = now
         self._index += 1
-        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings), state
+        return SeenFrame(image, None, pose, lost, self._index - 1, now, seconds, step, timings, places), state
 
     def _render(self, frame: SeenFrame) -> Rendered:
         """Run the stages on a frame."""

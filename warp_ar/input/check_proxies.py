@@ -14,10 +14,12 @@ from warp_ar.scene import Camera, Pose, Scene
 
 Image = NDArray[np.uint8]
 
-ON: Final = 0.3
-"""Share of a shape's outline on edges of the picture above which it is right: of a box 0.7, and 0.1 at 12 mm off."""
-BETTER: Final = 0.25
-"""Share of the outline by which more of it must lie on edges elsewhere."""
+MOVED: Final = 5.0
+"""Pixels by which a corner must be off: of a box that is right, 0.6."""
+ON: Final = 0.55
+"""Share of a shape's outline on edges of the picture from which on it is right: of a box that is, 0.7."""
+BETTER: Final = 0.15
+"""Share of the outline by which more of it must lie on edges elsewhere: one that is off along itself keeps 0.4."""
 FEWEST: Final = 2
 """Views that must agree, or all where there are fewer."""
 
@@ -27,7 +29,7 @@ def check_proxies(scene: Scene, camera: Camera, views: Sequence[tuple[Image, Pos
     found = []
     for index, proxy in enumerate(scene.proxies):
         fits = [refit for image, pose in views if (refit := refit_outline(image, camera, pose, proxy)) is not None]
-        worse = [fit for fit in fits if fit.met_before < ON and fit.met > fit.met_before + BETTER]
+        worse = [fit for fit in fits if fit.moved > MOVED and fit.met_before < ON and fit.met > fit.met_before + BETTER]
         if not worse or len(worse) < max(1, min(FEWEST, len(views))):
             continue
         off = np.median([np.subtract(fit.proxy.at, proxy.at)[:2] for fit in worse], axis=0)

@@ -92,5 +92,9 @@ def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> 
 
 def ball_is_seen(scene: Scene, camera: Camera, views: Iterable[tuple[Any, Pose]]) -> bool:
     """Whether any of some posed RGB frames shows any of the scene's mirror balls."""
-    kept = list(views)
-    return any(outline.support > LOST for probe in scene.probes for outline, _ in find_outlines(kept, camera, probe))
+    return any(  # frame by frame, up to the first that does: looking takes a third of a second
+        outline.support > LOST
+        for view in views
+        for probe in scene.probes
+        for outline, _ in find_outlines([view], camera, probe)
+    )

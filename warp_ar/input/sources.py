@@ -13,10 +13,11 @@ import os
 import pathlib
 from collections.abc import Sequence
 
-from warp_ar.errors import SourceError
+from warp_ar.errors import SourceError, UsageError
 from warp_ar.input.capture_device import CaptureDevice
 from warp_ar.input.frame_folder import IMAGE_SUFFIXES, FrameFolder
 from warp_ar.input.live_source import QueueSource
+from warp_ar.input.network_stream import SCHEMES, NetworkStream
 from warp_ar.input.source import DEFAULT_FPS, Frame, Source, check_exposures, check_fps, existing_path
 from warp_ar.input.synthetic import Synthetic
 from warp_ar.input.video_file import VideoFile
@@ -25,6 +26,7 @@ __all__ = [
     "CaptureDevice",
     "Frame",
     "FrameFolder",
+    "NetworkStream",
     "QueueSource",
     "Source",
     "Synthetic",
@@ -44,7 +46,7 @@ def open_source(
 
     Args:
         spec: A folder of images, an image, a video file, the index of a capture device (a number, also as text), the
-            URL of a camera's stream (``rtsp://...``), or ``synthetic:NAME``.
+            URL of a camera's stream (``rtsp://...``, ``http://...``), or ``synthetic:NAME``.
         fps: Frames per second: the rate of a folder (default 30), a new rate for a video's frames, or what is asked of
             a device.
         loop: Start again at the end, with index and time going on. Without effect on live sources.
@@ -65,7 +67,12 @@ def open_source(
     if text.startswith("synthetic:"):
         return Synthetic(text.removeprefix("synthetic:"), fps=fps or DEFAULT_FPS, loop=loop)
     if "://" in text:
-        return CaptureDevice(text, fps=fps, exposures=exposures)
+        scheme = text.partition("://")[0].lower()
+        if scheme not in SCHEMES:
+            raise SourceError(f"{text[:60]}: no stream is read by {scheme!r}; expected {', '.join(SCHEMES)}")
+        if exposures:
+            raise UsageError("exposures: a stream from the network does not let its exposure be set")
+        return NetworkStream(text, fps=fps)
     path = existing_path(pathlib.Path(spec))
     if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
         return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop, exposures=exposures)

@@ -133,7 +133,7 @@ class VideoFile(RecordedSource):
         """
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        to_rgb = functools.partial(_rgb_from_video, VideoReformatter())
+        to_rgb = functools.partial(rgb_from_video, VideoReformatter())
         count, packets, damage = 0, 0, ""
         demuxer = container.demux(stream)
         while not damage:
@@ -166,7 +166,7 @@ class VideoFile(RecordedSource):
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
 
-def _rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
+def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
     """Upright 8-bit RGB of a decoded picture, with the picture's own colour matrix and range."""
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:

@@ -13,7 +13,7 @@ import dataclasses
 import json
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,15 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from warp_ar.errors import SceneError, SinkError, reason
+from warp_ar.errors import SceneError, SinkError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, parse_json, too_much, write_whole
+from warp_ar.light.latlong_axes import DESCRIPTIONS, from_axes, world_from_marker
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-AXES = "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward +y"
+AXES = DESCRIPTIONS["z-up"]
 REC_709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Chromaticities of red, green, blue and white that sRGB's primaries have."""
 BRIGHT = 6.0
@@ -105,6 +106,9 @@ class Light:
     def load(cls, path: str | Path) -> Light:
         """Read a captured light, or any latlong OpenEXR with channels R, G and B.
 
+        A map in the axes of another program that this one knows is turned; one that does not say its axes is taken to
+        have those of a scene.
+
         Raises:
             SceneError: The file cannot be used.
         """
@@ -120,16 +124,25 @@ class Light:
         height, width = radiance.shape[:2]
         if width != 2 * height or height < 2:
             raise SceneError(f"{path} is {width}x{height}: a latlong environment is twice as wide as high")
+        axes = _axes_of(path, header)
         # Maps in the wild hold negative pixels, infinities and NaN.
         radiance = np.clip(np.nan_to_num(radiance, nan=0.0, posinf=1e6, neginf=0.0), 0.0, 1e6)
         confidence = channels.get("confidence", np.ones((height, width), np.float32))
         if confidence.shape != (height, width):
             size = "x".join(map(str, confidence.shape[::-1]))
             raise SceneError(f"{path}: its channel confidence is {size}; expected {width}x{height}, as the light is")
+        confidence = np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32)
+        emitters = _parse_emitters(path, header.get("emitters", "[]"))
+        if axes != "z-up":
+            try:
+                radiance, confidence = (from_axes(channel, axes) for channel in (radiance, confidence))
+            except UsageError as error:
+                raise SceneError(f"{path}: {error}") from error
+            emitters = tuple(_turned(emitter, world_from_marker(axes).T) for emitter in emitters)
         return cls(
             radiance,
-            np.clip(np.nan_to_num(confidence), 0.0, 1.0).astype(np.float32),
-            _parse_emitters(path, header.get("emitters", "[]")),
+            confidence,
+            emitters,
             _attribute(path, header, "whiteLevel", 1.0),
             _attribute(path, header, "exposure", 0.0) or None,
             _attribute(path, header, "lowerBound", 0.0),
@@ -251,6 +264,23 @@ def _attribute(path: Path, header: dict[str, Any], name: str, default: float) ->
     if not 0.0 <= number < math.inf:
         raise SceneError(f"{path}: its attribute {name} is {str(value)[:40]!r}; expected a finite number, 0 or more")
     return number
+
+
+def _axes_of(path: Path, header: Mapping[str, Any]) -> str:
+    """Name of the axes that a file says it has; the scene's own where it says nothing."""
+    said = header.get("axes")
+    if said is None:
+        return "z-up"
+    known = {text: name for name, text in DESCRIPTIONS.items()}
+    if str(said) not in known:
+        listed = "; ".join(known)
+        raise SceneError(f"{path}: its attribute axes is {str(said)[:120]!r}; expected one of: {listed}")
+    return known[str(said)]
+
+
+def _turned(emitter: CapturedEmitter, rotation: Array) -> CapturedEmitter:
+    direction, origin = (_triple(rotation @ np.array(value)) for value in (emitter.direction, emitter.origin))
+    return dataclasses.replace(emitter, direction=direction, origin=origin)
 
 
 def _parse_emitters(path: Path, text: object) -> tuple[CapturedEmitter, ...]:

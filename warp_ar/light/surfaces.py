@@ -98,7 +98,9 @@ def find_surfaces(scene: Scene, *, card_only: bool = False) -> Surfaces:
 
 def _largest(scene: Scene, shape: str, most: int) -> set[int]:
     """Numbers of the ``most`` proxies of a shape that look largest from the first ball."""
-    own = [number for number, proxy in enumerate(scene.proxies) if proxy.shape == shape]
+    # A proxy on a marker of its own moves: a point of it is another one in the next frame.
+    still = ((number, proxy) for number, proxy in enumerate(scene.proxies) if proxy.marker is None)
+    own = [number for number, proxy in still if proxy.shape == shape]
     if len(own) <= most:
         return set(own)
     center = np.array(scene.probes[0].center)
@@ -167,7 +169,7 @@ def _add_box(found: _Collector, box: Proxy, steps: int, group: int) -> None:
 def _in_boxes(scene: Scene, points: Array) -> NDArray[np.bool_]:
     inside = np.zeros(len(points), bool)
     for proxy in scene.proxies:
-        if proxy.shape == "box":
+        if proxy.shape == "box" and proxy.marker is None:
             local = (points - np.array(proxy.at)) @ rotation_matrix(proxy.rotate)
             inside |= (np.abs(local) < 0.5 * np.array(proxy.size) + 0.005).all(axis=1)
     return inside

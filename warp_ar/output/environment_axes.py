@@ -27,31 +27,30 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.light import captured
+from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, from_axes, to_axes, world_from_marker
+
+__all__ = [
+    "AXES",
+    "CUBES",
+    "DESCRIPTIONS",
+    "LAYOUTS",
+    "check_axes",
+    "from_axes",
+    "to_axes",
+    "to_cube",
+    "world_from_marker",
+]
 
 Radiance = npt.NDArray[np.float32]
 Array = npt.NDArray[np.float64]
 
-AXES = ("z-up", "blender", "y-up", "opengl")
-"""What a file's directions are told in; ``z-up`` is this program's own."""
-
 LAYOUTS = ("latlong", "cube")
-
-DESCRIPTIONS = {
-    "z-up": captured.AXES,
-    "blender": "latlong, row 0 toward +z (up), centre column toward +x, columns grow toward -y",
-    "y-up": "latlong, row 0 toward +y (up), centre column toward +z, columns grow toward -x",
-    "opengl": "latlong, row 0 toward +y (up), centre column toward -z, columns grow toward +x",
-}
-"""What a latlong's attribute ``axes`` says."""
 
 CUBES = {
     "y-up": "cube, faces +x -x +y -y +z -z from the top, y up, each as seen from inside (OpenEXR)",
     "opengl": "cube, faces +x -x +y -y +z -z from the top, y up, each as a face of OpenGL's cube map",
 }
 """What a cube's attribute ``axes`` says."""
-
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 # Along a row, down a column, for +x, -x, +y, -y, +z, -z.
 _X, _Y, _Z = np.eye(3)
@@ -62,16 +61,6 @@ _SPANS = {
 }
 
 
-def world_from_marker(axes: str) -> Array:
-    """Rotation from the marker's axes to those of a file's world, (3, 3).
-
-    Raises:
-        UsageError: There are no axes of this name.
-    """
-    check_axes(axes)
-    return _Y_UP.copy() if axes in _SPANS else np.eye(3)
-
-
 def check_axes(axes: str, layout: str = "latlong") -> None:
     """Raise UsageError unless these axes are known, and told for this layout."""
     if layout not in LAYOUTS:
@@ -79,47 +68,6 @@ def check_axes(axes: str, layout: str = "latlong") -> None:
     allowed = AXES if layout == "latlong" else tuple(CUBES)
     if axes not in allowed:
         raise UsageError(f"axes {axes!r}: expected {', '.join(allowed)} for a {layout}")
-
-
-def to_axes(radiance: Radiance, axes: str) -> Radiance:
-    """A latlong of this program in other axes, texel by texel.
-
-    Args:
-        radiance: (height, width, 3), z-up.
-        axes: One of ``AXES``.
-
-    Returns:
-        The same shape.
-
-    Raises:
-        UsageError: There are no such axes, or a quarter of the map is no whole number of columns.
-    """
-    check_axes(axes)
-    if axes == "z-up":
-        return radiance
-    mirrored = radiance[:, ::-1]  # columns grow toward -y, the centre stays between the two middle ones
-    return np.ascontiguousarray(np.roll(mirrored, _quarter(mirrored, axes), 1))
-
-
-def from_axes(radiance: Radiance, axes: str) -> Radiance:
-    """A latlong in other axes as this program's own; arguments and errors as `to_axes`."""
-    check_axes(axes)
-    if axes == "z-up":
-        return radiance
-    return np.ascontiguousarray(np.roll(radiance, -_quarter(radiance, axes), 1)[:, ::-1])
-
-
-def _quarter(radiance: Radiance, axes: str) -> int:
-    """Columns by which a map that is centred on +x must go right to be centred as ``axes`` say.
-
-    ``y-up`` is centred on -y of the marker, which the map holds a quarter right of +x; ``opengl`` on +y.
-    """
-    if axes == "blender":
-        return 0
-    width = int(radiance.shape[1])
-    if width % 4:
-        raise UsageError(f"a latlong of {width} columns has no whole quarter; axes {axes} need a width divisible by 4")
-    return -width // 4 if axes == "y-up" else width // 4
 
 
 def to_cube(radiance: Radiance, axes: str, size: int | None = None) -> Radiance:

@@ -22,7 +22,6 @@ from warp_ar.scene.description import (
     RGB,
     Color,
     FileMaterial,
-    LambertMaterial,
     Light,
     MetallicRoughnessMaterial,
     MirrorMaterial,
@@ -34,6 +33,7 @@ from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names
+from warp_ar.scene.object_materials import look_of as materials_of
 from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
 
 Matrix = npt.NDArray[np.float64]
@@ -143,6 +143,8 @@ def _turn_to(direction: Matrix) -> Matrix:
 
 def mesh_of(item: Object | Proxy) -> Mesh:
     """Triangles of an object or a proxy, before scale and pose."""
+    if isinstance(item, Object) and item.mesh is not None:
+        return item.mesh
     if item.file is not None:
         return load_kept_mesh(item.file)
     if isinstance(item, Object) and item.shape == "sphere":
@@ -157,14 +159,12 @@ def mesh_of(item: Object | Proxy) -> Mesh:
 
 
 def look_of(item: Object, mesh: Mesh) -> Look:
-    """What exchange formats can say of an object's material.
+    """What exchange formats can say of an object's material; of several, the first.
 
     A Phong lobe of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the
     reflectance straight on; a mirror becomes a metal without roughness.
     """
-    material = item.material
-    if isinstance(material, FileMaterial):
-        material = mesh.materials[0].surface if mesh.materials else LambertMaterial((1.0, 1.0, 1.0))
+    material = materials_of(item).materials[0].surface
     assert not isinstance(material, FileMaterial)
     if isinstance(material, PhongMaterial):
         alpha = math.sqrt(2.0 / (material.shininess + 2.0))

@@ -12,6 +12,7 @@ import contextlib
 import pathlib
 import tempfile
 import threading
+import weakref
 from abc import ABC, abstractmethod
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
@@ -27,6 +28,23 @@ Image = npt.NDArray[np.uint8]
 
 FRAMES_WAITING = 4
 """How many frames may wait to be encoded before `Sink.write` waits."""
+
+_open: weakref.WeakSet[ThreadedSink] = weakref.WeakSet()
+"""Sinks whose last frame is not stored yet."""
+
+
+def close_open_sinks() -> None:
+    """Close every sink that an interrupted `Sink.close`, or one that was never reached, left unfinished.
+
+    A signal's exception may come up anywhere, on the way into `close` too, where no code of that can catch it. Who
+    turns signals into exceptions calls this once no more come.
+
+    Raises:
+        SinkError: The last of those that sinks raised.
+    """
+    with contextlib.ExitStack() as stack:
+        for sink in list(_open):
+            stack.callback(sink.close)
 
 
 class Sink(ABC):
@@ -77,10 +95,12 @@ class ThreadedSink(Sink):
         self._executor = ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-sink")
         self._pending: collections.deque[Future[None]] = collections.deque()
         self._error: BaseException | None = None
-        self._closed = False
+        self._closed = self._ended = self._finished = False
+        self._last: Future[None] | None = None
         self._shape: tuple[int, ...] | None = None
         self._count = 0
-        self._counting = threading.Lock()
+        self._counting, self._finishing = threading.Lock(), threading.Lock()
+        _open.add(self)
 
     def _check(self, image: Any) -> None:
         """Raise SinkError if the frame is of a kind that cannot be written."""
@@ -121,21 +141,27 @@ class ThreadedSink(Sink):
                 raise error
 
     def close(self) -> None:
-        """Store what waits and end the threads."""
-        if self._closed:
+        """Store what waits and end the threads; where a signal interrupts that, a second call goes on with it."""
+        if self._ended:
             return
         self._closed = True
         # Finished on a thread, for a signal interrupts what the main thread does wherever it is.
-        last = self._executor.submit(self._finish_after, list(self._pending))
+        if self._last is None:
+            self._last = self._executor.submit(self._finish_after, list(self._pending))
         try:
             self._settle(0)
         finally:
             self._wait_out()
-        last.result()
+            self._ended = True
+            _open.discard(self)
+        self._last.result()
 
     def _finish_after(self, pending: list[Future[None]]) -> None:
         concurrent.futures.wait(pending)
-        self._finish()
+        with self._finishing:
+            finished, self._finished = self._finished, True
+        if not finished:  # an interrupted call may have asked for it before
+            self._finish()
 
     def _wait_out(self) -> None:
         """Wait for the threads' end, which one interrupt does not cut short."""

@@ -221,6 +221,8 @@ class Proxy:
     """Whole lengths in metres: x and y of a plane; x, y and z of a box; empty for a mesh."""
     file: Path | None = None
     """Mesh file, in metres."""
+    marker: Marker | None = None
+    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,6 +328,8 @@ class Object:
     """How it reflects light."""
     animate: Animation | None = None
     """How it moves."""
+    marker: Marker | None = None
+    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
     """A mesh in memory instead of a file; a scene file cannot say it. See ``Object.of``."""
 
@@ -367,6 +371,8 @@ class Light:
     """Radius in metres of the sphere that emits (point, spot), for soft shadows; 0 is a point."""
     animate: Animation | None = None
     """How it moves."""
+    marker: Marker | None = None
+    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Position (3,) in metres and unit direction (3,) that the light travels, ``seconds`` after the first frame.

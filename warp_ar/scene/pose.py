@@ -23,6 +23,10 @@ class Pose:
         """The motion back: from ``camera_from_world`` to ``world_from_camera``."""
         return Pose(self.rotation.T.copy(), -self.rotation.T @ self.translation)
 
+    def after(self, first: Pose) -> Pose:
+        """The motion that does ``first`` and then this one."""
+        return Pose(self.rotation @ first.rotation, self.rotation @ first.translation + self.translation)
+
     def apply(self, points: Array) -> Array:
         """Points (..., 3) mapped by the motion."""
         return points @ self.rotation.T + self.translation

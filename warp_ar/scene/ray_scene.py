@@ -9,6 +9,7 @@ import dataclasses
 import math
 import weakref
 from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +32,7 @@ from warp_ar.scene.object_materials import (
     reflects_diffusely,
     reflects_glossily,
 )
+from warp_ar.scene.pose import Pose
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
 from warp_ar.scene.texture_pack import DECODE, TexturePack, mask_cutoff
@@ -54,6 +56,11 @@ _MODELS: Final[dict[type, int]] = {
     scenes.MetallicRoughnessMaterial: structs.METALLIC_ROUGHNESS,
     scenes.MirrorMaterial: structs.MIRROR,
 }
+
+_NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
+_AWAY: Final = (0.0, 0.0, -1e5)
+_AWAY_SCALE: Final = 1e-6
+"""Where shapes wait whose marker is lost: no ray meets them, and no kernel has to ask."""
 
 # Planes whose normals have a larger cosine, 2.6 degrees, send each other less than a hundredth of their light.
 _ONE_WAY: Final = 0.999
@@ -94,6 +101,7 @@ def skeleton(scene: scenes.Scene) -> Any:
     objects = tuple(
         (
             item.shape,
+            item.marker,
             _mesh_key(item),
             type(item.material),
             tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
@@ -102,7 +110,7 @@ def skeleton(scene: scenes.Scene) -> Any:
         )
         for item in scene.objects
     )
-    lights = tuple(light.kind for light in scene.lights)
+    lights = tuple((light.kind, light.marker) for light in scene.lights)
     place = scene.camera, scene.marker, scene.has_marker, scene.pose, scene.captured
     return *place, scene.probes, scene.proxies, objects, lights
 
@@ -191,6 +199,7 @@ class HostScene:
         textures = TexturePack()
         self._objects = self._shape_records(scene.objects, device)
         self._proxies = self._shape_records(scene.proxies, device)
+        self._fixed_proxies = self._proxies.copy()
         self._textures = textures
         materials = self._material_records()
         self._place_objects()
@@ -203,6 +212,7 @@ class HostScene:
         self._balls = ball_outline(scene)
         self._lights_edited = False
         self.write_objects(np.zeros_like(self._objects), 0.0)
+        self.write_proxies(np.zeros_like(self._proxies))
         self.write_lights(np.zeros_like(self._lights), 0.0)
 
         records = np.zeros(len(textures.records), _dtype(structs.Texture))
@@ -346,31 +356,53 @@ class HostScene:
         record["emissive_texture"] = add(material.emissive, images, encoded=True)
         record["normal_scale"], record["occlusion_strength"] = material.normal_scale, material.occlusion_strength
 
-    def write_objects(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
+    def write_objects(
+        self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
+    ) -> bool:
         """Write the virtual objects as they stand ``seconds`` after the first frame.
 
         Args:
             records_out: Records of ``structs.Shape``, one per object.
             seconds: Time since the first frame.
+            places: ``world_from_marker`` of the markers that something rides on; None where one is lost.
 
         Returns:
             Whether anything is not where ``records_out`` had it.
         """
         for record, item, center in zip(self._objects, self.scene.objects, self._centers, strict=True):
-            if item.animate is not None or seconds == 0.0:
+            if item.animate is not None or item.marker is not None or seconds == 0.0:
                 rotation, position = item.pose_at(seconds)
-                record["rotation"], record["position"] = rotation, position + rotation @ center
+                _place(record, item, rotation, position + rotation @ center, places)
         return _update(records_out, self._objects)
 
-    def write_lights(self, records_out: npt.NDArray[Any], seconds: float) -> bool:
+    def write_proxies(
+        self, records_out: npt.NDArray[Any], places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
+    ) -> bool:
+        """Write the proxies where their markers have them; arguments and value as ``write_objects``."""
+        for record, fixed, item in zip(self._proxies, self._fixed_proxies, self.scene.proxies, strict=True):
+            if item.marker is not None:
+                _place(record, item, fixed["rotation"], fixed["position"], places)
+        changed = _update(records_out, self._proxies)
+        if changed:
+            self._lit = self._shaded = None
+        return changed
+
+    def write_lights(
+        self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE
+    ) -> bool:
         """Write the virtual lights as they stand ``seconds`` after the first frame; arguments as ``write_objects``."""
         for record, light in zip(self._lights, self.scene.lights, strict=True):
-            if light.animate is None and seconds != 0.0 and not self._lights_edited:
+            if light.animate is None and light.marker is None and seconds != 0.0 and not self._lights_edited:
                 continue
             self._lit = None
-            record["position"], record["direction"] = light.pose_at(seconds)
+            position, direction = light.pose_at(seconds)
+            place = None if light.marker is None else places.get(light.marker)
+            if place is not None:
+                position, direction = place.apply(position), place.rotation @ direction
+            record["position"], record["direction"] = position, direction
             record["kind"] = light_kind(light)
-            record["intensity"] = light.intensity * np.array(light.color)
+            lost = light.marker is not None and place is None
+            record["intensity"] = 0.0 if lost else light.intensity * np.array(light.color)
             record["inner_angle"], record["outer_angle"] = map(math.radians, (light.inner_angle, light.outer_angle))
             record["attenuation"], record["radius"] = light.attenuation, light.radius
         self._lights_edited = False
@@ -386,20 +418,20 @@ class HostScene:
         placed = self._objects.tobytes()
         if placed != self._placed:
             self._placed = placed
-            self._outline = Outline([face for record in self._objects for face in box_faces(record)])
+            self._outline = Outline([face for record in _present(self._objects) for face in box_faces(record)])
             self._shaded = None
 
     def light_outline(self, *, bounced: bool = False) -> Outline:
         """Where virtual light or its shadows can fall on proxies; if ``bounced``, what lit proxies send on as well."""
         if self._lit is None:
-            faces = [box_faces(record) for record in self._proxies]
+            faces = [box_faces(record) for record in _present(self._proxies)]
             shining = self._shining()
             self._lit = Outline([part for light in shining for own in faces for part in lit_faces(light, own)])
             self._bounced = None
         if not bounced:
             return self._lit
         if self._bounced is None:
-            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), self._proxies)])
+            self._bounced = Outline([*self._lit.polygons, *bounced_faces(self._shining(), _present(self._proxies))])
         return self._bounced
 
     def _shining(self) -> npt.NDArray[Any]:
@@ -414,9 +446,14 @@ class HostScene:
         """Where virtual objects can change the environment on proxies."""
         self._follow_objects()
         if self._shaded is None:
-            proxies = [box_faces(record) for record in self._proxies]
+            proxies = [box_faces(record) for record in _present(self._proxies)]
             self._shaded = Outline(
-                [part for record in self._objects for faces in proxies for part in shaded_faces(record, faces)]
+                [
+                    part
+                    for record in _present(self._objects)
+                    for faces in proxies
+                    for part in shaded_faces(record, faces)
+                ]
             )
         return self._shaded
 
@@ -455,6 +492,31 @@ def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:
             spanned = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
             found[:, index] = np.sqrt(np.abs(spanned) / np.where(area > 0.0, area, np.inf))
     return found.astype(np.float32)
+
+
+def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Shapes that are somewhere."""
+    there: npt.NDArray[Any] = records[records["position"][:, 2] > 0.5 * _AWAY[2]]
+    return there
+
+
+def _place(
+    record: Any,
+    item: scenes.Object | scenes.Proxy,
+    rotation: FloatArray,
+    position: FloatArray,
+    places: Mapping[scenes.Marker, Pose | None],
+) -> None:
+    """Put a shape where it stands in its marker's frame; out of the way while that is lost."""
+    record["scale"] = getattr(item, "scale", 1.0)
+    if item.marker is None:
+        record["rotation"], record["position"] = rotation, position
+        return
+    place = places.get(item.marker)
+    if place is None:
+        record["position"], record["scale"] = _AWAY, _AWAY_SCALE
+        return
+    record["rotation"], record["position"] = place.rotation @ rotation, place.apply(position)
 
 
 def _factor(color: scenes.Color) -> tuple[tuple[float, float, float], Path | None]:

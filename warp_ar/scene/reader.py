@@ -79,6 +79,9 @@ _T = TypeVar("_T")
 class _Table:
     """One table of a scene file: hands out checked values and knows how to complain about them."""
 
+    world: Marker | None = None
+    """The world's marker, if there is one."""
+
     def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
         self.label, self.folder, self.section = label, folder, section
         if not isinstance(data, dict):
@@ -305,6 +308,34 @@ def _read_marker(table: _Table) -> Marker:
     return Marker(dictionary, white=white, board=board)
 
 
+def _read_own_marker(parent: _Table) -> Marker | None:
+    """The marker that something rides on: a number, of the world's dictionary and size, or a table."""
+    if "marker" not in parent:
+        return None
+    world, value = parent.world, parent.data["marker"]
+    if isinstance(value, dict):
+        given = {"dictionary": world.dictionary, **value} if world else value
+        if world and world.board is None and "board" not in value:
+            given = {"size": world.size, **given}
+        keys = [key for key in keys_of(Marker) if key != "white"]
+        own = _read_marker(_Table(parent.label, parent.folder, parent.name("marker"), given, keys))
+    elif world is None or world.board is not None or isinstance(value, bool) or not isinstance(value, int):
+        right = 'a table such as { id = 7, size = 0.05 } or { board = "grid 2x2 0.03 0.01" }'
+        parent.fail("marker", f"expected {right}" + (", or an id" if world and world.board is None else ""))
+    else:
+        count = len(cv2.aruco.getPredefinedDictionary(_DICTIONARIES[world.dictionary]).bytesList)
+        own = Marker(world.dictionary, parent.integer("marker", low=0, high=count - 1), world.size)
+    if world is not None and own.dictionary == world.dictionary and _ids(own) & _ids(world):
+        number = min(_ids(own) & _ids(world))
+        parent.fail("marker", f"marker {number} of {own.dictionary} is the world's own; use another id or dictionary")
+    return own
+
+
+def _ids(marker: Marker) -> set[int]:
+    """Numbers in its dictionary that a marker or board shows."""
+    return {marker.id} if marker.board is None else set(range(marker.board.marker_count))
+
+
 def _read_board(table: _Table) -> Board:
     words = table.text("board", right=_BOARDS).split()
     match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", words[1]) if len(words) == 4 else None
@@ -347,6 +378,7 @@ def _read_proxy(table: _Table) -> Proxy:
         rotate=table.vec3("rotate", Proxy.rotate, unit="degrees"),
         size=() if sides is None else table.vector("size", sizes=(sides,), low=SMALLEST, unit="metres"),
         file=_read_mesh_path(table) if shape == "mesh" else None,
+        marker=_read_own_marker(table),
     )
 
 
@@ -376,6 +408,7 @@ def _read_object(table: _Table) -> Object:
         scale=table.number("scale", Object.scale, low=SMALLEST),
         material=_read_material(table) if "material" in table else Object.material,
         animate=_read_animation(table),
+        marker=_read_own_marker(table),
     )
 
 
@@ -458,6 +491,7 @@ def _read_light(table: _Table) -> Light:
         attenuation=attenuation,
         radius=table.number("radius", Light.radius, low=0.0, unit="metres"),
         animate=_read_animation(table),
+        marker=_read_own_marker(table),
     )
 
 
@@ -612,6 +646,10 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     top = _Table(label, folder, "", {key: data[key] for key in data if key not in _SECTIONS}, (*_TOP_KEYS, *_SECTIONS))
     _check_top(top, data, label)
 
+    def in_world(table: _Table) -> _Table:
+        table.world = marker
+        return table
+
     def one(section: str, keys: Sequence[str], read: Any) -> Any:
         return read(_Table(label, folder, section, data[section], keys)) if section in data else None
 
@@ -621,10 +659,13 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
             return (read(_Table(label, folder, section, value, keys)),)
         if not isinstance(value, list):
             raise SceneError(f"{label}: {section}: there may be several: write [[{section}]] instead of [{section}]")
-        return tuple(read(_Table(label, folder, f"{section}[{i}]", item, keys)) for i, item in enumerate(value))
+        return tuple(
+            read(in_world(_Table(label, folder, f"{section}[{i}]", item, keys))) for i, item in enumerate(value)
+        )
 
     lights, captured = _split_lights(data.get("light", []), label)
     data = {**data, "light": lights}
+    marker = one("marker", keys_of(Marker), _read_marker)
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
@@ -634,7 +675,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
             lambda table: _read_camera(table, data.get("source")),
         ),
         source=one("source", keys_of(SourceSpec), _read_source),
-        marker=one("marker", keys_of(Marker), _read_marker) or Marker(),
+        marker=marker or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
         objects=many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], _read_object),

@@ -8,7 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import SceneError
-from warp_ar.scene.description import Animation, Board, CapturedLight, Light, Object, PoseSpec, Probe, Scene, SourceSpec
+from warp_ar.scene.description import (
+    Animation,
+    Board,
+    CapturedLight,
+    Light,
+    Object,
+    PoseSpec,
+    Probe,
+    Proxy,
+    Scene,
+    SourceSpec,
+)
 from warp_ar.scene.keys import INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 
 
@@ -39,6 +50,13 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         fields = {key: getattr(item.animate, key) for key in keys_of(Animation)}
         return [f"animate = {value({key: entry for key, entry in fields.items() if entry is not None})}"]
 
+    def own_marker(item: Object | Light | Proxy) -> list[str]:
+        if item.marker is None:
+            return []
+        own = item.marker
+        fields = {"id": own.id, "size": own.size} if own.board is None else {"board": own.board}
+        return [f"marker = {value({'dictionary': own.dictionary, **fields})}"]
+
     lines = [f"schema = {scene.schema}", f"name = {value(scene.name)}"]
     guessed = scene.camera.field_of_view is not None
     lines += ["", "[camera]", *table(scene.camera, (*(("field_of_view",) if guessed else INTRINSICS), "transfer"))]
@@ -53,12 +71,13 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         lines += ["", "[[probe]]", *table(probe, keys_of(Probe))]
     for proxy in scene.proxies:
         lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
+        lines += own_marker(proxy)
     for item in scene.objects:
         if item.mesh is not None:
             raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
         model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
         lines += ["", "[[object]]", *table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
-        lines += animation(item)
+        lines += [*animation(item), *own_marker(item)]
         lines += [
             "",
             "[object.material]",
@@ -67,7 +86,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         ]
     for light in scene.lights:
         lines += ["", "[[light]]", *table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
-        lines += animation(light)
+        lines += [*animation(light), *own_marker(light)]
     if scene.captured is not None:
         lines += ["", "[[light]]", *table(scene.captured, keys_of(CapturedLight))]
     lines += ["", "[exposure]", *table(scene.exposure, ("scale",))]

@@ -304,6 +304,21 @@ class Wanted:
         return dataclasses.replace(self, off=self.off - {name} if on else self.off | {name})
 
 
+def beside(scene: Scene, folder: Path) -> Scene:
+    """The scene with files of a folder named as if they lay beside its own file."""
+
+    def named(path: Any) -> Any:
+        return Path(path.name) if isinstance(path, Path) and path.parent == folder else path
+
+    captured = scene.captured
+    return dataclasses.replace(
+        scene,
+        camera=dataclasses.replace(scene.camera, transfer=named(scene.camera.transfer)),
+        objects=tuple(dataclasses.replace(item, file=named(item.file)) for item in scene.objects),
+        captured=None if captured is None else dataclasses.replace(captured, file=named(captured.file)),
+    )
+
+
 def make_edit(command: protocol.Command, original: Wanted) -> tuple[Callable[[Wanted], Wanted], str] | None:
     """What a command makes of what is wanted, and its name in words; None if it is no edit.
 
@@ -366,6 +381,7 @@ def wanted_record(wanted: Wanted) -> dict[str, Any]:
         "lights": [part("light", i, item) for i, item in enumerate(scene.lights)],
         "proxies": [part("proxy", i, item) for i, item in enumerate(scene.proxies)],
         "probes": [plain(item) for item in scene.probes],
+        "captured": None if scene.captured is None else scene.captured.file.name,
         "exposure": scene.exposure.scale,
         "marker": {
             "dictionary": marker.dictionary,

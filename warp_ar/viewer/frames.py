@@ -25,6 +25,7 @@ from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.controls import Controls, Notify
 from warp_ar.viewer.intrinsics import guessed_camera
+from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
@@ -116,6 +117,8 @@ class FrameLoop:
         """The newest frame."""
         self.light: npt.NDArray[np.float32] | None = None
         """The environment, latlong linear RGB, as it was a moment ago; None while it is not known."""
+        self.light_state: LightState | None = None
+        """The same with what is known of it."""
 
     @property
     def fps(self) -> float:
@@ -276,12 +279,17 @@ class FrameLoop:
         self._light_time = now
         light = pipeline.arrays.get("environment")
         if light is None:
-            self.light = None
+            self.light = self.light_state = None
             return
         with exclusive(pipeline.device):
             values = np.array(light.numpy())
+            scale = pipeline.arrays.get("expose_scale")
+            exposure = 1.0 if scale is None else float(scale.numpy()[0])
+        status = pipeline.arrays.get("recover_status")
         # Black until the ball has been seen once.
         self.light = values if values.any() else None
+        known = {} if status is None else status()
+        self.light_state = None if self.light is None else LightState(values, exposure, known)
 
     def _watch_cost(self, pipeline: Pipeline, frame: Frame, result: Result, light_ms: float) -> None:
         """Learn what the preset costs; under a budget, choose the methods that it asks for."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,11 +25,13 @@ from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.controls import Controls, Notify, open_feed
+from warp_ar.viewer.dropped import DroppedFiles
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
+from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.recorder import Recorder
-from warp_ar.viewer.setup import RESPONSE, SetupChecks
+from warp_ar.viewer.setup import SetupChecks
 
 
 class Host:
@@ -72,6 +75,7 @@ class Host:
         self._controls = Controls(open_feed(scene, source), wanted, notify)
         self._folder = tempfile.TemporaryDirectory(prefix="warp_ar_live_")
         self._recorder = Recorder(Path(self._folder.name))
+        self._dropped, self._dropping = DroppedFiles(Path(self._folder.name)), threading.Lock()
         try:
             self._lighting = Lighting(self._controls, device, notify, lambda: self._budget.switch(None))
         except BaseException:
@@ -230,6 +234,17 @@ class Host:
         self._camera.stop_estimating()
         self._controls.change(lambda w: w.with_camera(calibration.with_transfer(camera, known)), "calibrate the camera")
 
+    def drop(self, name: str, data: bytes) -> str:
+        """Take a file that a viewer dropped onto the picture; what is to be said about it.
+
+        Raises:
+            WarpArError: It cannot be used; nothing has changed.
+        """
+        with self._dropping:
+            make, label, words = self._dropped.take(name, data, self._controls.wanted)
+            self._controls.change(make, label)
+        return words
+
     # ------------------------------------------------------------------------------------------------ what can be saved
 
     def camera_file(self) -> bytes:
@@ -284,6 +299,10 @@ class Host:
             )
         return calibration.written("environment.exr", lambda path: write_environment(path, light))
 
+    def light_state(self) -> LightState | None:
+        """The environment with what is known of it; None while it is not captured."""
+        return self._loop.light_state
+
     def scene_toml(self, *, full_paths: bool) -> str:
         """The scene as it is shown, as a scene file.
 
@@ -291,9 +310,8 @@ class Host:
             full_paths: Write the paths of files in full; else relative to the scene's folder where they lie in it.
         """
         scene = make_target(self._controls.wanted, self._controls.feed).scene
-        if isinstance(scene.camera.transfer, Path) and scene.camera.transfer.parent == Path(self._folder.name):
-            # What was measured here is saved beside the scene.
-            scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, transfer=Path(RESPONSE)))
+        # What was measured or dropped here is saved beside the scene.
+        scene = edits.beside(scene, Path(self._folder.name))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
 

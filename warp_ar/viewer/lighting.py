@@ -74,6 +74,7 @@ class Lighting:
         self._then: Target | None = None
         self._place: Any = None
         self._settled = False
+        self._bracket_notes: tuple[str, ...] = ()
         self._progress: tuple[str, int, int] | None = None
         self.plan: Plan | None = None
         """What lights the frames."""
@@ -140,6 +141,7 @@ class Lighting:
         if self._main.swaps != before:
             assert self._main.pipeline is not None
             self.plan = self._main.pipeline.plan
+            self._tell_bracket(self._main.pipeline.bracket.notes)
             self._notify(self.plan_message())
         if self._then is None:
             if self._second.pipeline is not None or self._second.busy:
@@ -148,6 +150,13 @@ class Lighting:
             with contextlib.suppress(WarpArError):
                 self._second.follow(self._then, prepare=self._warm_up)
         return self._main.pipeline if self._place == _place(self._now) else None
+
+    def _tell_bracket(self, notes: tuple[str, ...]) -> None:
+        """Say what of the source's exposures is not merged, once."""
+        if notes != self._bracket_notes:
+            self._bracket_notes = notes
+            for note in notes:
+                self._notify({"type": "notice", "text": note, "bad": False})
 
     def _follow_main(self, wanted: Wanted) -> None:
         target = self._first or self._now

@@ -32,7 +32,9 @@ from warp_ar.errors import UsageError, WarpArError
 from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
+from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.gate import BACKLOG, HEADER_SECONDS, Gate
+from warp_ar.viewer.shared_light import SharedLight
 
 if TYPE_CHECKING:
     from warp_ar.viewer.frames import Lit
@@ -57,6 +59,8 @@ MESSAGES_PER_SECOND: Final = 240.0
 CONNECTIONS_PER_SECOND: Final = 50.0
 """From one address; each takes about a millisecond."""
 _MOST_ADDRESSES: Final = 256
+DROP_SECONDS: Final = 60.0
+"""How long a dropped file may be on its way."""
 BYTES_PER_SECOND: Final = 8e6
 """Thirty pictures a second of a camera at 1920x1080."""
 LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
@@ -119,6 +123,8 @@ class Address:
     token: str | None = None
     """Secret that the page's address must hold; None asks for none."""
     tls: ssl.SSLContext | None = None
+    origins: tuple[str, ...] = ()
+    """Other sites' pages that may ask for the light."""
 
     @property
     def loopback(self) -> bool:
@@ -186,6 +192,7 @@ class Server:
         self._arrivals: dict[str, protocol.Bucket] = {}
         self._waiting = 0
         self._encode_ms = 0.0
+        self._taking = False
         self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
         self._hands = ThreadPoolExecutor(2, "warp-ar-page")
         self._ending = False
@@ -201,6 +208,7 @@ class Server:
         """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
         self.gate = Gate(own_headers(), header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
+        SharedLight(self)
         self.app.on_response_prepare.append(self._add_headers)
         self.app.add_routes(
             [
@@ -208,6 +216,7 @@ class Server:
                 web.get("/static/{name}", self._file),
                 web.get("/download/{name}", self._download),
                 web.get("/live", self._live),
+                web.post("/drop/{name}", self._drop_file),
             ]
         )
 
@@ -225,9 +234,14 @@ class Server:
         if self.address.loopback and self.address.token is None and name not in LOOPBACK:
             return self._refuse(f"this page is at {self.address.url}")
         origin = request.headers.get("Origin")
-        if origin is not None and origin != f"{request.scheme}://{request.host}":
+        welcome = origin in self.address.origins and request.path.startswith("/light")
+        if not welcome and origin is not None and origin != f"{request.scheme}://{request.host}":
             return self._refuse("requests from other sites are refused")
-        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and request.path != "/":
+        if (
+            not welcome
+            and request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+            and request.path != "/"
+        ):
             return self._refuse("requests from other sites are refused")
         given = request.query.get("token", "")
         public = request.path.startswith("/static/")
@@ -244,9 +258,12 @@ class Server:
         response.force_close()
         return response
 
-    @staticmethod
-    async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
+    async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
         response.headers.update(_HEADERS)
+        origin = request.headers.get("Origin")
+        if origin in self.address.origins and request.path.startswith("/light"):
+            allowed = {"Access-Control-Allow-Origin": str(origin), "Vary": "Origin"}
+            response.headers.update({**allowed, "Cross-Origin-Resource-Policy": "cross-origin"})
 
     # ------------------------------------------------------------------------------------------------------------ files
 
@@ -281,6 +298,33 @@ class Server:
             raise web.HTTPConflict(text=f"{error}\n") from error
         headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
         return web.Response(body=body, headers=headers)
+
+    async def _drop_file(self, request: web.Request) -> web.Response:
+        """Take a file that was dropped onto the picture; its answer says in words what became of it."""
+        host = await self._started()
+        name = request.match_info["name"]
+        if self._taking:
+            return web.Response(status=429, text="another file is being taken: wait until it is there\n")
+        self._taking = True
+        try:
+            # Its own bound, for all other requests have none worth the name; and not for ever.
+            async with asyncio.timeout(DROP_SECONDS):
+                parts, size = [], 0
+                async for part in request.content.iter_chunked(1 << 16):
+                    size += len(part)
+                    if size > MOST_BYTES:
+                        refused = web.Response(status=413, text=f"{size:,} bytes and more; {MOST_BYTES:,} are taken\n")
+                        refused.force_close()
+                        return refused
+                    parts.append(part)
+            words = await self._aside(host.drop, name, b"".join(parts))
+        except TimeoutError:
+            return web.Response(status=408, text="the file took too long\n")
+        except WarpArError as error:
+            return web.Response(status=422, text=f"{error}\n")
+        finally:
+            self._taking = False
+        return web.Response(text=f"{words}\n")
 
     # ---------------------------------------------------------------------------------------------------------- frames
 

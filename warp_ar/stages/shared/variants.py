@@ -8,7 +8,10 @@ still takes registers from what is.
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, Final
+
+from warp_ar.errors import UsageError
 
 from warp_ar.kernels.composite import CompositeConfig
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
@@ -18,9 +21,20 @@ from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.stages.features import Features
 
 
+VARIABLE: Final = "WARP_AR_KERNELS"
+"""Environment variable that decides for all devices: ``shared`` or ``specialised``. It is there for measuring."""
+
+
 def shares_kernels(device: Any) -> bool:
-    """Whether kernels on ``device`` are those of any scene."""
-    return bool(device.is_cpu)
+    """Whether kernels on ``device`` are those of any scene.
+
+    Raises:
+        UsageError: The environment variable has another value.
+    """
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in ("", "shared", "specialised"):
+        raise UsageError(f"{VARIABLE} = {asked!r}: expected shared or specialised")
+    return asked == "shared" if asked else bool(device.is_cpu)
 
 
 def trace_variant(config: TraceConfig, device: Any) -> TraceConfig:

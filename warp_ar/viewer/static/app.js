@@ -4,7 +4,7 @@ import { Capture } from "./capture.js";
 import { cameraOf, poseOf } from "./geometry.js";
 import { Handles } from "./handles.js";
 import { Light } from "./light.js";
-import { Connection, downloadUrl } from "./net.js";
+import { Connection, downloadUrl, dropFile } from "./net.js";
 import { QualityPanel, ScenePanel, TimePanel } from "./panels.js";
 import { Pointing } from "./pointing.js";
 import { SetupPanel } from "./setup.js";
@@ -47,6 +47,8 @@ const adopt = (next) => {
   scenePanel.scene = scene;
   quality.scene = scene;
   setup.scene = scene;
+  $("captured-note").hidden = !scene.captured;
+  $("captured-note").textContent = scene.captured ? `Light of ${scene.captured} stands for what the mirror ball shows.` : "";
 };
 let waiting = null;
 connection.addEventListener("scene", ({ detail }) => {
@@ -278,6 +280,29 @@ $("split").addEventListener("input", (event) => {
 });
 $("play").addEventListener("click", () => connection.send("play", { on: !state.playing }));
 $("record").addEventListener("click", () => connection.send("record", { on: state.recording === null }));
+/** Files one after another; what became of each is said in words. */
+async function take(files) {
+  for (const file of files) {
+    const box = notice(`${file.name} is on its way …`);
+    const { ok, words } = await dropFile(file);
+    box.remove();
+    notice(words, !ok);
+  }
+}
+$("open").addEventListener("click", () => $("open-file").click());
+$("open-light").addEventListener("click", () => $("open-file").click());
+$("open-file").addEventListener("change", (event) => {
+  take([...event.target.files]);
+  event.target.value = "";
+});
+for (const type of ["dragover", "dragleave", "drop"]) {
+  document.addEventListener(type, (event) => {
+    if (!event.dataTransfer?.types.includes("Files")) return;
+    event.preventDefault(); // else the browser leaves the page for the file
+    $("figure").classList.toggle("over", type === "dragover");
+    if (type === "drop") take([...event.dataTransfer.files]);
+  });
+}
 $("undo").addEventListener("click", () => connection.send("undo"));
 $("redo").addEventListener("click", () => connection.send("redo"));
 $("guide-go").addEventListener("click", () => {

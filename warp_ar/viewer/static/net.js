@@ -5,6 +5,16 @@ const query = token ? `?token=${encodeURIComponent(token)}` : "";
 
 export const downloadUrl = (name) => `download/${name}${query}`;
 
+/** Hand the program a file; whether it took it, and what it says. */
+export async function dropFile(file) {
+  try {
+    const answer = await fetch(`drop/${encodeURIComponent(file.name.slice(-120))}${query}`, { method: "POST", body: file });
+    return { ok: answer.ok, words: (await answer.text()).trim() };
+  } catch {
+    return { ok: false, words: `${file.name} could not be sent; it may be too large.` };
+  }
+}
+
 export class Connection extends EventTarget {
   /** Milliseconds to add to performance.now() for the server's clock. */
   offset = null;

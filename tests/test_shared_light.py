@@ -1,0 +1,334 @@
+"""The light that the page's server tells others: what it says, to whom, and what three.js makes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import http.server
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from tests.reference import color as reference_color
+from tests.test_viewer import PATIENCE, Site, run, served
+from warp_ar import live
+from warp_ar.errors import UsageError
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.output.environment_axes import AXES, to_cube
+from warp_ar.output.environment_harmonics import basis
+from warp_ar.scene import Pose
+from warp_ar.viewer import shared_light
+from warp_ar.viewer.light_record import FACES, LightState, describe, key_light
+from warp_ar.viewer.shared_light import MOST_LISTENERS, check_origin
+
+ROOT = Path(__file__).resolve().parents[1]
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# A lamp of 4 degrees within a map of 64 rows: half a texel is 1.4 degrees.
+DIRECTION = 0.03
+
+
+def room(height: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    """Grey walls and a lamp, and the direction toward it."""
+    toward = np.array([0.6, -0.48, 0.64])
+    directions = latlong_directions(height)
+    lamp = directions @ toward > np.cos(np.radians(4.0))
+    return np.where(lamp[..., None], (80.0, 60.0, 40.0), 0.2).astype(np.float32), toward
+
+
+def test_harmonics_are_the_light_of_a_surface() -> None:
+    """Irradiance by the nine numbers against the integral, in all axes, for a light that they hold exactly."""
+    directions = latlong_directions(64)
+    smooth = (1.0 + 0.5 * directions[..., 2] + 0.3 * directions[..., 0] * directions[..., 1]).astype(np.float32)
+    radiance = np.repeat(smooth[..., None], 3, -1)
+    normals = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.0, 0.0, -1.0]])
+    area = texel_solid_angles(64)
+    for axes in AXES:
+        told = describe(LightState(radiance, 1.0, {}), None, axes)
+        turn = np.reshape(told["world_from_marker"], (3, 3))
+        for normal in normals:
+            expected = (smooth * np.maximum(directions @ normal, 0.0) * area).sum()
+            found = basis((turn @ normal)[None]) @ np.array(told["irradiance"])
+            np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
+def test_the_key_light_is_the_lamp() -> None:
+    radiance, toward = room()
+    key = key_light(radiance, np.eye(3))
+    assert key is not None
+    np.testing.assert_allclose(key["direction"], toward, atol=DIRECTION)
+    lamp = radiance.max(-1) > 1.0
+    area = np.broadcast_to(texel_solid_angles(64), lamp.shape)
+    np.testing.assert_allclose(key["irradiance"], (radiance[lamp] * area[lamp][:, None]).sum(0), rtol=1e-3)
+    assert 0.0 < key["directionality"] < 1.0
+    assert key_light(np.ones((64, 128, 3), np.float32), np.eye(3)) is None
+    dark = np.where(lamp[..., None], radiance, 0.0).astype(np.float32)
+    sun = key_light(dark, np.eye(3))
+    assert sun is not None
+    assert sun["directionality"] == 1.0
+
+
+def test_what_is_told_beside_it() -> None:
+    radiance, _ = room()
+    values = {f"irradiance_{name}": [[1.0] * 3] * 6 for name in ("low", "value", "high")}
+    told = describe(LightState(radiance, 0.5, values), Pose(np.eye(3), np.array([0.0, 0.0, 1.0])), "y-up")
+    assert told["exposure"] == 0.5
+    assert told["pose"] == {"R": np.eye(3).ravel().tolist(), "t": [0.0, 0.0, 1.0]}
+    assert told["interval"]["low"] == [[1.0] * 3] * 6
+    bare = describe(LightState(radiance, 1.0, {}), None, "z-up")
+    assert bare["interval"] is None
+    assert bare["pose"] is None
+    json.dumps(told, allow_nan=False)
+
+
+async def known_light(site: Site, query: str = "", **options: Any) -> dict[str, Any]:
+    """``/light.json``, once the light is known: who asks keeps frames going."""
+    while True:
+        async with site.session.get(f"{site.url}/light.json{query}", **options) as response:
+            if response.status == 200:
+                return dict(await response.json())
+            assert response.status == 409, await response.text()
+            assert "the environment is not captured" in await response.text()
+        await asyncio.sleep(0.1)
+
+
+@run
+async def test_light_in_all_its_forms() -> None:
+    async with served() as site:
+        told = await known_light(site)
+        assert told["axes"] == "y-up"
+        assert len(told["radiance"]) == len(told["irradiance"]) == 9
+        assert np.isfinite(told["radiance"]).all()
+        assert told["pose"] is not None
+        turned = await known_light(site, "?axes=z-up")
+        assert turned["world_from_marker"] == np.eye(3).ravel().tolist()
+        async with site.session.get(f"{site.url}/light.exr?axes=z-up") as response:
+            data = await response.read()
+        latlong = read_exr(data)
+        assert latlong.shape == (64, 128, 3)
+        async with site.session.get(f"{site.url}/light.hdr?layout=cube&size=16") as response:
+            column = cv2.imdecode(np.frombuffer(await response.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert column.shape == (96, 16, 3)
+        faces = []
+        for face in FACES:
+            async with site.session.get(f"{site.url}/light/{face}.hdr?size=16") as response:
+                assert response.headers["Content-Type"] == "image/vnd.radiance"
+                faces.append(cv2.imdecode(np.frombuffer(await response.read(), np.uint8), cv2.IMREAD_UNCHANGED))
+        # The clip goes on, so the light has moved a little between two requests.
+        assert np.abs(np.concatenate(faces) - column).mean() < 0.1 * column.mean()
+        assert to_cube(latlong, "y-up", 16).shape == column.shape
+
+
+def read_exr(data: bytes) -> np.ndarray:
+    """Pixels of an OpenEXR with channels R, G and B."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "light.exr"
+        path.write_bytes(data)
+        with OpenEXR.File(str(path)) as file:
+            return np.array(file.channels()["RGB"].pixels)
+
+
+@run
+async def test_requests_that_are_wrong_are_named() -> None:
+    async with served() as site:
+        await known_light(site)
+        for path, words in (
+            ("/light.json?axes=up", "axes = 'up': expected y-up, z-up, blender, opengl"),
+            ("/light.exr?layout=ball", "layout = 'ball': expected latlong or cube"),
+            ("/light.hdr?layout=cube&size=0", "size = '0': expected 1 to 1024 texels"),
+            ("/light.hdr?layout=cube&size=99999999", "expected 1 to 1024 texels"),
+            ("/light/px.hdr?axes=z-up", "z-up"),
+            ("/light/px.hdr?axes=sideways", "axes = 'sideways'"),
+        ):
+            async with site.session.get(site.url + path) as response:
+                assert response.status == 400, path
+                text = await response.text()
+                assert words in text
+                assert text.count("\n") == 1
+        for path in ("/light.png", "/light/top.hdr", "/light/px.exr"):
+            async with site.session.get(site.url + path) as response:
+                assert response.status == 404
+
+
+@run
+async def test_changes_are_pushed() -> None:
+    async with served() as site:
+        told = []
+        async with site.session.ws_connect(f"{site.url}/light?axes=z-up") as socket:
+            async for message in socket:
+                told.append(json.loads(message.data))
+                if len(told) == 3:
+                    break
+        assert {one["axes"] for one in told} == {"z-up"}
+        assert told[0] != told[1]
+        async with site.session.ws_connect(f"{site.url}/light") as socket:
+            await socket.send_str("hello")
+            while (message := await socket.receive()).type is aiohttp.WSMsgType.TEXT:
+                pass
+            assert socket.close_code == 1008
+
+
+@run
+async def test_only_so_many_listen() -> None:
+    async with served() as site:
+        sockets = [await site.session.ws_connect(f"{site.url}/light") for _ in range(MOST_LISTENERS)]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as error:
+            await site.session.ws_connect(f"{site.url}/light")
+        assert error.value.status == 503
+        for socket in sockets:
+            await socket.close()
+        async with site.session.ws_connect(f"{site.url}/light"):
+            pass
+
+
+@run
+async def test_other_sites_are_let_in_by_name() -> None:
+    friend = "http://localhost:5173"
+    async with served(origins=(friend,)) as site:
+        await known_light(site)
+        async with site.session.get(
+            f"{site.url}/light.json", headers={"Origin": friend, "Sec-Fetch-Site": "cross-site"}
+        ) as response:
+            assert response.status == 200
+            assert response.headers["Access-Control-Allow-Origin"] == friend
+            assert response.headers["Vary"] == "Origin"
+        async with site.session.ws_connect(f"{site.url}/light", headers={"Origin": friend}):
+            pass
+        for path, origin in (
+            ("/light.json", "http://localhost:5174"),
+            ("/light.json", "https://evil.example"),
+            ("/light.json", "null"),
+            ("/download/frame.png", friend),  # the light alone
+            ("/", friend),
+        ):
+            async with site.session.get(site.url + path, headers={"Origin": origin}) as response:
+                assert response.status == 403, (path, origin)
+                assert "Access-Control-Allow-Origin" not in response.headers
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            await site.session.ws_connect(f"{site.url}/live", headers={"Origin": friend})
+
+
+@run
+async def test_the_token_is_asked_for() -> None:
+    async with served(token="5ec2e7", origins=("http://localhost:5173",)) as site:
+        for path in ("/light.json", "/light.exr", "/light.hdr", "/light/px.hdr", "/light", "/light.json?token=5ec2e"):
+            async with site.session.get(site.url + path, headers={"Origin": "http://localhost:5173"}) as response:
+                assert response.status == 403, path
+                assert "token" in await response.text()
+        assert (await known_light(site, "?token=5ec2e7"))["type"] == "light"
+
+
+@run
+async def test_who_has_asked_counts_as_a_viewer_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared_light, "WATCH_SECONDS", 0.3)
+    async with served() as site:
+        await known_light(site)
+        await known_light(site)
+        controls = site.server.host._controls
+        assert controls.watchers == 1
+        while controls.watchers:
+            await asyncio.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    "origin", ["localhost:5173", "http://", "http://a/b", "*", "http://*", "ftp://a", "http://a b"]
+)
+def test_an_origin_that_is_none_is_named(origin: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UsageError, match="expected an origin such as"):
+        check_origin(origin)
+    assert live.main(["desk", "--allow-origin", origin, "--no-browser"]) == 2
+    assert "--allow-origin" in capsys.readouterr().err
+    assert check_origin("https://studio.example:8443") == "https://studio.example:8443"
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """three.js from npm, or from the folder that WARP_AR_THREE names."""
+    folder = tmp_path_factory.mktemp("three")
+    given = os.environ.get("WARP_AR_THREE")
+    if given is None:
+        npm = shutil.which("npm")
+        if npm is None:
+            pytest.skip("needs three.js: npm, or its folder in WARP_AR_THREE")
+        done = subprocess.run(
+            [npm, "install", "--silent", "--no-audit", "--no-fund", "three@0.180.0"],
+            cwd=folder, capture_output=True, timeout=PATIENCE, check=False,
+        )  # fmt: skip
+        if done.returncode != 0:
+            pytest.skip("needs three.js, which npm does not get here; name its folder in WARP_AR_THREE")
+        given = str(folder / "node_modules" / "three")
+    site = folder / "site"
+    (site / "three").mkdir(parents=True)
+    for name in ("three.module.js", "three.core.js"):
+        shutil.copy(Path(given) / "build" / name, site / "three" / name)
+    shutil.copy(ROOT / "docs" / "examples" / "live-light.html", site)
+    return site
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        pass
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
+def test_three_js_shows_a_ball_as_the_light_says(three: Path) -> None:
+    """The example page, from another origin, in a real browser: the ball's middle has albedo / pi times E(+z)."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
+    pages = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(_Quiet, directory=str(three)))
+    threading.Thread(target=pages.serve_forever, daemon=True).start()
+    origin = f"http://127.0.0.1:{pages.server_address[1]}"
+    ready, end = threading.Event(), threading.Event()
+    address: list[str] = []
+
+    async def serve() -> None:
+        async with served(token="5ec2e7", origins=(origin,)) as site:
+            address.append(f"{site.url}/?token=5ec2e7")
+            ready.set()
+            await asyncio.to_thread(end.wait)
+
+    server = threading.Thread(target=lambda: asyncio.run(serve()), daemon=True)
+    server.start()
+    try:
+        assert ready.wait(PATIENCE)
+        with playwright.sync_playwright() as runner:
+            browser = runner.chromium.launch(
+                executable_path=CHROMIUM, args=["--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle"]
+            )
+            page = browser.new_page()
+            problems: list[str] = []
+            page.on("pageerror", lambda error: problems.append(str(error)))
+            page.goto(f"{origin}/live-light.html?desk={address[0].replace('?', '%3F')}")
+            page.wait_for_function("window.shown !== undefined", timeout=1e3 * PATIENCE)
+            told, pixels = page.evaluate(
+                """() => {
+                    const canvas = document.getElementById("view");
+                    const copy = document.createElement("canvas");
+                    [copy.width, copy.height] = [canvas.width, canvas.height];
+                    const context = copy.getContext("2d");
+                    context.drawImage(canvas, 0, 0);
+                    return [window.shown, Array.from(context.getImageData(159, 119, 2, 2).data)];
+                }"""
+            )
+            browser.close()
+        assert not problems
+        middle = np.array(pixels, float).reshape(4, 4)[:, :3].mean(0)
+        irradiance = basis(np.array([[0.0, 0.0, 1.0]])) @ np.array(told["irradiance"])
+        expected = reference_color.encoded_srgb(np.clip(0.5 / np.pi * irradiance[0], 0.0, 1.0))
+        assert 10.0 < expected.mean() < 250.0
+        # Two codes: 16-bit numbers of the shader, and a middle that is four pixels.
+        np.testing.assert_allclose(middle, expected, atol=2.0)
+    finally:
+        end.set()
+        server.join(PATIENCE)
+        pages.shutdown()
+        pages.server_close()

@@ -1,0 +1,181 @@
+"""Files that a viewer drops onto the picture: meshes, captured light, scenes.
+
+Nothing of them is trusted. A file's name chooses how it is read and is shown again, nothing else; what it holds is kept
+in the page's own temporary folder, within limits, and goes with it. A scene may name no file but those of the scene
+that is shown: through the page nobody reads what lies on this machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from warp_ar.errors import SceneError, UsageError, WarpArError
+from warp_ar.files import limits, too_much
+from warp_ar.light.captured import Light
+from warp_ar.light.latlong_axes import from_axes
+from warp_ar.output.places import files_of
+from warp_ar.scene import CapturedLight, Object, loads_scene
+from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+from warp_ar.viewer.edits import Wanted, add_item
+
+MOST_BYTES: Final = 1 << 26
+"""Of one file: 64 MB."""
+MOST_FILES: Final = 32
+"""Files that one run of the page keeps: edits that are undone still need theirs."""
+MOST_TRIANGLES: Final = 1_000_000
+"""Of a mesh: beyond that a page waits too long."""
+SIZES: Final = (0.02, 0.4)
+"""Metres: the longest side of what stands on a desk."""
+USUAL: Final = 0.12
+"""Metres: the longest side of a mesh whose units cannot be told."""
+PLACE: Final = (0.12, -0.08)
+"""Where it lands, metres."""
+LIGHTS: Final = (".exr", ".hdr")
+SUFFIXES: Final = (*MESH_SUFFIXES, *LIGHTS, ".toml")
+
+Edit = tuple[Callable[[Wanted], Wanted], str, str]
+"""What it makes of what is wanted, its name as an edit, and what is said about it."""
+
+
+class DroppedFiles:
+    """Takes files; one at a time."""
+
+    def __init__(self, folder: Path) -> None:
+        """Keep files in a folder, which must be there."""
+        self._folder, self._count = folder, 0
+
+    def take(self, name: str, data: bytes, wanted: Wanted) -> Edit:
+        """Keep a file and say what to make of it.
+
+        Args:
+            name: The file's own name.
+            data: What it holds.
+            wanted: What is shown now.
+
+        Raises:
+            WarpArError: It is none that can be used; it is not kept.
+        """
+        suffix = Path(name).suffix.lower()
+        if suffix not in SUFFIXES:
+            raise UsageError(f"{_shown(name)}: expected a file that ends in {', '.join(SUFFIXES)}")
+        if len(data) > MOST_BYTES:
+            raise UsageError(f"{_shown(name)} has {len(data):,} bytes; at most {MOST_BYTES:,} are taken")
+        if suffix == ".toml":
+            return _scene_edit(_shown(name), data, wanted)
+        if self._count >= MOST_FILES:
+            raise UsageError(f"{MOST_FILES} files were dropped already; start the program anew for more")
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(name).stem)[:40] or "file"
+        path = self._folder / f"{self._count:02d}-{stem}{suffix}"
+        path.write_bytes(data)
+        try:
+            edit = _light_edit(_shown(name), path) if suffix in LIGHTS else _mesh_edit(_shown(name), path, wanted)
+        except WarpArError as error:
+            # The folder is nobody's business. What was made of a file lies beside it.
+            words = str(error)
+            for made in self._folder.glob(f"{path.stem}.*"):
+                words = words.replace(str(made), _shown(name))
+                made.unlink()
+            raise UsageError(words) from error
+        self._count += 1
+        return edit
+
+
+def _shown(name: str) -> str:
+    """A file's name as it may be shown: short, and of one line."""
+    return re.sub(r"[^\w .()-]+", "_", Path(name).name)[:60]
+
+
+def _mesh_edit(name: str, path: Path, wanted: Wanted) -> Edit:
+    mesh = load_mesh(path)
+    if len(mesh.faces) > MOST_TRIANGLES:
+        raise UsageError(f"{name} has {len(mesh.faces):,} triangles; at most {MOST_TRIANGLES:,} are taken")
+    low, high = np.asarray(mesh.bounds, float)
+    longest = float((high - low).max())
+    if not longest > 0.0:
+        raise SceneError(f"{name}: all of it is at one point")
+    # Files are in metres, or in millimetres as printers have it, or in nobody knows what.
+    scale = next((unit for unit in (1.0, 0.001) if SIZES[0] <= longest * unit <= SIZES[1]), USUAL / longest)
+    middle = (low + high) / 2
+    at = (PLACE[0] - scale * middle[0], PLACE[1] - scale * middle[1], -scale * low[2])
+    thing = Object("mesh", file=path, at=_rounded(at), scale=float(f"{scale:.6g}"))
+    add_item(wanted.scene, "object", thing)  # whatever refuses it does so now
+    sides = " x ".join(f"{1e3 * scale * side:.0f}" for side in high - low)
+    units = {1.0: "metres", 0.001: "millimetres"}.get(scale, "units of its own, so its longest side is 120 mm")
+    words = f"{name}: {len(mesh.faces):,} triangles, {sides} mm, taken to be in {units}."
+    if mesh.notes:
+        words += f" Not shown: {'; '.join(mesh.notes[:4])}."
+    return lambda w: dataclasses.replace(w, scene=add_item(w.scene, "object", thing)), f"drop {name}", words
+
+
+def _rounded(values: Iterable[float]) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 5) for value in values)
+    return x, y, z
+
+
+def _light_edit(name: str, path: Path) -> Edit:
+    file = path
+    if path.suffix == ".hdr":
+        # Pictures of environments are seen from inside; in this program's maps columns run the other way.
+        file = path.with_suffix(".exr")
+        radiance = from_axes(_read_hdr(name, path), "blender")
+        Light(radiance, np.ones(radiance.shape[:2], np.float32)).save(file)
+    light = Light.load(file)
+    captured = CapturedLight(file)
+    height, width = light.radiance.shape[:2]
+    words = f"{name}: light of {width}x{height} directions stands for what the mirror ball shows. Undo takes it back."
+    return (
+        lambda w: dataclasses.replace(w, scene=dataclasses.replace(w.scene, captured=captured)),
+        f"light by {name}",
+        words,
+    )
+
+
+def _read_hdr(name: str, path: Path) -> Any:
+    """Linear RGB of a Radiance file, (h, w, 3); its header is looked at before anything is unpacked."""
+    data = path.read_bytes()
+    size = re.search(rb"\n-Y (\d{1,9}) \+X (\d{1,9})\n", data[:4096])
+    if not data.startswith(b"#?") or size is None:
+        raise SceneError(f"{name}: no Radiance picture with rows from the top (-Y ... +X ...)")
+    pixels = int(size[1]) * int(size[2])
+    if pixels > limits().picture_pixels:
+        raise SceneError(too_much(f"{name}: it", pixels, "pixels", "picture_pixels"))
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if picture is None or picture.ndim != 3 or picture.dtype != np.float32:
+        raise SceneError(f"{name}: the Radiance picture is damaged")
+    return np.ascontiguousarray(picture[..., 2::-1])
+
+
+def _scene_edit(name: str, data: bytes, wanted: Wanted) -> Edit:
+    try:
+        text = data.decode()
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
+    known = {str(path) for path in files_of(wanted.scene)}
+    for value in _texts(document):
+        if value not in known and (re.search(r"[/\\]", value) or re.search(r"\.\w{2,5}$", value)):
+            raise UsageError(
+                f"{name} names the file {value[:60]!r}; a scene with files of its own is opened by "
+                "python -m warp_ar.live, a dropped one may name only those of the scene that is shown"
+            )
+    scene = dataclasses.replace(loads_scene(text, name), path=wanted.scene.path)
+    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
+
+
+def _texts(value: Any) -> Iterable[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, list):
+        for item in value:
+            yield from _texts(item)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _texts(item)

@@ -1,0 +1,189 @@
+"""The light as other programs take it from the page's server: ``/light.json``, pictures, and a channel of changes.
+
+    GET /light.json                 harmonics, key light, interval, exposure, pose
+    GET /light.exr, /light.hdr      the environment: ``?axes=``, ``?layout=cube``, ``?size=``
+    GET /light/px.hdr ... nz.hdr    one face of the cube
+    WS  /light                      the same JSON, when it has changed; text, no answer expected
+
+All take ``?axes=`` (y-up, the default, z-up, blender, opengl) and the token as the page does. Who asks counts as a
+viewer for some seconds, so that frames are lit though nobody looks at the page. What makes the answers loads Warp, for
+which the page does not wait: it is in ``light_record``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from aiohttp import WSMsgType, web
+
+from warp_ar.errors import UsageError, WarpArError
+
+if TYPE_CHECKING:
+    from warp_ar.viewer.light_record import LightState
+    from warp_ar.viewer.server import Server
+
+AXES: Final = ("y-up", "z-up", "blender", "opengl")
+LAYOUTS: Final = ("latlong", "cube")
+
+WATCH_SECONDS: Final = 5.0
+"""How long a request keeps frames going."""
+PUSH_SECONDS: Final = 0.1
+"""How often the channel looks for changes; the light itself is looked at four times a second."""
+MOST_LISTENERS: Final = 8
+LARGEST_FACE: Final = 1024
+
+
+class SharedLight:
+    """The routes of one server."""
+
+    def __init__(self, server: Server) -> None:
+        """Add them to the server's application."""
+        self._server = server
+        self._watching: asyncio.TimerHandle | None = None
+        self._listeners = 0
+        server.app.add_routes(
+            [
+                web.get("/light.json", self._json),
+                web.get("/light.{kind:exr|hdr}", self._picture),
+                web.get("/light/{face:[pn][xyz]}.hdr", self._face),
+                web.get("/light", self._channel),
+            ]
+        )
+
+    # ------------------------------------------------------------------------------------------------------- requests
+
+    async def _state(self) -> LightState:
+        host = await self._server._started()
+        self._keep_watching()
+        state = host.light_state()
+        if state is None:
+            raise web.HTTPConflict(
+                text="the environment is not captured: no stage of this scene reads it, or the marker was not seen\n"
+            )
+        return state
+
+    def _keep_watching(self) -> None:
+        """Count as a viewer from now on for some seconds."""
+        if self._watching is None:
+            self._server.host.watch(1)
+        else:
+            self._watching.cancel()
+        self._watching = asyncio.get_running_loop().call_later(WATCH_SECONDS, self._rest)
+
+    def _rest(self) -> None:
+        self._watching = None
+        self._server.host.watch(-1)
+
+    async def _json(self, request: web.Request) -> web.Response:
+        axes = _axes(request)
+        state = await self._state()
+        latest = self._server.host.latest
+        pose = None if latest is None else latest.pose
+        from warp_ar.viewer.light_record import describe
+
+        return web.json_response(await self._made(describe, state, pose, axes))
+
+    async def _picture(self, request: web.Request) -> web.Response:
+        layout, size = request.query.get("layout", "latlong"), _size(request)
+        axes, kind = _axes(request), request.match_info["kind"]
+        if layout not in LAYOUTS:
+            raise web.HTTPBadRequest(text=f"layout = {layout!r}: expected {' or '.join(LAYOUTS)}\n")
+        state = await self._state()
+
+        from warp_ar.viewer.light_record import encode_picture
+
+        return self._answer(await self._made(encode_picture, state, kind, axes, layout, size), kind)
+
+    async def _face(self, request: web.Request) -> web.Response:
+        axes, size = _axes(request), _size(request)
+        state = await self._state()
+        from warp_ar.viewer.light_record import encode_face
+
+        return self._answer(await self._made(encode_face, state, axes, size, request.match_info["face"]), "hdr")
+
+    async def _made(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        """What a function makes beside the loop; what it refuses is the request's fault."""
+        try:
+            return await self._server._aside(make, *arguments)
+        except WarpArError as error:
+            raise web.HTTPBadRequest(text=f"{error}\n") from error
+
+    @staticmethod
+    def _answer(body: bytes, kind: str) -> web.Response:
+        types = {"exr": "image/x-exr", "hdr": "image/vnd.radiance"}
+        return web.Response(body=body, headers={"Content-Type": types[kind]})
+
+    # -------------------------------------------------------------------------------------------------------- channel
+
+    async def _channel(self, request: web.Request) -> web.StreamResponse:
+        axes = _axes(request)
+        if self._listeners >= MOST_LISTENERS:
+            return web.Response(status=503, text=f"{MOST_LISTENERS} programs listen already\n")
+        if not await self._server._may_come(request.remote or ""):
+            return web.Response(status=429, text="too many connections\n")
+        await self._server._started()
+        socket = web.WebSocketResponse(max_msg_size=1024, heartbeat=30.0, compress=False)
+        await socket.prepare(request)
+        self._server.gate.upgrade(request)
+        self._listeners += 1
+        self._server.host.watch(1)
+        pusher = asyncio.create_task(self._push(socket, axes))
+        try:
+            async for message in socket:
+                if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+                    await socket.close(code=1008, message=b"this channel takes no messages")
+        finally:
+            self._listeners -= 1
+            self._server.host.watch(-1)
+            pusher.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await pusher
+        return socket
+
+    async def _push(self, socket: web.WebSocketResponse, axes: str) -> None:
+        """Send what has changed; a listener that takes nothing is closed by the heartbeat."""
+        from warp_ar.viewer.light_record import describe
+
+        sent: tuple[Any, ...] = ()
+        while not socket.closed:
+            host = self._server.host
+            state, latest = host.light_state(), host.latest
+            pose = None if latest is None else latest.pose
+            now = (state, None if pose is None else (*pose.rotation.ravel(), *pose.translation))
+            if state is not None and (not sent or now[0] is not sent[0] or now[1] != sent[1]):
+                sent = now
+                content = await self._server._aside(describe, state, pose, axes)
+                await socket.send_str(json.dumps(content))
+            await asyncio.sleep(PUSH_SECONDS)
+
+
+def _axes(request: web.Request) -> str:
+    axes = request.query.get("axes", "y-up")
+    if axes not in AXES:
+        raise web.HTTPBadRequest(text=f"axes = {axes[:40]!r}: expected {', '.join(AXES)}\n")
+    return axes
+
+
+def _size(request: web.Request) -> int | None:
+    text = request.query.get("size")
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit() and len(text) < 6 and 1 <= int(text) <= LARGEST_FACE):
+        raise web.HTTPBadRequest(text=f"size = {text[:40]!r}: expected 1 to {LARGEST_FACE} texels\n")
+    return int(text)
+
+
+def check_origin(origin: str) -> str:
+    """An origin that may ask for the light, as browsers name it.
+
+    Raises:
+        UsageError: It is none.
+    """
+    scheme, _, rest = origin.partition("://")
+    if scheme not in ("http", "https") or not rest or any(c in rest for c in "/?#*@ "):
+        raise UsageError(f"--allow-origin {origin}: expected an origin such as http://localhost:5173, without a path")
+    return origin
