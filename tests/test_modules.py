@@ -1,8 +1,10 @@
-<<<<<<< HEAD
-"""Compiling side by side: headers that are parsed once, kernels that need no translation to be found in the cache."""
+"""Compiling side by side: headers that are parsed once, what is left, kernels found in the cache untranslated."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,81 +15,6 @@ from warp_ar.device import resolve_device
 from warp_ar.engine import modules, scheduler
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels.launch import QUICK_TO_COMPILE
-
-
-@wp.kernel(module="unique", enable_backward=False)
-def usual_kernel(values_out: wp.array[wp.float32]):
-    values_out[wp.tid()] = 1.0
-
-
-@wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
-def quick_kernel(values_out: wp.array[wp.float32]):
-    values_out[wp.tid()] = 2.0
-
-
-def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path) -> None:
-    """The second kernel finds the headers of the first under the name that Warp looks for, and no third ones appear."""
-    device = resolve_device("cpu")
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    kernels = [usual_kernel, quick_kernel]
-    headers = modules._Headers({modules._flags(kernel.module) for kernel in kernels})
-
-    def names() -> set[str]:
-        from warp._src.context import runtime
-
-        return {path.name for path in Path(runtime.get_clang_pch_dir()).glob("*.pch")}
-
-    def compile_both() -> list[set[str]]:
-        seen = []
-        for kernel in kernels:
-            with headers.shared(modules._flags(kernel.module)):
-                seen.append(names())
-                modules._load(kernel.module, device)
-                seen.append(names())
-        return seen
-
-    with ThreadPoolExecutor(1) as thread:  # with headers of its own: none
-        before, first, second, after = thread.submit(compile_both).result()
-    assert (len(before), len(first), len(second)) == (0, 1, 2)
-    assert after == second
-    values = wp.zeros(1, dtype=wp.float32, device="cpu")
-    wp.launch(quick_kernel, 1, outputs=[values], device="cpu")
-    assert values.numpy() == 2.0
-
-
-def test_flags_of_clang_part_headers() -> None:
-    usual, quick = str(wp.config.cpu_compiler_flags), QUICK_TO_COMPILE["cpu_compiler_flags"]
-    assert modules._clang_flags(usual) == modules._clang_flags(quick) == ["-march=native"]
-    assert modules._clang_flags("-mavx2 -mllvm=-x=1") == ["-mavx2"]
-
-
-class _Listed(Exception):
-    """The kernels of a plan are known."""
-
-
-@pytest.mark.parametrize("quality", ["low", "medium", "high"])
-def test_no_kernel_is_translated_to_tell_whether_it_is_cached(monkeypatch, quality) -> None:
-    """Warp would, at every start, for values of ``wp.static`` that hang on a loop's variable."""
-    found: list[wp.Kernel] = []
-
-    def listed(kernels, device, progress=None):
-        found.extend(kernels)
-        raise _Listed
-
-    monkeypatch.setattr(scheduler, "load_modules", listed)
-    with Pipeline("desk", device="cpu", quality=quality) as pipeline, pytest.raises(_Listed):
-        pipeline.warm_up()
-    assert found
-    assert [kernel.key for kernel in found if kernel.adj.has_unresolved_static_expressions] == []
-=======
-"""Compiling side by side, and what it leaves."""
-
-from __future__ import annotations
-
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 SCRIPT = """
 import pathlib, tempfile
@@ -138,4 +65,70 @@ def test_what_warp_keeps_for_a_thread_goes_with_it(tmp_path: Path) -> None:
     assert list(temporary.glob("wp_pch_*")) == []
     (headers,) = (tmp_path / "cache").glob("**/headers_*")
     assert [path.suffix for path in headers.iterdir()] == [".pch"]
->>>>>>> main
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def usual_kernel(values_out: wp.array[wp.float32]):
+    values_out[wp.tid()] = 1.0
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+def quick_kernel(values_out: wp.array[wp.float32]):
+    values_out[wp.tid()] = 2.0
+
+
+def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path) -> None:
+    """The second kernel finds the headers of the first under the name that Warp looks for, and no third ones appear."""
+    device = resolve_device("cpu")
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    kernels = [usual_kernel, quick_kernel]
+    headers = modules._Headers({modules._flags(kernel.module) for kernel in kernels})
+
+    def names() -> set[str]:
+        from warp._src.context import runtime
+
+        return {path.name for path in Path(runtime.get_clang_pch_dir()).glob("*.pch")}
+
+    def compile_both() -> list[set[str]]:
+        seen = []
+        for kernel in kernels:
+            with headers.shared(modules._flags(kernel.module)):
+                seen.append(names())
+                modules._load(kernel.module, device)
+                seen.append(names())
+        return seen
+
+    with ThreadPoolExecutor(1) as thread:  # with headers of its own: none
+        before, first, second, after = thread.submit(compile_both).result()
+    headers.close()
+    assert (len(before), len(first), len(second)) == (0, 1, 2)
+    assert after == second
+    values = wp.zeros(1, dtype=wp.float32, device="cpu")
+    wp.launch(quick_kernel, 1, outputs=[values], device="cpu")
+    assert values.numpy() == 2.0
+
+
+def test_flags_of_clang_part_headers() -> None:
+    usual, quick = str(wp.config.cpu_compiler_flags), QUICK_TO_COMPILE["cpu_compiler_flags"]
+    assert modules._clang_flags(usual) == modules._clang_flags(quick) == ["-march=native"]
+    assert modules._clang_flags("-mavx2 -mllvm=-x=1") == ["-mavx2"]
+
+
+class _Listed(Exception):
+    """The kernels of a plan are known."""
+
+
+@pytest.mark.parametrize("quality", ["low", "medium", "high"])
+def test_no_kernel_is_translated_to_tell_whether_it_is_cached(monkeypatch, quality) -> None:
+    """Warp would, at every start, for values of ``wp.static`` that hang on a loop's variable."""
+    found: list[wp.Kernel] = []
+
+    def listed(kernels, device, progress=None):
+        found.extend(kernels)
+        raise _Listed
+
+    monkeypatch.setattr(scheduler, "load_modules", listed)
+    with Pipeline("desk", device="cpu", quality=quality) as pipeline, pytest.raises(_Listed):
+        pipeline.warm_up()
+    assert found
+    assert [kernel.key for kernel in found if kernel.adj.has_unresolved_static_expressions] == []

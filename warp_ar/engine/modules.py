@@ -53,7 +53,8 @@ def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress |
 def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
     cores = usable_cores()
     headers = _Headers({_flags(module) for module in modules}) if device.is_cpu else None
-    modules = sorted(modules, key=_is_quick)
+
+    modules = sorted(modules, key=_has_flags)
 
     def work(module: Any) -> None:
         with headers.shared(_flags(module)) if headers is not None else contextlib.nullcontext():
@@ -81,7 +82,7 @@ def _flags(module: Any) -> str:
     return str(wp.config.cpu_compiler_flags if own is None else own)
 
 
-def _is_quick(module: Any) -> bool:
+def _has_flags(module: Any) -> bool:
     return module.options.get("cpu_compiler_flags") is not None
 
 
@@ -103,21 +104,16 @@ class _Headers:
     differ in them alone share one. Where this Warp keeps or names headers otherwise, each thread parses them.
     """
 
-<<<<<<< HEAD
     def __init__(self, flags: Iterable[str]) -> None:
         """Find what is there, that of the caller's thread too.
 
         Args:
             flags: Of the modules that will be compiled.
         """
-        runtime = getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
-=======
-    def __init__(self) -> None:
->>>>>>> main
+        self._flags = {*flags, str(wp.config.cpu_compiler_flags)}
         self._folder_of_thread = (
             getattr(_runtime(), "get_clang_pch_dir", None) if wp.config.use_precompiled_headers else None
         )
-        self._flags = {*flags, str(wp.config.cpu_compiler_flags)}
         builtin = Path(wp.__file__).parent / "native" / "builtin.h"
         self._lock = threading.Lock()
         self._first: int | None = None
@@ -130,8 +126,10 @@ class _Headers:
         stat = builtin.stat()
         key = f"{wp.__version__} {builtin} {stat.st_mtime_ns} {stat.st_size} {wp.config.cpu_compiler_flags}"
         self._store = Path(wp.config.kernel_cache_dir) / f"headers_{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-        if not _headers_in(self._store):
-            _copy_headers(Path(self._folder_of_thread()), self._store)
+        folders = getattr(_runtime(), "_pch_dirs", None)
+        parsed = folders.get(threading.get_ident()) if isinstance(folders, dict) else None
+        if parsed is not None and not _headers_in(self._store):
+            _copy_headers(Path(parsed.name), self._store)
 
     @contextlib.contextmanager
     def shared(self, flags: str) -> Any:
@@ -149,21 +147,14 @@ class _Headers:
             first = self._first is None and not _headers_in(own) and not _headers_in(self._store)
             if first:
                 self._first = threading.get_ident()
-<<<<<<< HEAD
-                watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
-        if first:
-            watcher.start()
-        else:
-            if self._first is not None and not _headers_in(own):
-=======
                 self._parsing = own
                 self._watcher = threading.Thread(target=self._keep, args=(own,), daemon=True)
                 self._watcher.start()
-        if not first and not _headers_in(own):
-            if self._first is not None:
->>>>>>> main
-                self._parsed.wait(_HEADER_WAIT)
-            _copy_headers(self._store, own)
+        if not first:
+            if not _headers_in(own):
+                if self._first is not None:
+                    self._parsed.wait(_HEADER_WAIT)
+                _copy_headers(self._store, own)
             self._rename(own, flags)
         yield
 
@@ -175,7 +166,6 @@ class _Headers:
         _copy_headers(own, self._store)
         self._parsed.set()
 
-<<<<<<< HEAD
     def _rename(self, own: Path, flags: str) -> None:
         """Have headers that were parsed with other flags of LLVM found with these."""
         wanted = _digest(flags)
@@ -188,20 +178,6 @@ class _Headers:
                     if _digest(other) in path.name:
                         _copy_file(path, own / path.name.replace(_digest(other), wanted))
 
-
-def _clang_flags(flags: str) -> list[str]:
-    """Flags without those of LLVM and of its passes."""
-    words = flags.split()
-    return [word for word in words if not word.startswith("-mllvm=") and not word.endswith("vectorize")]
-
-
-def _digest(flags: str) -> str:
-    """By which Warp names headers: FNV-1a of the flags, a zero byte behind each."""
-    value = 0xCBF29CE484222325
-    for byte in "".join(f"{word}\0" for word in flags.split()).encode():
-        value = (value ^ byte) * 0x100000001B3 % (1 << 64)
-    return f"{value:016x}"
-=======
     def close(self) -> None:
         """When the threads are done: remove what Warp keeps for each of them."""
         self._over.set()
@@ -239,7 +215,19 @@ def remove_header_folders(threads: Iterable[int] | None = None) -> None:
 def _runtime() -> Any:
     """What Warp keeps for the process; None before it is initialised, or where this Warp keeps it elsewhere."""
     return getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None)
->>>>>>> main
+
+
+def _clang_flags(flags: str) -> list[str]:
+    """Flags without those of LLVM and of its passes."""
+    return [word for word in flags.split() if not word.startswith("-mllvm=") and not word.endswith("vectorize")]
+
+
+def _digest(flags: str) -> str:
+    """By which Warp names headers: FNV-1a of the flags, a zero byte behind each."""
+    value = 0xCBF29CE484222325
+    for byte in "".join(f"{word}\0" for word in flags.split()).encode():
+        value = (value ^ byte) * 0x100000001B3 % (1 << 64)
+    return f"{value:016x}"
 
 
 def _headers_in(folder: Path) -> list[Path]:
@@ -248,12 +236,10 @@ def _headers_in(folder: Path) -> list[Path]:
 
 def _copy_headers(source: Path, target: Path) -> None:
     """Copy parsed headers; a file appears whole or not at all. A full or foreign disk only costs the time again."""
-    headers = _headers_in(source)
     with contextlib.suppress(OSError):
-        if headers:
-            target.mkdir(parents=True, exist_ok=True)
-        for path in headers:
+        for path in _headers_in(source):
             if not (target / path.name).exists():
+                target.mkdir(parents=True, exist_ok=True)
                 _copy_file(path, target / path.name)
 
 
