@@ -1,20 +1,27 @@
 """The path tracer on bundled scenes: rays a second beside the bare rate, and the time to an error of 1 %.
 
-Bare is one ray through the middle of every pixel to the first surface, nothing else. The time to 1 % is that of the
-samples that were taken times the square of their error over 1 %: what is left falls with the root of their number.
+Bare is one ray through the middle of every pixel to the first surface, objects included, and nothing else. The time to
+1 % is that of the samples that were taken times the square of their error over 1 %: what is left falls with the root of
+their number.
 """
 
 from __future__ import annotations
 
+import functools
 import statistics
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import warp as wp
 
-from bench.common import measure, report
+from bench.common import measure, report, time_once
 from warp_ar.accuracy.known_frame import light_up_to
-from warp_ar.accuracy.path_tracer import PathTracer
+from warp_ar.accuracy.path_tracer import BAND, PathTracer
+from warp_ar.device import usable_cores
 from warp_ar.kernels import path_tracer
+from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")
@@ -28,9 +35,47 @@ SAMPLES = 64
 WANTED = 0.01
 
 
-def primary(tracer: PathTracer) -> None:
-    """One ray per pixel."""
-    path_tracer.find_shown(tracer._trace, tracer._params, tracer._local, tracer._local.shown)
+@functools.cache
+def make_primary_kernel(trace: TraceConfig) -> wp.Kernel:
+    find_vertex = path_tracer.make_find_vertex(trace)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def primary_kernel(
+        row_start: wp.int32, params: wp.array[FrameParams], scene: path_tracer.LocalScene, depth: wp.array2d[wp.float32]
+    ):
+        i, j = wp.tid()
+        i += row_start
+        ray = scene.picture.rays[i, j]
+        direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+        depth[i, j] = find_vertex(scene, params[0].camera_position, direction, True).hit.t
+
+    return primary_kernel
+
+
+class Primary:
+    """One ray per pixel, by as many threads as paths are followed by."""
+
+    def __init__(self, tracer: PathTracer) -> None:
+        self.tracer = tracer
+        self.shape = tracer.camera.height, tracer.camera.width
+        self.depth = wp.zeros(self.shape, dtype=wp.float32, device=tracer.device)
+        self.kernel = make_primary_kernel(tracer._trace)
+
+    def launch(self, rows: tuple[int, int] | None) -> None:
+        """A band of rows."""
+        inputs = [self.tracer._params, self.tracer._local]
+        launch_rows(self.kernel, self.shape, inputs, [self.depth], rows=rows, device=self.tracer.device)
+
+    def __call__(self) -> None:
+        """All rows."""
+        if not self.tracer.device.is_cpu:
+            self.launch(None)
+            return
+        self.launch((0, 1))
+        height = self.shape[0]
+        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+        with ThreadPoolExecutor(usable_cores()) as pool:
+            list(pool.map(self.launch, bands))
 
 
 def main(device: str) -> None:
@@ -44,7 +89,7 @@ def main(device: str) -> None:
         assert 0.01 < changed.mean() < 0.9, "virtual things are not in the picture"
         pixels = SIZES[kind][0] * SIZES[kind][1]
         before, samples = tracer.rays(), tracer.samples
-        contenders = {"paths": lambda t=tracer: t.sample(STEPS[kind]), "bare": lambda t=tracer: primary(t)}
+        contenders = {"paths": lambda t=tracer: t.sample(STEPS[kind]), "bare": Primary(tracer)}
         times = _measure(contenders, device)
         rays = (tracer.rays() - before) / (tracer.samples - samples) * STEPS[kind]
         rate = rays / (statistics.median(times["paths"]) * 1e-3)
@@ -71,8 +116,6 @@ def _encoded(tracer: PathTracer) -> np.ndarray:
 
 def _measure(contenders: dict, device: str) -> dict[str, list[float]]:
     """In turn; by the clock of the host on CUDA as well, for sampling counts what is done."""
-    from bench.common import time_once
-
     if wp.get_device(device).is_cpu:
         return measure(contenders, device, runs=RUNS)
     times: dict[str, list[float]] = {name: [] for name in contenders}

@@ -6,11 +6,15 @@ SCENE is a bundled scene, or the scene file of a case of truth (``scene_VERSION.
 frames up to N run through the pipeline; its picture of that frame, averaged down, is compared with the reference that
 follows paths in the light that the pipeline had. One JSON line per scene and quality:
 
-  nothing    mean FLIP of the camera's frame to the reference, where the reference differs from it
+  nothing    root mean square difference of the camera's frame to the reference, in codes, where the latter differs
   lost       the same of the pipeline's picture
-  half       the same between the reference's first and second half of samples: its noise, twice over
   kept       lost / nothing
-  truth_*    kept of the error to the truth, by the pipeline and by the reference
+  flip_*     nothing and lost as mean FLIP; flip_half between two halves of the reference's samples: its noise
+  truth_*    kept of the difference to the truth, by the pipeline and by the reference
+
+Differences are those of means over blocks of BLOCK x BLOCK pixels in linear light, encoded. Noise of the reference is
+taken out of them: of a difference d1 to one half of its samples and d2 to the other, the mean of d1 d2 is that of the
+square of the difference to what both converge to.
 """
 
 from __future__ import annotations
@@ -28,10 +32,16 @@ import numpy.typing as npt
 from bench.common import commit
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Scene, load_scene
 from warp_ar.session import with_light
 
 Image = npt.NDArray[np.uint8]
+
+BLOCK = 3
+"""Pixels to each side of a block."""
+CHANGED = 2.0
+"""Codes from which on a block differs from the camera's frame."""
 
 
 def averaged(image: Image, size: tuple[int, int]) -> Image:
@@ -48,6 +58,29 @@ def truth_of(scene: Scene, frame: int) -> Image | None:
     return None if image is None else np.asarray(image[..., ::-1], np.uint8)
 
 
+def blocks_of(radiance: npt.NDArray[np.float32], known: KnownFrame) -> npt.NDArray[np.float64]:
+    """Means over blocks in linear light as the camera clips it, in codes, not rounded."""
+    table = decode_table(known.scene.camera.transfer).astype(np.float64)
+    rows, columns = (side // BLOCK for side in radiance.shape[:2])
+    cut = np.clip(radiance[: rows * BLOCK, : columns * BLOCK].astype(np.float64), 0.0, 1.0)
+    mean = cut.reshape(rows, BLOCK, columns, BLOCK, 3).mean(axis=(1, 3))
+    return np.stack([np.interp(mean[..., c], table[:, c], np.arange(256.0)) for c in range(3)], axis=-1)
+
+
+def decoded(image: Image, known: KnownFrame) -> npt.NDArray[np.float32]:
+    """Linear radiance of codes."""
+    table = decode_table(known.scene.camera.transfer)
+    return np.stack([table[image[..., c], c] for c in range(3)], axis=-1)
+
+
+def difference(
+    test: npt.NDArray[np.float64], halves: list[npt.NDArray[np.float64]], where: npt.NDArray[np.bool_]
+) -> float:
+    """Root mean square difference to what two halves converge to, in codes."""
+    product = ((test - halves[0]) * (test - halves[-1]))[where]
+    return float(np.sqrt(max(product.mean(), 0.0)))
+
+
 def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, device: str) -> dict[str, Any]:
     """Errors of one quality on one scene."""
     camera = known.scene.camera
@@ -62,27 +95,32 @@ def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, devi
     reference = encoded(linear, known)
     region = changed_region(frame, reference)
     nothing, lost = (float(flip_map(reference, image)[region].mean()) for image in (frame, lit))
+    traced = [blocks_of(half.radiance, known) for half in halves]
+    seen, shown = (blocks_of(decoded(image, known), known) for image in (frame, lit))
+    apart = np.abs(seen - 0.5 * (traced[0] + traced[1])).max(axis=2) > CHANGED
+    before = difference(seen, traced, apart)
+    after = difference(shown, traced, apart)
     row: dict[str, Any] = {
-        "nothing": round(nothing, 4),
-        "lost": round(lost, 4),
-        "half": round(float(flip_map(halves[0].image, halves[1].image)[region].mean()), 4),
-        "kept": round(lost / nothing, 3),
+        "nothing": round(before, 2),
+        "lost": round(after, 2),
+        "kept": round(after / before, 3),
+        "flip_nothing": round(nothing, 4),
+        "flip_lost": round(lost, 4),
+        "flip_half": round(float(flip_map(halves[0].image, halves[1].image)[region].mean()), 4),
         "seconds": round(sum(half.seconds for half in halves), 1),
         "pipeline_ms": round(known.milliseconds, 1),
     }
     if truth is not None:
-        true = averaged(truth, size)
-        changed = changed_region(frame, true)
-        before = flip_map(true, frame)[changed].mean()
-        for name, image in (("pipeline", lit), ("reference", reference)):
-            row[f"truth_{name}"] = round(float(flip_map(true, image)[changed].mean() / before), 3)
+        true = blocks_of(decoded(averaged(truth, size), known), known)
+        changed = np.abs(seen - true).max(axis=2) > CHANGED
+        before = difference(seen, [true], changed)
+        row["truth_pipeline"] = round(difference(shown, [true], changed) / before, 3)
+        row["truth_reference"] = round(difference(true, traced, changed) / before, 3)
     return row
 
 
 def encoded(radiance: npt.NDArray[np.float32], known: KnownFrame) -> Image:
     """Codes of linear radiance by the camera's transfer."""
-    from warp_ar.kernels.color import decode_table
-
     table = decode_table(known.scene.camera.transfer)
     edges = 0.5 * (table[:-1] + table[1:])
     codes = [np.searchsorted(edges[:, c], radiance[..., c], side="right") for c in range(3)]

@@ -21,6 +21,7 @@ COMMANDS = (
     "environment",
     "export",
     "explain",
+    "farm.cli",
     "tradeoff",
     "paper",
     "reference",
@@ -40,6 +41,7 @@ def command_line() -> str:
     parts = []
     for name in COMMANDS:
         parser = importlib.import_module(f"warp_ar.{name}").make_parser()
+        name = name.removesuffix(".cli")  # of a package that is a command
         parts += [f"## `python -m warp_ar.{name}`", "", parser.description or "", "", *_options(parser)]
         for action in parser._actions:
             if isinstance(action, argparse._SubParsersAction):

@@ -29,6 +29,11 @@ Its variance is, to first order, that of z + rho g - b e, b = rho g / e (0 where
 number of samples: so moments of the three are summed. Deeper in a path, reflectance is read from a map that was made
 before, of E averaged over 5 x 5 pixels of one surface; of a point that no pixel shows it is the mean of its proxy.
 
+**Toward objects.** A difference begins where a path meets a virtual object, and most of what mirrors and metals throw
+onto matt surfaces comes by few directions. So a matt surface draws one direction in ``GUIDED`` toward the bounding
+sphere of a virtual object, evenly within its cone, or toward a ball. The density of every direction is then that of the
+mixture, (1 - q) p + q sum [within cone k] / (n Omega_k), Omega the cone's solid angle.
+
 Where no frame is given, all paths are whole, and proxies have the reflectance that they are given.
 
 References:
@@ -50,6 +55,7 @@ from warp_ar.kernels.path_sampling import (
     ALL_MODELS,
     NO_DENSITY,
     STREAMS,
+    Drawn,
     PathKey,
     Sky,
     balance,
@@ -57,6 +63,7 @@ from warp_ar.kernels.path_sampling import (
     draw_reflected,
     draw_sky,
     lights_in_the_way,
+    lobe_chance,
     near_radiance,
     random_triple,
     reflect_direct,
@@ -65,10 +72,10 @@ from warp_ar.kernels.path_sampling import (
 )
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.relight import reflectance_of
-from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
+from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import MIN_FACING
 from warp_ar.kernels.shadow import has_penumbra, sample_light
-from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Light, Picture, Probe, RayScene
+from warp_ar.kernels.structs import LAMBERT, MIRROR, SPHERE, FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, ROUNDING, Hit, TraceConfig, intersect_sphere, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
@@ -86,6 +93,10 @@ MOST_SURVIVAL = wp.constant(wp.float32(0.95))
 """Chance to go on, at most."""
 LEAST_WEIGHT = wp.constant(wp.float32(0.25))
 """Of the frame's four pixels around a point, what those of its surface must have for the frame to show it."""
+GUIDED = wp.constant(wp.float32(0.5))
+"""Share of directions that a matt surface draws toward objects and balls."""
+LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
+"""Of a cone: half an angle of 0.08 degrees."""
 SMOOTHED = wp.constant(2)
 """Pixels to each side over which irradiance is averaged for the map of reflectance."""
 PICK = wp.constant(0)
@@ -291,6 +302,109 @@ def make_look_up_material() -> wp.Function:
 
 
 @wp.func
+def guide_sphere(scene: LocalScene, k: wp.int32) -> wp.vec4:
+    """Centre and radius of a sphere around virtual object number k, or after these around a ball."""
+    count = scene.rays.objects.shape[0]
+    if k < count:
+        shape = scene.rays.objects[k]
+        radius = wp.length(shape.extent)
+        if shape.kind == wp.static(int(SPHERE)):
+            radius = shape.extent[0]
+        return wp.vec4(shape.position[0], shape.position[1], shape.position[2], shape.scale * radius)
+    probe = scene.probes[k - count]
+    return wp.vec4(probe.center[0], probe.center[1], probe.center[2], probe.radius)
+
+
+@wp.func
+def guide_count(scene: LocalScene, changes_only: wp.bool) -> wp.int32:
+    """Spheres that directions are drawn to: those of balls show what is there anyway, which changes nothing."""
+    if changes_only:
+        return scene.rays.objects.shape[0]
+    return scene.rays.objects.shape[0] + scene.probes.shape[0]
+
+
+@wp.func
+def guided_chance(scene: LocalScene, surface: Surface, changes_only: wp.bool) -> wp.float32:
+    """Chance of a direction to be drawn toward an object or a ball."""
+    if guide_count(scene, changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
+        return 0.0
+    return GUIDED * (1.0 - lobe_chance(surface))
+
+
+@wp.func
+def cone_versine(sphere: wp.vec4, point: wp.vec3) -> wp.float32:
+    """1 - cosine of the half angle under which a sphere is seen; 2, all directions, from within."""
+    away = wp.vec3(sphere[0], sphere[1], sphere[2]) - point
+    square = wp.dot(away, away)
+    radius = sphere[3] * sphere[3]
+    if square <= radius:
+        return 2.0
+    sine = radius / square
+    return wp.max(sine / (1.0 + wp.sqrt(1.0 - sine)), LEAST_VERSINE)
+
+
+@wp.func
+def guide_density(scene: LocalScene, point: wp.vec3, direction: wp.vec3, changes_only: wp.bool) -> wp.float32:
+    """Density with which ``draw_guide`` gives a direction."""
+    count = guide_count(scene, changes_only)
+    density = float(0.0)
+    for k in range(count):
+        sphere = guide_sphere(scene, k)
+        versine = cone_versine(sphere, point)
+        axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
+        off = axis - direction
+        # |a - b|^2 / 2 is 1 - cos, without its cancellation.
+        if 0.5 * wp.dot(off, off) <= versine:
+            density += 1.0 / (2.0 * wp.pi * versine)
+    return density / wp.float32(wp.max(count, 1))
+
+
+@wp.func
+def draw_guide(scene: LocalScene, point: wp.vec3, pick: wp.float32, u: wp.vec2, changes_only: wp.bool) -> wp.vec3:
+    """Direction toward an object or a ball."""
+    count = guide_count(scene, changes_only)
+    sphere = guide_sphere(scene, wp.min(wp.int32(pick * wp.float32(count)), count - 1))
+    versine = u[0] * cone_versine(sphere, point)
+    sine = wp.sqrt(wp.max(versine * (2.0 - versine), 0.0))
+    phi = 2.0 * wp.pi * u[1]
+    axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
+    return wp.normalize(frame_from_normal(axis) * wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - versine))
+
+
+@wp.func
+def next_density(
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, wi: wp.vec3, changes_only: wp.bool
+) -> wp.float32:
+    """Density with which ``draw_next`` gives a direction."""
+    chance = guided_chance(scene, surface, changes_only)
+    density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
+    if chance > 0.0:
+        density += chance * guide_density(scene, hit.point, wi, changes_only)
+    return density
+
+
+@wp.func
+def draw_next(
+    scene: LocalScene, hit: Hit, surface: Surface, wo: wp.vec3, pick: wp.vec3, u: wp.vec2, changes_only: wp.bool
+) -> Drawn:
+    """Direction in which a path goes on, with its weight and density; ``pick``'s first and last number choose how."""
+    chance = guided_chance(scene, surface, changes_only)
+    if chance <= 0.0:
+        return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
+    drawn = Drawn()
+    if pick[2] < chance:
+        drawn.direction = draw_guide(scene, hit.point, pick[2] / chance, u, changes_only)
+    else:
+        drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
+    wi = drawn.direction
+    drawn.weight = wp.vec3(0.0, 0.0, 0.0)
+    if wp.dot(wi, hit.geometric_normal) > 0.0:
+        drawn.density = next_density(scene, hit, surface, wo, wi, changes_only)
+        drawn.weight = reflect_direct(surface, hit.normal, wo, wi) / wp.max(drawn.density, 1.0e-20)
+    return drawn
+
+
+@wp.func
 def is_turned(vertex: Vertex, direction: wp.vec3) -> wp.bool:
     """Whether a ray meets a surface from behind."""
     return wp.dot(vertex.hit.geometric_normal, direction) >= 0.0
@@ -383,16 +497,21 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
 
 @functools.cache
 def make_virtual_light(trace: TraceConfig) -> wp.Function:
-    """``virtual_light(scene, vertex, surface, wo, key, k) -> Carried``: reflected radiance of all virtual lights."""
+    """``virtual_light(scene, hit, surface, wo, changes_only, key, k) -> Carried``: reflected, of all virtual lights."""
     hidden_by_physical = make_hidden_by_physical(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
 
     @wp.func(module="unique")
     def virtual_light(
-        scene: LocalScene, vertex: Vertex, surface: Surface, wo: wp.vec3, key: PathKey, k: wp.int32
+        scene: LocalScene,
+        hit: Hit,
+        surface: Surface,
+        wo: wp.vec3,
+        changes_only: wp.bool,
+        key: PathKey,
+        k: wp.int32,
     ) -> Carried:
         carried = Carried()
-        hit = vertex.hit
         for index in range(scene.lights.shape[0]):
             light = sample_light(scene.lights[index], hit.point)
             if wp.max(light.irradiance_normal) > 0.0:
@@ -412,7 +531,7 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
                                 cosine = light.distance / away[3]
                                 radius = scene.lights[index].radius
                                 own = away[3] * away[3] / (wp.pi * radius * radius * cosine)
-                                share = balance(own, surface_density(surface, hit.normal, wo, wi))
+                                share = balance(own, next_density(scene, hit, surface, wo, wi, changes_only))
                             carried.radiance += share * wp.cw_mul(reflected, light.irradiance_normal)
         return carried
 
@@ -474,7 +593,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                     start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
                     carried.rays += 1
                     if not hidden_by_physical(scene, start, sky.direction, sky.distance):
-                        other = surface_density(surface, hit.normal, wo, sky.direction)
+                        other = next_density(scene, hit, surface, wo, sky.direction, changes_only)
                         share = balance(sky.density, other) / sky.density
                         light = share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
                         if is_white:
@@ -486,12 +605,12 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                             elif not changes_only:
                                 carried.radiance += light
                 if not only_light:
-                    lit = virtual_light(scene, vertex, surface, wo, key, k)
+                    lit = virtual_light(scene, hit, surface, wo, changes_only, key, k)
                     carried.radiance += wp.cw_mul(weight, lit.radiance)
                     carried.rays += lit.rays
             u = random_triple(key, k, SCATTER)
             pick = random_triple(key, k, PICK)
-            drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
+            drawn = draw_next(scene, hit, surface, wo, pick, wp.vec2(u[0], u[1]), changes_only)
             weight = wp.cw_mul(weight, drawn.weight)
             if wp.max(weight) <= 0.0:
                 return carried

@@ -22,7 +22,7 @@ from warp_ar.farm.cli import main
 from warp_ar.farm.status import read_status
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PATIENCE = 240.0
+PATIENCE = 580.0
 """Seconds after which a run that should have ended has hung."""
 
 RECORDINGS = """

@@ -12,7 +12,7 @@ from warp_ar.farm.driver import INTERRUPTIONS, Driver
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.manifest import RECORD, Manifest, RunError
 from warp_ar.farm.pool import Event
-from warp_ar.farm.work import Outcome
+from warp_ar.farm.records import Outcome
 
 VERSION = "warp_ar 1"
 FRAMES = 10

@@ -14,7 +14,8 @@ from tests.farm_rig import SIZE, make_jobs, write_recording
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.labels import DEPTH_SCALE, _harmonics, run_lengths
-from warp_ar.farm.work import Context, Work
+from warp_ar.farm.records import Context
+from warp_ar.farm.work import Work
 from warp_ar.kernels.object_masks import trace_object_masks
 from warp_ar.scene import load_scene
 

@@ -13,8 +13,9 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.records import Context
 from warp_ar.farm.survey import Survey
-from warp_ar.farm.work import Context, Work
+from warp_ar.farm.work import Work
 from warp_ar.scene import Animation, dumps_scene, load_scene
 from warp_ar.session import Session
 
@@ -74,10 +75,11 @@ def test_segments_are_bit_equal_to_one_run_where_light_is_given(folder, light):
     assert np.abs(whole[0].astype(int) - whole[-1]).max() > 20, "the clip must show something that changes"
 
 
-def test_a_surveyed_clip_is_lit_as_a_live_one(folder):
-    jobs, run = surveyed(folder, light="follow")
+@pytest.mark.parametrize("quality", ["low", "medium"])  # medium knows emitters by their places
+def test_a_surveyed_clip_is_lit_as_a_live_one(folder, quality):
+    jobs, run = surveyed(folder, quality=quality)
     whole = lit_whole(jobs, run)
-    with Session(folder / "scene.toml", source=folder / "a.mp4", quality="low", device="cpu") as session:
+    with Session(folder / "scene.toml", source=folder / "a.mp4", quality=quality, device="cpu") as session:
         live = [result.image for _, result in session]
     for a, b in zip(whole, live, strict=True):
         assert np.abs(a.astype(int) - b).max() <= MOST_CODES
@@ -125,6 +127,15 @@ def test_a_survey_holds_light_until_it_moves(folder):
     assert radiance.shape == (64, 128, 3)
     assert emitters is None, "quality low finds no places of emitters"
     assert survey.pose(0) is not None
+
+
+def test_a_clock_is_started_before_the_first_frame():
+    image = np.zeros((480, 640, 3), np.uint8)
+    with Pipeline("torus", quality="low", device="cpu") as pipeline:
+        pipeline.start_clock(1.0)
+        pipeline(image, time_seconds=3.0)
+        with pytest.raises(UsageError, match="start_clock comes before the first frame"):
+            pipeline.start_clock(1.0)
 
 
 def test_restart_and_take_light_say_what_they_need():

@@ -16,6 +16,9 @@ from tests.test_sources import write_video
 from warp_ar.input.frame_folder import IMAGE_SUFFIXES
 from warp_ar.input.sources import open_source
 from warp_ar.output.environment_file import ENVIRONMENT_SUFFIXES
+from warp_ar.output.gltf_file import GLTF_SUFFIX
+from warp_ar.output.track_file import TRACK_SUFFIX
+from warp_ar.output.usd_file import USD_SUFFIXES
 from warp_ar.output.video_sink import VIDEO_SUFFIXES
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
 
@@ -36,7 +39,7 @@ def test_every_row_has_its_test(row: list[str]) -> None:
     assert len(row) == 4
     file, name = row[3].strip("`").split("::")
     tree = ast.parse((ROOT / "tests" / f"{file}.py").read_text(encoding="utf-8"))
-    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)}
 
 
 @pytest.mark.parametrize(
@@ -46,6 +49,8 @@ def test_every_row_has_its_test(row: list[str]) -> None:
         ("In", "mesh", MESH_SUFFIXES),
         ("Out", "lit frames", VIDEO_SUFFIXES),
         ("Out", "environment", ENVIRONMENT_SUFFIXES),
+        ("Out", "camera, surfaces, lights of a shot", (*USD_SUFFIXES, GLTF_SUFFIX)),
+        ("Out", "the camera's way", (TRACK_SUFFIX,)),
     ],
 )
 def test_every_ending_has_its_row(section: str, what: str, suffixes: tuple[str, ...]) -> None:

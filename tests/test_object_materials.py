@@ -16,7 +16,16 @@ from warp_ar.kernels.materials import make_surface
 from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
 from warp_ar.kernels.visibility import FAR, make_trace
-from warp_ar.scene import Camera, FileMaterial, LambertMaterial, Object, PhongMaterial, Scene, dumps_scene
+from warp_ar.scene import (
+    Camera,
+    FileMaterial,
+    LambertMaterial,
+    Object,
+    PhongMaterial,
+    Scene,
+    dumps_scene,
+    object_from_trimesh,
+)
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
 from warp_ar.scene.object_materials import look_of, reflects_diffusely, reflects_glossily
 from warp_ar.scene.ray_scene import HostScene, TraceConfig, trace_config
@@ -260,7 +269,7 @@ def test_meshes_in_memory(device, tmp_path):
     """A Trimesh is an object as it is; a scene file cannot say it."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     ball.visual.vertex_colors = [0, 255, 0, 255]
-    item = Object("mesh", mesh=mesh_from_trimesh(ball), at=(0.0, 1.0, 0.0))
+    item = object_from_trimesh(ball, at=(0.0, 1.0, 0.0))
     seen = look([item], [(0, -3, 0)], FORWARD, device)
     assert seen["t"][0] == pytest.approx(3.5, abs=0.01)
     np.testing.assert_allclose(seen["diffuse"][0], [0, 1, 0], atol=1e-6)

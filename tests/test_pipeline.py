@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_ar.engine.carried_light import resample_light
 from warp_ar.engine.pipeline import Pipeline, Result
-from warp_ar.errors import UsageError
+from warp_ar.errors import SceneError, UsageError
 from warp_ar.input.sources import Synthetic
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import (
@@ -338,6 +338,27 @@ def test_impossible_numbers_are_refused_and_the_next_frame_works(
             with pytest.raises(UsageError, match=re.escape(expected)):
                 call(frames[0], **arguments)
         assert run(pipeline, frames[:1])[0].state is TrackState.TRACKED
+
+
+def test_numbers_of_a_scene_that_are_not_finite_are_named(frames: Frames) -> None:
+    """A scene of a file cannot have any; one that was made in Python can, and every pixel would be one."""
+    good = make_scene(lights=(Light("point", 1.0, at=(0.0, 0.0, 0.4)),))
+    ball = dataclasses.replace(good.probes[0], radius=math.inf)
+    light = dataclasses.replace(good.lights[0], at=(0.0, math.nan, 0.4))
+    wrong = (
+        (dataclasses.replace(good, lights=(light,)), r"lights\[0\]\.at\[1\] = nan: expected a finite number"),
+        (dataclasses.replace(good, probes=(ball,)), r"probes\[0\]\.radius = inf"),
+        (dataclasses.replace(good, camera=dataclasses.replace(good.camera, fx=math.nan)), r"camera\.fx = nan"),
+    )
+    for scene, expected in wrong:
+        with pytest.raises(SceneError, match=expected):
+            Pipeline(scene, device="cpu", quality="low")
+    with Pipeline(good, device="cpu", quality="low") as pipeline:
+        before = pipeline(frames[0]).image.copy()
+        for scene, expected in wrong[:2]:
+            with pytest.raises(SceneError, match=expected):
+                pipeline.update(scene)
+        assert (pipeline(frames[0]).image == before).all()
 
 
 def test_impossible_exposures_are_refused(frames: Frames) -> None:

@@ -320,6 +320,22 @@ MADE_TO_HURT: dict[tuple[str, str], bytes] = {
     ),
     ("mesh, glTF", "-1 vertices"): _gltf(accessors=[{"componentType": 5126, "count": -1, "type": "VEC3"}]),
     ("mesh, glTF", "a node that is its own child"): _gltf(nodes=[{"mesh": 0, "children": [0]}]),
+    ("mesh, glTF", "nodes in a circle"): _gltf(nodes=[{"children": [1]}, {"mesh": 0, "children": [0]}]),
+    ("mesh, glTF", "a node reached twice"): _gltf(scenes=[{"nodes": [0, 1]}], nodes=[{"children": [1]}, {"mesh": 0}]),
+    ("mesh, glTF", "a matrix of NaN"): _gltf(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}]),
+    ("mesh, glTF", "a texture on another machine"): _gltf(images=[{"uri": "https://a.example/a.png"}]),
+    ("mesh, glTF", "indices out of every range"): _gltf(
+        meshes=[{"primitives": [{"attributes": {"POSITION": 10**9}, "material": -1}]}]
+    ),
+    ("mesh, glTF", "10^9 sparse values"): _gltf(
+        accessors=[{"componentType": 5126, "count": 3, "type": "VEC3", "sparse": {"count": 10**9}}]
+    ),
+    ("mesh, glTF", "a view beyond its buffer"): _gltf(bufferViews=[{"buffer": 0, "byteLength": 10**15}]),
+    ("mesh, glTF", "a stride of 10^15"): _gltf(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 10**15}]),
+    ("mesh, glTF", "100,000 copies of a mesh"): _gltf(
+        scenes=[{"nodes": list(range(100_000))}], nodes=[{"mesh": 0}] * 100_000
+    ),
+    ("mesh, glTF", "a factor that is no number"): _gltf(materials=[{"emissiveFactor": ["bright", None, 1]}]),
     ("mesh, glTF", "200,000 deep"): b'{"a":' * 200_000,
     ("mesh, glTF", "lists in place of objects"): _gltf(images=[[]], materials=[[]], accessors=3),
     ("mesh, GLB", "a part longer than the file"): b"glTF" + struct.pack("<IIII", 2, 100, 0xFFFFFFF0, 0x4E4F534A),

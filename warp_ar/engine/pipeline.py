@@ -34,6 +34,7 @@ from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.scene import Pose, Scene, load_scene
+from warp_ar.scene.finite import check_finite
 from warp_ar.scene.ray_scene import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
@@ -79,7 +80,7 @@ def _read_scene(scene: object) -> Scene:
     """What was given as a scene, checked.
 
     Raises:
-        SceneError: It cannot be read.
+        SceneError: It cannot be read, or one of its numbers is not finite.
         UsageError: It is none.
     """
     if isinstance(scene, str | os.PathLike):
@@ -87,6 +88,7 @@ def _read_scene(scene: object) -> Scene:
     if not isinstance(scene, Scene):
         raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
     _check_exposure(scene)
+    check_finite(scene)
     return scene
 
 
@@ -133,7 +135,7 @@ class Pipeline:
 
         Raises:
             UsageError: An argument that cannot be used.
-            SceneError: The scene cannot be used, or its camera does not fit ``size``.
+            SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
         scene = _read_scene(scene)
         for exposure in exposures:
@@ -223,11 +225,12 @@ class Pipeline:
             False if the scene needs a new pipeline; nothing has changed then.
 
         Raises:
-            SceneError: The scene's camera does not fit the size of the frames.
+            SceneError: The scene's camera does not fit the size of the frames, or a number is not finite.
             UsageError: The pipeline is closed, or another process's.
         """
         self._check_usable()
         _check_exposure(scene)
+        check_finite(scene, leave=("pose",))  # which stays as it was, or calls for another pipeline
         self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
         if skeleton(scene) != skeleton(self.scene):

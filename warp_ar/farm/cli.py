@@ -114,7 +114,7 @@ def work(options: argparse.Namespace, folder: Path) -> int:
 
 def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
     from warp_ar.farm.pool import ProcessPool, devices_of
-    from warp_ar.farm.work import Context
+    from warp_ar.farm.records import Context
 
     context = Context(jobs, folder.absolute(), "cpu")
     if options.ray is None:

@@ -15,9 +15,9 @@ from typing import Any
 
 from warp_ar.errors import reason
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
-from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, record_at
+from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
-from warp_ar.farm.work import Outcome, places_of
+from warp_ar.farm.records import Outcome
 from warp_ar.files import write_whole
 
 TRIES = 2
@@ -196,7 +196,7 @@ class Driver:
         if Job("index").key(self._jobs) in self._manifest.done:
             self._manifest.add("again", Job("index").key(self._jobs), reason="variations were added")
         left: list[Job] = [Job("index")]
-        self._work(lambda: left.pop() if left else None, places_of(self._jobs, done))
+        self._work(lambda: left.pop() if left else None, [job.place(self._jobs).as_posix() for job in done])
 
     def _finished_jobs(self, clip: int) -> Iterator[Job]:
         length = int(self._manifest.done[Job("survey", clip).key(self._jobs)]["length"])
@@ -324,6 +324,8 @@ class Driver:
         try:
             write_whole(self._folder / PROGRESS, json.dumps(told).encode())
         except OSError as error:
+            if is_no_space(error):
+                return  # a job or the manifest says so
             self._say(f"{self._folder / PROGRESS} cannot be written: {reason(error)}")
 
     def _seconds_left(self, open_jobs: int, now: float) -> float | None:

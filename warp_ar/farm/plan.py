@@ -12,7 +12,8 @@ from warp_ar.errors import WarpArError
 from warp_ar.farm.frames import index_frames
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, source_of
 from warp_ar.farm.manifest import RunError
-from warp_ar.farm.work import Context, Work
+from warp_ar.farm.records import Context
+from warp_ar.farm.work import Work
 
 PROBES = 3
 """Jobs that are tried."""

@@ -24,9 +24,11 @@ from typing import Any, Protocol
 
 from warp_ar.device import usable_cores
 from warp_ar.farm.jobs import Job
+from warp_ar.farm.records import Context, Outcome
 from warp_ar.farm.version import program_version
-from warp_ar.farm.work import Context, Outcome, Work
 
+CORES = 4
+"""Of a worker on CPU: more of them leave stages of few rows waiting."""
 TELL_SECONDS = 0.5
 """Between two messages about frames."""
 
@@ -66,11 +68,13 @@ def devices_of(device: str, workers: int | None) -> list[str]:
         device: ``auto``, ``cpu`` or ``cuda``.
         workers: How many; None: one per GPU, or one per four cores.
     """
+    if device == "cpu":
+        return ["cpu"] * (workers or max(1, usable_cores() // CORES))
     from warp_ar.device import resolve_device
 
     first = resolve_device(device)
     if first.is_cpu:
-        return ["cpu"] * (workers or max(1, usable_cores() // 4))
+        return ["cpu"] * (workers or max(1, usable_cores() // CORES))
     import warp as wp
 
     found = [str(gpu) for gpu in wp.get_cuda_devices()] if device in ("auto", "cuda") else [str(first)]
@@ -182,6 +186,8 @@ def _serve(pipe: Any, context: Context, cores: Sequence[int]) -> None:
         os.sched_setaffinity(0, cores)
     _write_to_log(context.folder / "log" / f"worker-{context.worker}.log")
     import cv2
+
+    from warp_ar.farm.work import Work  # here: a driver does without Warp
 
     cv2.setNumThreads(max(1, len(cores)))
     jobs: queue.SimpleQueue[tuple[Job, Any]] = queue.SimpleQueue()

@@ -16,8 +16,8 @@ from typing import Any
 from warp_ar.errors import UsageError, reason
 from warp_ar.farm.jobs import Job
 from warp_ar.farm.pool import Event
+from warp_ar.farm.records import Context
 from warp_ar.farm.version import program_version
-from warp_ar.farm.work import Context, Work
 
 CONNECT_SECONDS = 30.0
 """Within which a cluster must answer."""
@@ -31,6 +31,8 @@ class Member:
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
+        from warp_ar.farm.work import Work
+
         self._work, self._frames = Work(context), 0
         self._lock = threading.Lock()
 

@@ -6,20 +6,20 @@ import dataclasses
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from warp_ar.errors import WarpArError, reason
-from warp_ar.farm.dataset_files import write_dataset_files
 from warp_ar.farm.draws import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
-from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
+from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.labels import LAYERS, LabelWriter
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
 from warp_ar.farm.part_video import PartSink, join_parts
+from warp_ar.farm.records import Context, Outcome
 from warp_ar.farm.survey import lit_scene, survey_clip
 from warp_ar.farm.version import program_version
 from warp_ar.scene import SourceSpec, dumps_scene
@@ -29,31 +29,6 @@ PART = "frames.mp4"
 
 LEAST_FREE = 1 << 20
 """Bytes below which a disk is full, whatever a library says of its failure."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Context:
-    """What all jobs of a run share."""
-
-    jobs: JobFile
-    folder: Path
-    """Of the run."""
-    device: str
-    """``cpu`` or ``cuda:N``."""
-    worker: int = 0
-    """Number of the worker."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What became of a job."""
-
-    state: str
-    """``done``, ``failed``, or ``full``: the disk is."""
-    values: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Of the manifest's line."""
-    reason: str = ""
-    """What went wrong, on one line."""
 
 
 class Work:
@@ -118,6 +93,9 @@ class Work:
                     shutil.rmtree(context.folder / "parts" / jobs.clips[job.clip].name, ignore_errors=True)
                     return {**values, "bytes": place.stat().st_size}
                 case _:
+                    # Here: it loads what no other job needs.
+                    from warp_ar.farm.dataset_files import write_dataset_files
+
                     found = [Path(name) for name in arguments]
                     values = write_dataset_files(jobs, found, part, context.folder, program_version())
                     _replace_models(part / "models", place.parent / "models")
@@ -203,8 +181,3 @@ def _note(log: Path, line: str, more: str = "") -> None:
             stream.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {line}\n{more}")
     except OSError:
         return
-
-
-def places_of(jobs: JobFile, done: Sequence[Job]) -> list[str]:
-    """Places of finished variations, as the last job of a data set is told them."""
-    return [job.place(jobs).as_posix() for job in done]

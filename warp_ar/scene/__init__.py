@@ -28,6 +28,7 @@ from warp_ar.scene.description import (
     SourceSpec,
     Vec3,
 )
+from warp_ar.scene.object_materials import object_from_trimesh
 from warp_ar.scene.pose import Pose
 from warp_ar.scene.reader import bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.writer import dumps_scene
@@ -64,4 +65,5 @@ __all__ = [
     "load_calibration",
     "load_scene",
     "loads_scene",
+    "object_from_trimesh",
 ]

@@ -331,7 +331,7 @@ class Object:
     marker: Marker | None = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)
-    """A mesh in memory instead of a file; a scene file cannot say it. See ``Object.of``."""
+    """A mesh in memory instead of a file, as ``object_from_trimesh`` gives; a scene file cannot say it."""
 
     def pose_at(self, seconds: float) -> tuple[FloatMatrix, FloatMatrix]:
         """Rotation R (3, 3) and position (3,) in metres, ``seconds`` after the first frame."""

@@ -30,6 +30,8 @@ _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0
 """From +Y up to +Z up."""
 _MOST_IMAGES: Final = 4
 """Largest number of pixels of all pictures together, in pictures of the largest size."""
+_MOST_PLACES: Final = 20_000
+"""Nodes of a file, and primitives that they place, at most."""
 _COMPRESSED: Final = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -70,6 +72,7 @@ class _Reader:
         self._nodes, self._meshes, self._skins = (
             objects(path, self._header, key) for key in ("nodes", "meshes", "skins")
         )
+        self._primitives: dict[tuple[int, int], MeshPart | None] = {}
         self._images: dict[int, int] = {}
         self._decoded: list[npt.NDArray[np.uint8]] = []
         self._pixels = self._elements = 0
@@ -81,8 +84,17 @@ class _Reader:
         for key in ("animations", "cameras"):
             if objects(self._path, self._header, key):
                 self._note(key)
+        if len(self._nodes) > _MOST_PLACES:
+            fail(self._path, f"it has {len(self._nodes):,} nodes; at most {_MOST_PLACES:,} are read: join them")
         parts: list[MeshPart] = []
         world = self._world_transforms()
+        shown = [node["mesh"] for index in world if "mesh" in (node := self._nodes[index])]
+        places = sum(
+            len(objects(self._path, self._meshes[number], "primitives"))
+            for number in self._indices(shown, "nodes' meshes", len(self._meshes))
+        )
+        if places > _MOST_PLACES:
+            fail(self._path, f"its nodes place {places:,} primitives; at most {_MOST_PLACES:,} are read: join them")
         for index, transform in world.items():
             node = self._nodes[index]
             if "mesh" in node:
@@ -187,9 +199,17 @@ class _Reader:
             if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
                 self._note("points and lines")
                 continue
-            part = self._primitive(primitive, self._meshes[number], node)
+            # The same triangles may stand at thousands of nodes.
+            alike = "weights" not in node
+            key = (number, id(primitive))
+            if not alike or key not in self._primitives:
+                self._primitives[key] = self._primitive(primitive, self._meshes[number], node)
+            part = self._primitives[key] if alike else self._primitives.pop(key)
             if part is None:
                 continue
+            self._elements += len(part.faces)
+            if self._elements > limits().mesh_elements:
+                raise SceneError(too_much(f"{self._path}", self._elements, "faces", "mesh_elements"))
             bones = self._bones(node, primitive, world) if "skin" in node else None
             # A skinned mesh stands where its joints are, whatever its own node says.
             moved = part.moved(transform) if bones is None else part.bent(np.einsum("ij,njk->nik", _UP, bones))
@@ -220,9 +240,8 @@ class _Reader:
         if colors is not None and colors.shape[1] == 3:
             colors = np.concatenate([colors, np.ones((count, 1))], axis=1)
         faces = self._faces(primitive, count)
-        self._elements += len(faces)
-        if self._elements > limits().mesh_elements:
-            raise SceneError(too_much(f"{self._path}", self._elements, "faces", "mesh_elements"))
+        if len(faces) > limits().mesh_elements:
+            raise SceneError(too_much(f"{self._path}", len(faces), "faces", "mesh_elements"))
         if not len(faces):
             return None
         return MeshPart.checked(

@@ -27,6 +27,7 @@ from warp_ar.scene.description import (
 )
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_cache import load_kept_mesh
+from warp_ar.scene.mesh_files import mesh_from_trimesh
 from warp_ar.scene.mesh_materials import MeshMaterial
 
 _LOG = logging.getLogger(__name__)
@@ -45,6 +46,19 @@ class Look:
     """Whether rays may pass through some triangles."""
     bumpy: bool
     """Whether a material has a normal map."""
+
+
+def object_from_trimesh(source: Any, **fields: Any) -> Object:
+    """An object of a ``trimesh.Trimesh`` or ``trimesh.Scene`` in memory, with its colours, materials and textures.
+
+    Args:
+        source: The mesh, in metres; its axes stay as they are.
+        fields: Other fields of ``Object``, such as ``at``, ``rotate``, ``scale`` and ``material``.
+
+    Raises:
+        SceneError: It holds no triangle, a vertex that is not finite, or a face with an index out of range.
+    """
+    return Object("mesh", mesh=mesh_from_trimesh(source), **fields)
 
 
 def mesh_of(item: Object) -> Mesh | None:

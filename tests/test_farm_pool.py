@@ -1,0 +1,75 @@
+"""Which cores and devices workers have, and how their ends are told."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from warp_ar.errors import UsageError
+from warp_ar.farm.pool import Teller, cores_of, devices_of, is_from_outside, words_of_exit
+from warp_ar.farm.ray_pool import _knock
+
+
+@pytest.mark.parametrize(
+    ("cores", "workers", "expected"),
+    [
+        ({0, 1, 2, 3}, 1, [[0, 1, 2, 3]]),
+        ({0, 1, 2, 3}, 2, [[0, 1], [2, 3]]),
+        ({2, 3, 5, 7, 9}, 2, [[2, 3], [5, 7, 9]]),
+        ({0, 1}, 2, [[0], [1]]),
+        ({0, 1}, 5, [[0], [1], [0], [1], [0]]),
+    ],
+)
+def test_cores_are_shared_out_evenly(monkeypatch, cores, workers, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores, raising=False)
+    assert cores_of(workers) == expected
+
+
+def test_workers_on_cpu_are_as_many_as_asked_or_one_per_four_cores(monkeypatch):
+    assert devices_of("cpu", 3) == ["cpu"] * 3
+    for cores, workers in ((2, 1), (8, 2), (64, 16)):
+        monkeypatch.setattr("warp_ar.farm.pool.usable_cores", lambda cores=cores: cores)
+        assert devices_of("cpu", None) == ["cpu"] * workers
+
+
+@pytest.mark.parametrize(
+    ("code", "outside", "words"),
+    [
+        (-signal.SIGKILL, True, "its worker was ended by SIGKILL"),
+        (-signal.SIGTERM, True, "its worker was ended by SIGTERM"),
+        (-signal.SIGSEGV, False, "its worker was ended by SIGSEGV"),
+        (3, False, "its worker ended with exit code 3"),
+        (0, False, "its worker ended with exit code 0"),
+        (-200, False, "its worker was ended by signal 200"),
+    ],
+)
+def test_a_crash_is_told_from_a_kill(code, outside, words):
+    assert is_from_outside(code) is outside
+    assert words_of_exit(code) == words
+
+
+def test_frames_are_told_now_and_then(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("warp_ar.farm.pool.time.monotonic", lambda: now[0])
+    told: list[int] = []
+    teller = Teller(told.append)
+    for frame in range(1, 11):
+        now[0] += 0.2
+        teller(frame)
+    assert told == [3, 6, 9]
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("somewhere", "--ray somewhere: expected HOST:PORT"),
+        ("host:99999", "--ray host:99999: expected HOST:PORT"),
+        ("127.0.0.1:1", "--ray 127.0.0.1:1: no cluster answers"),
+    ],
+)
+def test_an_address_of_no_cluster_is_told_at_once(address, words):
+    with pytest.raises(UsageError) as caught:
+        _knock(address)
+    assert str(caught.value).startswith(words)
