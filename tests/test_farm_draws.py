@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import cv2
@@ -104,6 +105,20 @@ def test_no_object_hides_the_marker_from_any_camera(drawn):
         marker = hull(pixels(pose, square))
         for item in variation.scene.objects:
             assert not _overlap(hull(pixels(pose, points_of(item))), marker)
+
+
+def test_what_would_hide_the_marker_finds_no_place(tmp_path):
+    """A tall box stands before the marker, as the camera sees it, or behind it: only behind it is allowed."""
+    low = looking_down(0.0, -0.5, 0.15)
+    for y0, y1, found in ((-0.2, -0.16, False), (0.28, 0.32, True)):
+        section = {"objects": [1, 1], "object": [{"shape": "box", "size": [0.02, 0.02, 0.2]}]}
+        dataset = make_jobs(tmp_path, [{"scene": "desk"}], dataset={**section, "region": [-0.01, y0, 0.01, y1]}).dataset
+        scene = dataclasses.replace(load_scene("desk"), proxies=(), probes=())
+        if found:
+            assert len(draw_variation(scene, dataset, 0, 0, [low]).scene.objects) == 1
+        else:
+            with pytest.raises(NoPlace):
+                draw_variation(scene, dataset, 0, 0, [low])
 
 
 def test_outlines_overlap_where_no_side_separates_them():

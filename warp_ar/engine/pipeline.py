@@ -271,14 +271,14 @@ class Pipeline:
         if self._short is not None and other._short is not None:
             self._short.resume(other._short)
 
-    def restart(self, first: int = 0, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
-        """Take the next frame for one of a clip that starts at 0 seconds, as if no other frame had been lit before it.
+    def restart(self, *, saturation: npt.NDArray[np.int64] | None = None) -> None:
+        """Take the next frame for one of a clip that starts at 0 seconds, as if no other had been lit before it.
 
         Pictures of a part of a clip then are those that the whole clip gives, and do not depend on what the pipeline
-        was used for before. That needs a light that is given: an environment that is gathered over frames is not.
+        was used for before. That needs a light that is given: an environment that is gathered over frames is not. So
+        are the poses, where the next frame is not the clip's first.
 
         Args:
-            first: Number of the next frame in its clip.
             saturation: Codes at which the camera's channels saturate, (3,), where they are known; they then hold for
                 all frames to come.
 
@@ -289,7 +289,7 @@ class Pipeline:
         self._finish()
         if self.plan.features.observed:
             raise UsageError("restart needs a captured light: a mirror ball's is gathered over the frames before")
-        self._begun, self._start_time, self._last_time = first, 0.0, 0.0
+        self._begun, self._start_time, self._last_time = 0, 0.0, 0.0
         self._lit_time = math.inf  # no frame came before
         self._shown = None
         if self._tracker is not None:

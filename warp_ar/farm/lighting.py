@@ -117,7 +117,7 @@ class Lighter:
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(open_part(path, survey.index, job.first, job.end, fps)) as source:
             pipeline = self._pipeline_for(own, source.size, outputs, follows=len(survey.keys) > 0)
-            pipeline.restart(job.first, saturation=survey.saturation)
+            pipeline.restart(saturation=survey.saturation)
             self._key = None
             for frame in source:
                 if (frame.index - job.first) % every:

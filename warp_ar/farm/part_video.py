@@ -215,7 +215,7 @@ def _sound(source: Any, target: Any, zero: float, until: float | None) -> Iterat
                 continue
             shift = round(zero / float(packet.time_base))
             packet.pts -= shift
-            packet.dts = packet.pts if packet.dts is None else packet.dts - shift
+            packet.dts = packet.pts  # sound is never reordered
             packet.stream = streams[packet.stream.index]
             yield seconds, packet
 

@@ -101,7 +101,8 @@ class RayPool:
         return ""
 
     def _ask_version(self, worker: int) -> None:
-        self._tasks[self._actors[worker].version.remote()] = worker, "ready"
+        """Ask until an actor that is being started, perhaps again, answers."""
+        self._tasks[self._actors[worker].version.options(max_task_retries=-1).remote()] = worker, "ready"
 
     def give(self, worker: int, job: Job, arguments: Any) -> None:
         """As ``Pool.give``."""

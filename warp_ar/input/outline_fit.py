@@ -13,6 +13,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Final, TypeAlias
@@ -38,8 +39,10 @@ SPACING: Final = 4.0
 """Pixels between samples of an edge."""
 STEP: Final = 6.0
 """Codes per pixel that a step must have: more than noise and wood have."""
-FARTHEST: Final = 20.0
-"""Pixels that a pointed corner may be moved."""
+DEPTHS: Final = (1.0, 0.9, 0.8, 1.12, 1.25)
+"""Factors of the side that is pointed out worst, from which the edges are tried."""
+FARTHEST: Final = 12.0
+"""Pixels that a corner may lie from where it was pointed out."""
 POINTED: Final = 8.0
 """Pixels: standard deviation of a pointed corner, over that of an edge's step of one pixel."""
 MET: Final = 1.5
@@ -87,20 +90,36 @@ def fit_outline(
     start = {"plane": _start_plane, "wall": _start_wall, "box": _start_box}[kind](view, np.asarray(points, float))
     _check(kind, start)
     gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
-    shape = start
     anchors = _anchors(kind, start, view, np.asarray(points, float))
-    for reach in REACHES:
-        for _ in range(ROUNDS):
-            moved = _improve(kind, shape, view, gray, reach, anchors)
-            if moved is None:
-                break
-            shape = moved
-    met = _met(kind, shape, view, gray)
-    # Edges that lie far from where somebody pointed are others.
-    moved_by = np.linalg.norm(view.pixels(_corners(kind, shape))[anchors[0]] - anchors[1], axis=1).max()
-    fitted = met >= ENOUGH and bool(moved_by <= FARTHEST)
-    shape = shape if fitted else start
-    return OutlineFit(_proxy(kind, shape), met, fitted)
+    start = _settled(kind, start, view, anchors)
+    best, met = start, 0.0
+    # A pixel is millimetres along the line of sight: the last side is tried at several lengths.
+    for factor, first in itertools.product(DEPTHS, (0, 1)):
+        shape = start.copy()
+        shape[4] *= factor
+        for reach in REACHES[first:]:
+            shape = _rounds(kind, shape, view, gray, reach, anchors)
+        # Edges that lie far from where somebody pointed are others.
+        off = np.linalg.norm(view.pixels(_corners(kind, shape))[anchors[0]] - anchors[1], axis=1).max()
+        share = _met(kind, shape, view, gray) if off <= FARTHEST else 0.0
+        if share > met:
+            best, met = shape, share
+    fitted = met >= ENOUGH
+    if not fitted:
+        best, met = start, _met(kind, start, view, gray)
+    return OutlineFit(_proxy(kind, best), met, fitted)
+
+
+def _rounds(
+    kind: str, shape: Array, view: _View, gray: NDArray[np.float32], reach: float, anchors: tuple[list[int], Array]
+) -> Array:
+    """A shape after some steps with one reach."""
+    for _ in range(ROUNDS):
+        moved = _improve(kind, shape, view, gray, reach, anchors)
+        if moved is None:
+            break
+        shape = moved
+    return shape
 
 
 @dataclasses.dataclass(frozen=True)
@@ -344,10 +363,26 @@ def _steps(gray: NDArray[np.float32], at: Array, normals: Array, reach: float) -
 
 
 def _anchors(kind: str, shape: Array, view: _View, points: Array) -> tuple[list[int], Array]:
-    """Numbers of the shape's corners that were pointed out, and where they are at first."""
+    """Numbers of the shape's corners that were pointed out, and where they were."""
     seen = view.pixels(_corners(kind, shape))
     chosen = [int(np.linalg.norm(seen - point, axis=1).argmin()) for point in points]
-    return chosen, seen[chosen]
+    return chosen, points
+
+
+def _settled(kind: str, shape: Array, view: _View, anchors: tuple[list[int], Array]) -> Array:
+    """The shape whose corners lie nearest to where they were pointed out: all points count alike."""
+    chosen, pointed = anchors
+    for _ in range(ROUNDS):
+        now = view.pixels(_corners(kind, shape))[chosen].ravel()
+        steps = 1e-4 * np.eye(len(shape))
+        jacobian = np.column_stack([view.pixels(_corners(kind, shape + s))[chosen].ravel() - now for s in steps]) / 1e-4
+        if not np.isfinite(jacobian).all():
+            return shape
+        moved = shape + np.linalg.lstsq(jacobian, pointed.ravel() - now, rcond=None)[0]
+        if not _is_sound(kind, moved):
+            return shape
+        shape = moved
+    return shape
 
 
 def _improve(
