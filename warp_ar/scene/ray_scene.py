@@ -533,7 +533,8 @@ def _vectors(parts: Iterable[npt.NDArray[np.float32]], length: int, dtype: Any, 
 
 
 def _update(records_out: npt.NDArray[Any], records: npt.NDArray[Any]) -> bool:
-    if records_out.tobytes() == records.tobytes():
+    # By fields: the bytes between them are whatever was in the memory.
+    if np.array_equal(records_out, records):
         return False
     records_out[...] = records
     return True
