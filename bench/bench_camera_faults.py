@@ -21,7 +21,7 @@ import numpy as np
 
 from tests.simulated_camera import ALL, ALONE, Faults, decode_srgb, expose
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
-from warp_ar.scene import load_scene
+from warp_ar.scene import SourceSpec, load_scene
 from warp_ar.session import Session
 
 TRUTH = Path(__file__).resolve().parents[2] / "shared" / "truth"
@@ -63,6 +63,7 @@ def score(case: Path, version: str, faults: Faults, device: str) -> dict[str, fl
     there = [light_of(case / version / name) if name in truths else clean[name] for name in names]
     wanted = dict(zip(names, expose(there, faults, phase=phase), strict=True))
     scene = load_scene(case / f"scene_{version}.toml")
+    scene = dataclasses.replace(scene, source=SourceSpec(path=case / "camera", metering="automatic"))
     known = (faults.distortion, 0.0, 0.0, 0.0, 0.0)
     if faults.distortion:
         # The calibration knows the lens: its focal length here is the picture's width.

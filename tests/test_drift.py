@@ -138,7 +138,7 @@ def test_virtual_lights_keep_their_value_while_the_exposure_moves():
     """A pipeline's lights shine in the camera values of each frame."""
     text = SCENE + '[[light]]\nkind = "point"\nat = [0.2, 0.0, 0.3]\nintensity = 0.2\n'
     picture = linear_picture(loads_scene(text))
-    with Pipeline(loads_scene(text), device="cpu", quality="low") as pipeline:
+    with Pipeline(loads_scene(text), device="cpu", quality="low", follows_camera=True) as pipeline:
         lit = []
         for index, gain in enumerate((1.0, 0.6)):
             result = pipeline(encode(picture * gain), pose=POSE, time_seconds=0.2 * index)
@@ -147,3 +147,20 @@ def test_virtual_lights_keep_their_value_while_the_exposure_moves():
     table = (slice(10, 30), slice(60, 100))
     assert added[0][table].mean() > 0.05
     assert added[1][table].mean() == pytest.approx(added[0][table].mean(), rel=0.1)
+
+
+def test_light_that_dims_on_all_surfaces_is_light_unless_the_camera_meters_by_itself() -> None:
+    """Nothing tells the two apart: by default frames say what they show, and virtual lights stay as they are."""
+    text = SCENE + '[[light]]\nkind = "point"\nat = [0.2, 0.0, 0.3]\nintensity = 0.2\n'
+    source = '[source]\npath = "clip"\nmetering = '
+    picture = linear_picture(loads_scene(text))
+    table = (slice(10, 30), slice(60, 100))
+    added = {}
+    for metering in ("fixed", "automatic"):
+        scene = loads_scene(text + f'{source}"{metering}"\n')
+        with Pipeline(scene, device="cpu", quality="low") as pipeline:
+            for index, gain in enumerate((1.0, 0.6)):
+                result = pipeline(encode(picture * gain), pose=POSE, time_seconds=0.2 * index)
+        added[metering] = (decode_srgb(cv2.blur(result.image, (5, 5))) - 0.6 * picture)[table].mean()
+    # Not by the whole gain: in a darker frame the table is taken to reflect less.
+    assert added["fixed"] > 1.3 * added["automatic"]

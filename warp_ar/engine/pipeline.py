@@ -113,7 +113,7 @@ class Pipeline:
         profile: bool = False,
         synchronous: bool = False,
         emitters: bool = False,
-        follows_camera: bool = True,
+        follows_camera: bool | None = None,
         culling: bool = True,
     ) -> None:
         """Plan, allocate and build.
@@ -134,7 +134,8 @@ class Pipeline:
                 that light then takes effect some frames later.
             emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
             follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
-                from frames one after another. Parts of a clip that are lit by themselves need it off.
+                from frames one after another; None: if the scene says that the camera meters by itself. Light that
+                dims on all surfaces alike is then taken for a drift.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
 
         Raises:
@@ -173,6 +174,8 @@ class Pipeline:
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
         with translating(self.device), wp.ScopedDevice(self.device):
             # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+            if follows_camera is None:
+                follows_camera = scene.source is not None and scene.source.metering == "automatic"
             follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
             self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
             self._scheduler = Scheduler(

@@ -279,7 +279,9 @@ def _check_drift(look: Look, views: Sequence[tuple[Image, Pose]], whites: Array)
     spread = float(np.percentile(ratio.mean(1), 80) - np.percentile(ratio.mean(1), 20))
     if abs(change) > DRIFT and abs(levels[-1] - levels[0]) > DRIFT and spread < 0.5 * abs(change):
         text = f"the exposure drifts: all of the picture changes by a factor of {math.exp(change):.2f}"
-        found.append(Finding("camera.drift", text, "lock the camera's exposure"))
+        found.append(
+            Finding("camera.drift", text, 'lock the camera\'s exposure, or say [source] metering = "automatic"')
+        )
     colour = ratio[:, [0, 2]] - ratio[:, 1:2]
     shift, width = np.median(colour, axis=0), np.percentile(colour, 80, axis=0) - np.percentile(colour, 20, axis=0)
     k = int(np.argmax(np.abs(shift)))

@@ -119,6 +119,9 @@ class SourceSpec:
     """Exposure times in seconds that frames have in turn: recorded so, or to be asked of the device."""
     shown: float | None = None
     """Exposure time in seconds of the frames that are lit and shown; the longest if left out."""
+    metering: Literal["fixed", "automatic"] | None = None
+    """Whether the camera's exposure and white balance may drift; what dims all alike is then not the light; fixed if
+    left out."""
 
 
 @dataclasses.dataclass(frozen=True)

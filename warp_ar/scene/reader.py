@@ -290,6 +290,7 @@ def _read_source(table: _Table) -> SourceSpec:
         if "exposures" in table
         else None,
         shown=table.number("shown", low=1e-6, high=1e3, unit="seconds") if "shown" in table else None,
+        metering=cast(Any, table.choice("metering", ("fixed", "automatic"), "fixed")) if "metering" in table else None,
     )
 
 

@@ -111,6 +111,7 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("source", "fps"): ("frames per second", "24.0", 'path = "frames"'),
     ("source", "exposures"): ("seconds", "[0.016, 0.001]", "camera = 0"),
     ("source", "shown"): ("seconds", "0.001", "camera = 0\nexposures = [0.016, 0.001]"),
+    ("source", "metering"): ("-", '"automatic"', "camera = 0"),
     ("marker", "dictionary"): ("-", '"DICT_APRILTAG_36h11"', "size = 0.08"),
     ("marker", "id"): ("-", "7", "size = 0.08"),
     ("marker", "size"): ("metres", "0.08", ""),
