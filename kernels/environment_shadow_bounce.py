@@ -136,7 +136,7 @@ def make_estimated(config: DistantLightConfig) -> wp.Function:
         cosine = wp.max(wp.dot(normal, wo), 0.0)
         surface = surface_at(scene, distant.dfg, hit, cosine, RAY_SPREAD)
         sent = Sent()
-        if wp.static(config.textures):
+        if wp.static(config.textures and config.gathered):
             sent.emitted = surface.emission
         if wp.static(config.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
@@ -200,7 +200,7 @@ def make_bounced(config: DistantLightConfig) -> wp.Function:
             geometric = -geometric
         surface = surface_at(scene, distant.dfg, hit, wp.max(wp.dot(normal, wo), 0.0), RAY_SPREAD)
         emitted = wp.vec3(0.0)
-        if wp.static(config.textures):
+        if wp.static(config.textures and config.gathered):
             emitted = surface.emission
         rough = surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2]
         glossy = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]

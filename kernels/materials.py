@@ -109,6 +109,20 @@ def roughness_at(scene: RayScene, material: Material, point: SurfacePoint) -> wp
     return material.roughness
 
 
+@wp.func
+def emitted_radiance(scene: RayScene, material: Material, point: SurfacePoint) -> wp.vec3:
+    """What a point sends out itself, on a side that does."""
+    if material.unlit != 0:
+        base = wp.cw_mul(material.base_color, wp.vec3(point.color[0], point.color[1], point.color[2]))
+        if material.base_texture >= 0:
+            base = wp.cw_mul(base, rgb(sample_texture(scene, material.base_texture, point)))
+        return base
+    emission = material.emission
+    if material.emissive_texture >= 0:
+        emission = wp.cw_mul(emission, rgb(sample_texture(scene, material.emissive_texture, point)))
+    return emission
+
+
 @functools.cache
 def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
     """``surface_at(scene, dfg, hit, cos_o, spread) -> Surface``; ``dfg`` is a table as ``integrate_dfg`` writes it.

@@ -65,6 +65,8 @@ class DistantLightConfig:
     """Whether emitters of the environment are known by their places."""
     captured: bool = False
     """Whether the environment is known without mirror balls, from a file."""
+    gathered: bool = True
+    """Whether rays that happen to meet what emits bring its light; else ``area_lights`` are looked for themselves."""
 
     def general(self, form: DiffuseForm) -> DistantLightConfig:
         """For any scene with as many mirror balls, textures or not: forms that it does not call for may be empty.
@@ -75,9 +77,7 @@ class DistantLightConfig:
         models = tuple(sorted(map(int, (LAMBERT, PHONG, MIRROR, METALLIC_ROUGHNESS))))
         known = self.probes or self.captured
         diffuse: DiffuseForm = form if known else "none"
-        return DistantLightConfig(
-            self.trace.general(), models, self.textures, diffuse, known, self.probes, self.emitters, self.captured
-        )
+        return dataclasses.replace(self, trace=self.trace.general(), models=models, diffuse=diffuse, specular=known)
 
 
 @wp.struct
@@ -184,7 +184,10 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
         surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
         radiance = wp.cw_mul(surface.diffuse, distant_irradiance(distant, hit.point, normal)) / wp.pi
         if wp.static(config.textures):
-            radiance = surface.occlusion * radiance + surface.emission
+            if wp.static(config.gathered):
+                radiance = surface.occlusion * radiance + surface.emission
+            else:
+                radiance = surface.occlusion * radiance
         if wp.static(config.specular):
             if knows_levels(distant):
                 wi = reflect(wo, normal)

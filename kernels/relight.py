@@ -76,6 +76,7 @@ from typing import Literal
 
 import warp as wp
 
+from warp_ar.kernels.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
 from warp_ar.kernels.color import decode, luminance
 from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
@@ -83,7 +84,7 @@ from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows
-from warp_ar.kernels.shadow import has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
+from warp_ar.kernels.shadow import LightSample, has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean, intensity
 from warp_ar.kernels.visibility import (
@@ -170,6 +171,8 @@ class RelightConfig:
     """Whether light that lit proxies send to each other is known."""
     edge_samples: int = 1
     """Samples per pixel along the edges of shadows and of proxies: a square number; 1 leaves edges hard."""
+    area_samples: int = 0
+    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
     def general(self, *, soft: bool) -> RelightConfig:
         """For any scene in which as much is known of the receiver."""
@@ -336,6 +339,50 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 
 
 @functools.cache
+def make_area_response(config: RelightConfig) -> wp.Function:
+    """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over what emits."""
+    method, reading = config.method, READINGS.get(config.method)
+    is_lit = make_shadow(config.trace)
+    area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
+
+    @wp.func(module="unique")
+    def area_response(scene: RayScene, receiver: Receiver, hit: Hit, matter: Matter, turn: wp.float32) -> wp.vec3:
+        total = wp.vec3()
+        count = area_count(scene)
+        for k in range(count):
+            area = area_sample(scene, hit.point, k, count, turn)
+            n_dot_l = wp.max(wp.dot(hit.normal, area.wi), 0.0)
+            if wp.max(area.irradiance_normal) <= 0.0 or wp.dot(hit.geometric_normal, area.wi) <= 0.0:
+                continue
+            light = LightSample()
+            light.wi = area.wi
+            light.distance = area.distance
+            if not is_lit(scene, hit.point, hit.geometric_normal, hit.error, light):
+                continue
+            if wp.static(config.probes):
+                if meets_probe(receiver.probes, hit.point, area.wi, area.distance):
+                    continue
+            response = n_dot_l
+            if wp.static(method != "flat"):
+                alpha = wp.dot(area.wi, matter.key)
+                if wp.static(reading is not None):
+                    if wp.static(reading is not None and reading.weighted):
+                        alpha = alpha * matter.directionality
+                    if wp.static(reading is not None and reading.blend == "shader"):
+                        response = shader_response(n_dot_l, matter.m, alpha)
+                    else:
+                        response = text_response(n_dot_l, matter.m, alpha)
+                elif wp.static(method == "relief"):
+                    response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
+                else:
+                    response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
+            total += response * area.irradiance_normal
+        return total
+
+    return area_response
+
+
+@functools.cache
 def make_direct_lighting(config: RelightConfig) -> wp.Function:
     """``direct_lighting(scene, lights, receiver, hit, row, col, mirror, turn) -> DirectLighting``: of virtual light.
 
@@ -346,6 +393,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
     visible_share = make_visible_share(config.trace) if config.soft else None
     find_matter = make_find_matter(config)
     method, reading = config.method, READINGS.get(config.method)
+    area_response = make_area_response(config) if config.area_samples > 0 else None
 
     @wp.func(module="unique")
     def direct_lighting(
@@ -403,6 +451,16 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                 else:
                     response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
             added += visible * response * light.irradiance_normal
+        if wp.static(config.area_samples > 0):
+            if scene.area_lights.shape[0] > 0:
+                if wp.static(method != "flat"):
+                    if not known:
+                        known = True
+                        matter = find_matter(scene, receiver, hit, row, col, mirror)
+                by_areas = area_response(scene, receiver, hit, matter, turn)
+                if wp.max(by_areas) > 0.0:
+                    result.visibility |= _LIT
+                    added += by_areas
         if wp.static(config.bounced):
             if mirror[0] <= 0.0:
                 cells = receiver.cells

@@ -21,9 +21,18 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.area_lights import (
+    POINT_SAMPLES,
+    lobe_solid_angle,
+    looks_by_lobe,
+    make_area_count,
+    make_area_reflection,
+    make_area_sample,
+    without_lobe,
+)
 from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
-from warp_ar.kernels.materials import make_reflect_direct, make_surface, reflect, specular_occlusion
+from warp_ar.kernels.materials import Surface, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.reflect import (
     DiffuseForm,
@@ -33,7 +42,14 @@ from warp_ar.kernels.reflect import (
     make_distant_irradiance,
     make_reflected_radiance,
 )
-from warp_ar.kernels.shadow import ALL_LIGHTS, make_sample_light, make_shadow, make_visible_share, tile_turn
+from warp_ar.kernels.shadow import (
+    ALL_LIGHTS,
+    LightSample,
+    make_sample_light,
+    make_shadow,
+    make_visible_share,
+    tile_turn,
+)
 from warp_ar.kernels.structs import FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import (
     Hit,
@@ -71,6 +87,8 @@ class ShadeConfig:
     """Whether lights with a radius cast soft shadows."""
     near_field: bool = False
     """Whether ``near_field`` says what surrounds the objects."""
+    area_samples: int = 0
+    """Samples of what emits, per point; ``area_lights.POINT_SAMPLES``: as lights at points; 0: nothing emits."""
 
     def general(self, form: DiffuseForm, *, soft: bool) -> ShadeConfig:
         """For any scene with as many mirror balls; ``form`` is that of ``DistantLightConfig.general``."""
@@ -90,6 +108,51 @@ class NearPoint:
 
 
 @functools.cache
+def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
+    """``lit_by_areas(scene, hit, surface, normal, geometric, wo, turn) -> vec3``: radiance by what emits."""
+    trace, samples = config.distant.trace, config.area_samples
+    reflect_direct = make_reflect_direct(config.distant.models)
+    is_lit = make_shadow(trace)
+    area_count, area_sample = make_area_count(samples), make_area_sample(samples)
+    by_rays = samples != POINT_SAMPLES and config.distant.specular
+    area_reflection = make_area_reflection(trace, samples) if by_rays else None
+
+    @wp.func(module="unique")
+    def lit_by_areas(
+        scene: RayScene,
+        hit: Hit,
+        surface: Surface,
+        normal: wp.vec3,
+        geometric: wp.vec3,
+        wo: wp.vec3,
+        turn: wp.float32,
+    ) -> wp.vec3:
+        total = wp.vec3(0.0)
+        count = area_count(scene)
+        lobe = lobe_solid_angle(surface)
+        for k in range(count):
+            area = area_sample(scene, hit.point, k, count, turn)
+            if wp.max(area.irradiance_normal) > 0.0 and wp.dot(geometric, area.wi) > 0.0:
+                lit = surface
+                if wp.static(by_rays):
+                    if looks_by_lobe(scene.objects[area.object], hit.point, lobe):
+                        lit = without_lobe(surface)
+                direct = reflect_direct(lit, normal, wo, area.wi)
+                if wp.max(direct) > 0.0:
+                    light = LightSample()
+                    light.wi = area.wi
+                    light.distance = area.distance
+                    if is_lit(scene, hit.point, geometric, hit.error, light):
+                        total += wp.cw_mul(direct, area.irradiance_normal)
+        if wp.static(by_rays):
+            if count > 0:
+                total += area_reflection(scene, hit, surface, normal, geometric, wo, turn)
+        return total
+
+    return lit_by_areas
+
+
+@functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
 
@@ -103,6 +166,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
     sample_light = make_sample_light(config.lights)
     is_lit = make_shadow(forms.trace)
     visible_share = make_visible_share(forms.trace) if config.soft else None
+    lit_by_areas = make_lit_by_areas(config) if config.area_samples > 0 else None
 
     @wp.func(module="unique")
     def shade_hit(
@@ -162,6 +226,8 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                         else:
                             if is_lit(scene, hit.point, geometric, hit.error, light):
                                 radiance += wp.cw_mul(direct, light.irradiance_normal)
+        if wp.static(config.area_samples > 0):
+            radiance += lit_by_areas(scene, hit, surface, normal, geometric, wo, turn)
         return radiance
 
     return shade_hit

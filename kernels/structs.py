@@ -150,6 +150,15 @@ class Texture:
 
 
 @wp.struct
+class AreaLight:
+    """An object that emits, as a light that is all at one point; see ``kernels/area_lights.py``."""
+
+    object: wp.int32
+    power: wp.vec3  # integral of radiance over the emitting area, local: m^2 times camera values
+    facing: wp.vec3  # local: mean normal of the area by what it emits, not unit; zero where it is alike all around
+
+
+@wp.struct
 class RayScene:
     """All that rays can meet, and what it is made of."""
 
@@ -168,6 +177,10 @@ class RayScene:
     triangle_materials: wp.array[wp.int32]  # to be added to ``Shape.material``
     triangle_density: wp.array[wp.vec2]  # texture coordinates of both sets per unit of the mesh
     pixel_spread: wp.float32  # angle of a pixel in the picture, radians
+    # Empty where no object emits.
+    area_lights: wp.array[AreaLight]  # the objects that do
+    emitting_faces: wp.array[wp.vec3i]  # object; triangle of its mesh, -1: the whole sphere; 1: only its front emits
+    emitting_shares: wp.array[wp.float32]  # of all that is emitted, by this face and those before it; the last is 1
 
 
 @wp.struct

@@ -25,7 +25,9 @@ from typing import Any
 from warp_ar.engine.graph import make_plan
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene
+from warp_ar.scene.area_lights import emits_light
 from warp_ar.stages import STAGES
+from warp_ar.stages.features import AREA_SAMPLES
 from warp_ar.stages.quality import PRESETS, Quality
 from warp_ar.stages.request import Request
 
@@ -58,6 +60,15 @@ def _shared(name: str, *methods: str) -> Setting:
 _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "environment_height": ("rows of the map that holds the environment", {}),
     "edge_samples": ("samples per pixel along the outlines of virtual objects, and of shadows of virtual light", {}),
+    "area_light": (
+        "light of objects that emit",
+        {
+            "point": "as if each were all at its middle (the paper)",
+            "coarse": "8 places on them per point",
+            "fine": "32 places",
+            "brute_force": "256 places",
+        },
+    ),
     "light_shadow": (
         "shadows of virtual lights",
         {"hard": "as if every light were a point (the paper)", "soft": "as wide as the light"},
@@ -68,6 +79,7 @@ SETTINGS: tuple[Setting, ...] = (
     _shared("environment_height", "32", "64", "128", "256"),
     _shared("edge_samples", "1", "4", "16"),
     _shared("light_shadow", "hard", "soft"),
+    _shared("area_light", *AREA_SAMPLES),
     *(Setting(stage.name, tuple(stage.methods), (stage.name,)) for stage in _CHOICES),
 )
 """All there are."""
@@ -122,11 +134,12 @@ def relevant_settings(scene: Scene, size: tuple[int, int]) -> tuple[Setting, ...
     """Settings that change what the scene shows or costs."""
     plan = make_plan(Request(scene, PRESETS["reference"], size))
     running = {stage.name for stage, _ in plan.stages}
-    soft = any(light.radius > 0.0 for light in scene.lights)
+    needed = {
+        "light_shadow": any(light.radius > 0.0 for light in scene.lights),
+        "area_light": any(map(emits_light, scene.objects)),
+    }
     return tuple(
-        setting
-        for setting in SETTINGS
-        if not running.isdisjoint(setting.stages) and (setting.name != "light_shadow" or soft)
+        setting for setting in SETTINGS if not running.isdisjoint(setting.stages) and needed.get(setting.name, True)
     )
 
 

@@ -41,6 +41,7 @@ _OUTPUT = {
     "mirror_ball": "mirrored",
     "edge_samples": "virtual",
     "light_shadow": "physical_added",
+    "area_light": "physical_added",
     "expose": "image",
 }
 """What a setting's stage writes; settings that are not here change the size of what is written."""

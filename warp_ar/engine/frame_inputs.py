@@ -275,7 +275,7 @@ class FrameInputs:
         """What of this frame virtual objects and lights can reach."""
         rects = (self.rects[name] for name in RECTS)
         objects, light, shadows, balls = (rect[0] < rect[1] and rect[2] < rect[3] for rect in rects)
-        shines = bool(self.block.host("lights")["intensity"].any())
+        shines = self.host_scene.has_area_lights or bool(self.block.host("lights")["intensity"].any())
         falls = bool(self.host_scene.light_outline().polygons)
         return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
 

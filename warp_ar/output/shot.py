@@ -21,6 +21,7 @@ from warp_ar.scene import Camera, Pose, Scene
 from warp_ar.scene.description import (
     RGB,
     Color,
+    EmissiveMaterial,
     FileMaterial,
     Light,
     MetallicRoughnessMaterial,
@@ -34,7 +35,7 @@ from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names
 from warp_ar.scene.object_materials import look_of as materials_of
-from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
+from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
 
 Matrix = npt.NDArray[np.float64]
 
@@ -153,7 +154,11 @@ def mesh_of(item: Object | Proxy) -> Mesh:
         return torus_mesh(item.major_radius, item.minor_radius)
     if item.shape == "box":
         return box_mesh(item.size)
-    x, y = (0.5 * length for length in item.size)
+    if isinstance(item, Object) and item.shape == "disk":
+        return disk_mesh(item.radius)
+    if isinstance(item, Object) and item.shape == "tube":
+        return tube_mesh(item.radius, item.length)
+    x, y = (0.5 * length for length in item.size[:2])
     corners = [[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]]
     return make_mesh(corners, [[0, 1, 2], [0, 2, 3]], [[0, 0, 1]] * 4, [[0, 0], [1, 0], [1, 1], [0, 1]])
 
@@ -165,7 +170,7 @@ def look_of(item: Object, mesh: Mesh) -> Look:
     reflectance straight on; a mirror becomes a metal without roughness.
     """
     material = materials_of(item).materials[0].surface
-    assert not isinstance(material, FileMaterial)
+    assert not isinstance(material, FileMaterial | EmissiveMaterial)
     if isinstance(material, PhongMaterial):
         alpha = math.sqrt(2.0 / (material.shininess + 2.0))
         factor, texture = _colored(material.diffuse, mesh)

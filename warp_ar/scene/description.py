@@ -298,25 +298,44 @@ class MirrorMaterial:
 
 
 @dataclasses.dataclass(frozen=True)
+class EmissiveMaterial:
+    """Sends out light of its own, alike in all directions, and reflects none."""
+
+    color: RGB = (1.0, 1.0, 1.0)
+    """Factor on the radiance per channel."""
+    intensity: float = 1.0
+    """Radiance in camera values: 1 is what the camera clips."""
+    image: Path | None = None
+    """Picture that multiplies the radiance: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
+    two_sided: bool = False
+    """Whether the back of an open surface emits too; else it is not there from behind, but throws a shadow."""
+
+
+@dataclasses.dataclass(frozen=True)
 class FileMaterial:
     """The materials that the mesh's file brings; matt white where it brings none."""
 
 
-Material: TypeAlias = FileMaterial | PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial
+Material: TypeAlias = (
+    FileMaterial | PhongMaterial | MetallicRoughnessMaterial | LambertMaterial | MirrorMaterial | EmissiveMaterial
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Object:
     """A virtual object; a point p of its shape stands at R (scale p) + at. Fields unused by its shape are zero."""
 
-    shape: Literal["mesh", "sphere", "box", "torus"]
-    """Spheres, boxes and tori are centred at their origin; a torus lies around its z axis."""
+    shape: Literal["mesh", "sphere", "box", "torus", "rect", "disk", "tube"]
+    """All but meshes are centred at their origin; a torus and a tube lie around their z axis, a rect and a disk face
+    their own +z."""
     file: Path | None = None
     """Mesh file; under another material than its own its textures of the base colour multiply the first colour."""
     radius: float = 0.0
-    """Radius of a sphere in metres."""
-    size: Vec3 = (0.0, 0.0, 0.0)
-    """Whole lengths of a box in metres."""
+    """Radius of a sphere, a disk or a tube in metres."""
+    size: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Whole lengths of a box, or of a rect along x and y, in metres."""
+    length: float = 0.0
+    """Length of a tube in metres; its ends are open."""
     major_radius: float = 0.0
     """Distance of a torus's tube from its axis in metres."""
     minor_radius: float = 0.0
@@ -393,6 +412,50 @@ class Light:
 
 
 @dataclasses.dataclass(frozen=True)
+class AreaLight:
+    """A virtual light with an extent, which the picture shows: an object that emits."""
+
+    kind: Literal["rect", "disk", "sphere", "tube"]
+    """A rect and a disk shine where their own +z points; a tube lies around its z axis."""
+    intensity: float
+    """Radiance in camera values: 1 is what the camera clips."""
+    color: RGB = (1.0, 1.0, 1.0)
+    """Factor on the radiance per channel."""
+    at: Vec3 = (0.0, 0.0, 0.0)
+    """Centre in metres."""
+    rotate: Vec3 = (0.0, 0.0, 0.0)
+    """Degrees about the fixed x, then y, then z axis; [180, 0, 0] turns a rect or disk down."""
+    size: tuple[float, ...] = ()
+    """Whole lengths of a rect along x and y in metres."""
+    radius: float = 0.0
+    """Radius of a disk, sphere or tube in metres."""
+    length: float = 0.0
+    """Length of a tube in metres; its ends are open."""
+    image: Path | None = None
+    """Picture that multiplies the radiance of a rect: sRGB-encoded, or linear radiance (HDR, OpenEXR)."""
+    two_sided: bool = False
+    """Whether the back of a rect or disk shines too; else it is not there from behind, but throws a shadow."""
+    animate: Animation | None = None
+    """How it moves."""
+    marker: Marker | None = None
+    """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+
+    def as_object(self) -> Object:
+        """The object that it is in a ``Scene``."""
+        return Object(
+            self.kind,
+            radius=self.radius,
+            size=self.size or Object.size,
+            length=self.length,
+            at=self.at,
+            rotate=self.rotate,
+            material=EmissiveMaterial(self.color, self.intensity, self.image, self.two_sided),
+            animate=self.animate,
+            marker=self.marker,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class CapturedLight:
     """Light of the environment from a file instead of from a mirror ball in the frames."""
 
@@ -449,9 +512,9 @@ class Scene:
     proxies: tuple[Proxy, ...] = ()
     """The physical objects that are modelled."""
     objects: tuple[Object, ...] = ()
-    """Virtual objects."""
+    """Virtual objects; those that emit are lights."""
     lights: tuple[Light, ...] = ()
-    """Virtual lights."""
+    """Virtual lights that the picture does not show."""
     captured: CapturedLight | None = None
     """Light of the environment from a file; mirror balls are then objects like others."""
     pose: PoseSpec | None = None

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, Final
 
 from warp_ar.scene.description import (
+    EmissiveMaterial,
     FileMaterial,
     LambertMaterial,
     Material,
@@ -23,17 +24,27 @@ OBJECT_KEYS: Final = {
     "sphere": ("radius",),
     "box": ("size",),
     "torus": ("major_radius", "minor_radius"),
+    "rect": ("size",),
+    "disk": ("radius",),
+    "tube": ("radius", "length"),
 }
 LIGHT_KEYS: Final = {
     "point": ("at", "attenuation", "radius"),
     "spot": ("at", "target", "direction", "inner_angle", "outer_angle", "attenuation", "radius"),
     "directional": ("direction",),
 }
+AREA_LIGHT_KEYS: Final = {
+    "rect": ("at", "rotate", "size", "image", "two_sided"),
+    "disk": ("at", "rotate", "radius", "two_sided"),
+    "sphere": ("at", "rotate", "radius"),
+    "tube": ("at", "rotate", "radius", "length"),
+}
 MATERIALS: Final[dict[str, type[Material]]] = {
     "phong": PhongMaterial,
     "metallic_roughness": MetallicRoughnessMaterial,
     "lambert": LambertMaterial,
     "mirror": MirrorMaterial,
+    "emissive": EmissiveMaterial,
     "file": FileMaterial,
 }
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from warp_ar.scene.description import (
     Color,
+    EmissiveMaterial,
     FileMaterial,
     LambertMaterial,
     Material,
@@ -25,6 +26,7 @@ from warp_ar.scene.description import (
     PhongMaterial,
     Scene,
 )
+from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import mesh_from_trimesh
@@ -109,18 +111,22 @@ def look_of(item: Object) -> Look:
         SceneError: Its mesh cannot be read.
     """
     mesh = mesh_of(item)
-    if mesh is None:
+    if isinstance(item.material, EmissiveMaterial):
+        materials: tuple[MeshMaterial, ...] = (_emissive(item, item.material, mesh),)
+    elif mesh is None:
         surface = LambertMaterial() if isinstance(item.material, FileMaterial) else item.material
-        materials: tuple[MeshMaterial, ...] = (MeshMaterial(surface=surface),)
+        materials = (MeshMaterial(surface=surface),)
     elif isinstance(item.material, FileMaterial):
         materials = mesh.materials or _NO_FILE
-        if _is_closed(mesh):
+        if is_closed(mesh):
             materials = tuple(dataclasses.replace(material, double_sided=True) for material in materials)
     else:
         bases = [material.base for material in mesh.materials] if mesh.uvs is not None else []
         materials = tuple(MeshMaterial(surface=item.material, base=base) for base in bases or [None])
     own = isinstance(item.material, FileMaterial)
-    pictured = any(isinstance(value, Path) for material in materials for value in vars(material.surface).values())
+    pictured = isinstance(item.material, EmissiveMaterial) or any(
+        isinstance(value, Path) for material in materials for value in vars(material.surface).values()
+    )
     plain = all(material.plain for material in materials) and len(set(materials)) == 1
     colored = own and mesh is not None and mesh.colors is not None
     return Look(
@@ -131,8 +137,20 @@ def look_of(item: Object) -> Look:
     )
 
 
+def _emissive(item: Object, material: EmissiveMaterial, mesh: Mesh | None) -> MeshMaterial:
+    """What sends out light as a material of triangles; its picture is the scene's."""
+    peak = 1.0 if material.image is None else load_emission(material.image)[1]
+    red, green, blue = (peak * material.intensity * factor for factor in material.color)
+    closed = item.shape in ("sphere", "box", "torus") or (mesh is not None and is_closed(mesh))
+    return MeshMaterial(
+        surface=LambertMaterial((0.0, 0.0, 0.0)),
+        double_sided=closed or material.two_sided,
+        emission=(red, green, blue),
+    )
+
+
 @functools.lru_cache(maxsize=64)
-def _is_closed(mesh: Mesh) -> bool:
+def is_closed(mesh: Mesh) -> bool:
     """Whether nobody outside of a mesh sees a triangle from behind: every edge has its way back."""
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     _, place = np.unique(corners, axis=0, return_inverse=True)

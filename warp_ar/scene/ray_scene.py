@@ -21,6 +21,7 @@ from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.kernels.visibility import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
+from warp_ar.scene.area_lights import emits, make_area_table
 from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.object_materials import (
@@ -33,8 +34,9 @@ from warp_ar.scene.object_materials import (
 )
 from warp_ar.scene.pose import Pose
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
-from warp_ar.scene.shapes import silhouette_tolerance, torus_mesh
-from warp_ar.scene.texture_pack import DECODE, TexturePack, mask_cutoff
+from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
+from warp_ar.scene.texture_codes import DECODE
+from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -56,6 +58,8 @@ _MODELS: Final[dict[type, int]] = {
     scenes.MirrorMaterial: structs.MIRROR,
 }
 
+PICTURE_CELLS: Final = 16
+"""Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
 _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
 _AWAY_SCALE: Final = 1e-6
@@ -66,8 +70,10 @@ _ONE_WAY: Final = 0.999
 
 
 def shape_kind(item: scenes.Object | scenes.Proxy) -> int:
-    """Kind of ``structs.Shape`` that an object or proxy becomes; a torus becomes a fine mesh."""
-    return int(structs.MESH if item.shape == "torus" else _SHAPES[item.shape])
+    """Kind of ``structs.Shape`` that an object or proxy becomes; what has no kind of its own becomes a fine mesh."""
+    if isinstance(item, scenes.Object) and _mesh_key(item) is not None:
+        return int(structs.MESH)
+    return int(_SHAPES[item.shape])
 
 
 def light_kind(light: scenes.Light) -> int:
@@ -106,6 +112,7 @@ def skeleton(scene: scenes.Scene) -> Any:
             tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
             any(map(reflects_diffusely, look_of(item).materials)),
             any(map(reflects_glossily, look_of(item).materials)),
+            tuple(map(emits, look_of(item).materials)),
         )
         for item in scene.objects
     )
@@ -231,6 +238,24 @@ class HostScene:
         ray_scene.pixel_spread = 1.0 / max(scene.camera.fx, scene.camera.fy)
         self._add_corners(ray_scene, device)
         self.ray_scene = ray_scene
+        self._write_area_lights(device)
+
+    def _write_area_lights(self, device: Any) -> None:
+        """The table of what emits; numbers of a scene with the same ``skeleton`` may change it."""
+        keys = map(_mesh_key, self.scene.objects)
+        table = make_area_table(self.scene.objects, [None if key is None else self._meshes[key][0] for key in keys])
+        self.has_area_lights = len(table.lights) > 0
+        if not self.has_area_lights:
+            return
+        scene = self.ray_scene
+        if scene.emitting_shares is not None and scene.emitting_shares.shape == table.shares.shape:
+            scene.area_lights.assign(table.lights)
+            scene.emitting_faces.assign(table.faces)
+            scene.emitting_shares.assign(table.shares)
+            return
+        scene.area_lights = wp.array(table.lights, dtype=structs.AreaLight, device=device)
+        scene.emitting_faces = wp.array(table.faces, dtype=wp.vec3i, device=device)
+        scene.emitting_shares = wp.array(table.shares, dtype=wp.float32, device=device)
 
     def _add_corners(self, ray_scene: Any, device: Any) -> None:
         """What the corners and triangles of all meshes hold; what no mesh calls for stays empty."""
@@ -273,6 +298,7 @@ class HostScene:
         self._lit = None
         self._balls = ball_outline(scene)
         self._lights_edited = True
+        self._write_area_lights(self.ray_scene.materials.device)
 
     def _place_objects(self) -> None:
         looks = [look_of(item) for item in self.scene.objects]
@@ -316,7 +342,7 @@ class HostScene:
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
-            mesh = key if isinstance(key, Mesh) else file_mesh(key) if isinstance(key, Path) else torus_mesh(*key)
+            mesh = _make_mesh(key)
             ray_mesh = shared_ray_mesh(mesh, device) if isinstance(key, Path) else make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
@@ -326,7 +352,7 @@ class HostScene:
         """Write a material of an object into a record of ``structs.Material``."""
         mesh = mesh_of(item)
         surface = material.surface
-        assert not isinstance(surface, scenes.FileMaterial)
+        assert not isinstance(surface, scenes.FileMaterial | scenes.EmissiveMaterial)
         first = surface.diffuse if isinstance(surface, scenes.PhongMaterial) else surface.base_color
         specular = surface.specular if isinstance(surface, scenes.PhongMaterial) else (0.0, 0.0, 0.0)
         for color in (first, specular):
@@ -353,7 +379,8 @@ class HostScene:
         record["emission"] = material.emission
         for name in ("metallic_roughness", "normal", "occlusion"):
             record[f"{name}_texture"] = add(getattr(material, name), images, encoded=False)
-        record["emissive_texture"] = add(material.emissive, images, encoded=True)
+        image = item.material.image if isinstance(item.material, scenes.EmissiveMaterial) else None
+        record["emissive_texture"] = add(material.emissive, images, encoded=True, path=image)
         record["normal_scale"], record["occlusion_strength"] = material.normal_scale, material.occlusion_strength
 
     def write_objects(
@@ -430,7 +457,10 @@ class HostScene:
         if self._lit is None:
             faces = [box_faces(record) for record in _present(self._proxies)]
             shining = self._shining()
-            self._lit = Outline([part for light in shining for own in faces for part in lit_faces(light, own)])
+            parts = [part for light in shining for own in faces for part in lit_faces(light, own)]
+            if self.has_area_lights:
+                parts = [part for own in faces for part in own]  # what emits may be large: all is taken for lit
+            self._lit = Outline(parts)
             self._bounced = None
         if not bounced:
             return self._lit
@@ -479,10 +509,36 @@ def _mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
     """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
     if item.shape == "mesh":
         return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
-    if isinstance(item, scenes.Object) and item.shape == "torus":
+    if not isinstance(item, scenes.Object):
+        return None
+    if item.shape == "torus":
         outer = item.scale * (item.major_radius + item.minor_radius)
         return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
+    gap = silhouette_tolerance(item.scale * max(item.radius, 0.5 * item.length)) / item.scale
+    emissive = isinstance(item.material, scenes.EmissiveMaterial)
+    match item.shape:
+        case "rect":
+            pictured = emissive and item.material.image is not None  # type: ignore[union-attr]
+            return "rect", item.size[:2], PICTURE_CELLS if pictured else 1
+        case "disk":
+            return "disk", item.radius, gap
+        case "tube":
+            return "tube", item.radius, item.length, gap
+        case "box" if emissive:
+            return "box", item.size
     return None
+
+
+_MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": tube_mesh, "box": box_mesh}
+
+
+def _make_mesh(key: Any) -> Mesh:
+    """What ``_mesh_key`` says."""
+    if isinstance(key, Mesh):
+        return key
+    if isinstance(key, Path):
+        return file_mesh(key)
+    return _MAKERS[key[0]](*key[1:]) if key[0] in _MAKERS else torus_mesh(*key)
 
 
 def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:

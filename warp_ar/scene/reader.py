@@ -27,11 +27,13 @@ from warp_ar.scene.description import (
     RGB,
     SCHEMA,
     Animation,
+    AreaLight,
     Board,
     Camera,
     CapturedLight,
     CharucoBoard,
     Color,
+    EmissiveMaterial,
     Exposure,
     FileMaterial,
     GridBoard,
@@ -51,7 +53,16 @@ from warp_ar.scene.description import (
     Vec3,
 )
 from warp_ar.scene.exif import camera_by_exif
-from warp_ar.scene.keys import IN_MEMORY, INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
+from warp_ar.scene.keys import (
+    AREA_LIGHT_KEYS,
+    IN_MEMORY,
+    INTRINSICS,
+    LIGHT_KEYS,
+    MATERIALS,
+    OBJECT_KEYS,
+    PROXY_KEYS,
+    keys_of,
+)
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
 from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
@@ -151,6 +162,12 @@ class _Table:
         value = self.text(key, default, right=right)
         if value not in options:
             self.fail(key, f"expected {right}" if few else f"unknown; {nearest(value, options)}")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        value = self.data.get(key, default)
+        if not isinstance(value, bool):
+            self.fail(key, "expected true or false")
         return value
 
     def vector(
@@ -400,8 +417,9 @@ def _read_object(table: _Table) -> Object:
     return Object(
         shape=cast(Any, shape),
         file=_read_mesh_path(table) if shape == "mesh" else None,
-        radius=table.length("radius") if shape == "sphere" else Object.radius,
-        size=table.vec3("size", low=SMALLEST, unit="metres") if shape == "box" else Object.size,
+        radius=table.length("radius") if "radius" in OBJECT_KEYS[shape] else Object.radius,
+        size=_read_size(table, shape),
+        length=table.length("length") if shape == "tube" else Object.length,
         major_radius=major,
         minor_radius=minor,
         at=table.vec3("at", Object.at, unit="metres"),
@@ -411,6 +429,12 @@ def _read_object(table: _Table) -> Object:
         animate=_read_animation(table),
         marker=_read_own_marker(table),
     )
+
+
+def _read_size(table: _Table, shape: str) -> tuple[float, ...]:
+    """Whole lengths of a rect or a box."""
+    sides = {"rect": 2, "box": 3}.get(shape)
+    return Object.size if sides is None else table.vector("size", sizes=(sides,), low=SMALLEST, unit="metres")
 
 
 def _read_material(parent: _Table) -> Material:
@@ -435,6 +459,13 @@ def _read_material(parent: _Table) -> Material:
         )
     if kind is LambertMaterial:
         return LambertMaterial(table.reflectance("base_color", LambertMaterial.base_color))
+    if kind is EmissiveMaterial:
+        return EmissiveMaterial(
+            color=table.vec3("color", EmissiveMaterial.color, low=0.0),
+            intensity=table.number("intensity", EmissiveMaterial.intensity, low=0.0),
+            image=table.file("image", "a picture") if "image" in table else None,
+            two_sided=table.flag("two_sided", EmissiveMaterial.two_sided),
+        )
     return MirrorMaterial(table.reflectance("base_color", MirrorMaterial.base_color))
 
 
@@ -455,9 +486,29 @@ def _read_animation(parent: _Table) -> Animation | None:
     )
 
 
-def _read_light(table: _Table) -> Light:
-    kind = table.choice("kind", LIGHT_KEYS)
-    table.only("kind", LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
+def _read_area_light(table: _Table, kind: str) -> AreaLight:
+    return AreaLight(
+        kind=cast(Any, kind),
+        intensity=table.number("intensity", low=0.0),
+        color=table.vec3("color", AreaLight.color, low=0.0),
+        at=table.vec3("at", unit="metres"),
+        rotate=table.vec3("rotate", AreaLight.rotate, unit="degrees"),
+        size=_read_size(table, kind) if kind == "rect" else AreaLight.size,
+        radius=table.length("radius") if kind != "rect" else AreaLight.radius,
+        length=table.length("length") if kind == "tube" else AreaLight.length,
+        image=table.file("image", "a picture") if "image" in table else None,
+        two_sided=table.flag("two_sided", AreaLight.two_sided),
+        animate=_read_animation(table),
+        marker=_read_own_marker(table),
+    )
+
+
+def _read_light(table: _Table) -> Light | AreaLight:
+    kinds = {**LIGHT_KEYS, **AREA_LIGHT_KEYS}
+    kind = table.choice("kind", kinds)
+    table.only("kind", kinds[kind], (key for keys in kinds.values() for key in keys))
+    if kind in AREA_LIGHT_KEYS:
+        return _read_area_light(table, kind)
     spot = kind == "spot"
     at = Light.at if kind == "directional" else table.vec3("at", unit="metres")
     target = table.vec3("target", unit="metres") if "target" in table else None
@@ -667,6 +718,9 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     lights, captured = _split_lights(data.get("light", []), label)
     data = {**data, "light": lights}
     marker = one("marker", keys_of(Marker), _read_marker)
+    shining = many("light", keys_of(Light, AreaLight), _read_light)
+    emitting = tuple(light.as_object() for light in shining if isinstance(light, AreaLight))
+    objects = many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], _read_object)
     scene = Scene(
         schema=SCHEMA,
         name=top.text("name", "scene" if path is None else path.stem),
@@ -679,8 +733,8 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
         marker=marker or Marker(),
         probes=many("probe", keys_of(Probe), _read_probe, single=True),
         proxies=many("proxy", keys_of(Proxy), _read_proxy),
-        objects=many("object", [key for key in keys_of(Object) if ("object", key) not in IN_MEMORY], _read_object),
-        lights=many("light", keys_of(Light), _read_light),
+        objects=objects + emitting,
+        lights=tuple(light for light in shining if isinstance(light, Light)),
         captured=None if captured is None else _read_captured(_Table(label, folder, *captured, keys_of(CapturedLight))),
         pose=one("pose", _POSE_KEYS, _read_pose),
         has_marker="marker" in data or "pose" not in data,

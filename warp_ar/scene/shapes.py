@@ -113,6 +113,63 @@ def box_mesh(size: Sequence[float]) -> Mesh:
     )
 
 
+def rect_mesh(size: Sequence[float], cells: int = 1) -> Mesh:
+    """Rectangle in its own x and y that faces +z, centred at the origin.
+
+    Args:
+        size: Lengths along x and y in metres.
+        cells: Into how many it is cut along either; each is two triangles.
+
+    Returns:
+        The mesh; u runs along x, v along y.
+    """
+    u, v, faces = _grid(cells, cells)
+    vertices = np.stack([(u - 0.5) * size[0], (v - 0.5) * size[1], np.zeros_like(u)], axis=-1)
+    return make_mesh(vertices, faces, np.tile([0.0, 0.0, 1.0], (len(u), 1)), np.stack([u, v], axis=-1))
+
+
+def disk_mesh(radius: float, tolerance: float | None = None) -> Mesh:
+    """Disk in its own x and y that faces +z, centred at the origin.
+
+    Args:
+        radius: Radius in metres.
+        tolerance: Largest gap between triangles and circle in metres; :func:`silhouette_tolerance` if left out.
+
+    Returns:
+        The mesh; texture coordinates span the square around it.
+    """
+    count = _segments(radius, silhouette_tolerance(radius) if tolerance is None else tolerance)
+    phi = 2.0 * np.pi * np.arange(count) / count
+    rim = np.stack([np.cos(phi), np.sin(phi), np.zeros(count)], axis=-1)
+    vertices = np.concatenate([np.zeros((1, 3)), rim])
+    k = np.arange(count)
+    faces = np.stack([np.zeros(count, int), 1 + k, 1 + (k + 1) % count], axis=-1)
+    normals = np.tile([0.0, 0.0, 1.0], (count + 1, 1))
+    return make_mesh(radius * vertices, faces, normals, 0.5 + 0.5 * vertices[:, :2])
+
+
+def tube_mesh(radius: float, length: float, tolerance: float | None = None) -> Mesh:
+    """Side of a cylinder around the z axis, centred at the origin; its ends are open.
+
+    Args:
+        radius: Radius in metres.
+        length: Along z in metres.
+        tolerance: Largest gap between triangles and cylinder in metres; :func:`silhouette_tolerance` if left out.
+
+    Returns:
+        The mesh; u runs around the axis from +x through +y, v along it.
+    """
+    count = _segments(radius, silhouette_tolerance(radius) if tolerance is None else tolerance)
+    turn, side = np.meshgrid(np.arange(count + 1), np.arange(2), indexing="ij")
+    phi = 2.0 * np.pi * (turn % count) / count
+    normals = np.stack([np.cos(phi), np.sin(phi), np.zeros_like(phi)], axis=-1).reshape(-1, 3)
+    vertices = radius * normals
+    vertices[:, 2] = length * (side.ravel() - 0.5)
+    a = 2 * np.arange(count)
+    faces = np.stack([a, a + 2, a + 3, a, a + 3, a + 1], axis=-1).reshape(-1, 3)
+    return make_mesh(vertices, faces, normals, np.stack([turn.ravel() / count, side.ravel()], axis=-1))
+
+
 def _grid(columns: int, rows: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
     """Parameters u and v of a grid's (rows + 1) x (columns + 1) vertices, and two triangles per cell."""
     v, u = np.meshgrid(np.arange(rows + 1) / rows, np.arange(columns + 1) / columns, indexing="ij")

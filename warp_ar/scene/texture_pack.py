@@ -19,38 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.kernels import structs
+from warp_ar.scene.emissive_picture import RADIANCE_SUFFIXES, load_emission
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse
+from warp_ar.scene.texture_codes import DECODE, encode_texture, linear_texture
 
 FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
 
 _WRAPS: Final = {"repeat": structs.REPEATED, "clamp": structs.CLAMP, "mirror": structs.MIRRORED}
-
-
-def _decode_table() -> FloatArray:
-    code = np.arange(256) / 255.0
-    encoded = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([code, encoded]).astype(np.float32)
-
-
-DECODE: Final = _decode_table()
-"""Value of each linear code, then of each sRGB-encoded one (IEC 61966-2-1), (512,)."""
-
-
-def linear_texture(texture: ByteArray) -> FloatArray:
-    """Linear RGB of an sRGB-encoded picture, (h, w, 3)."""
-    linear: FloatArray = DECODE[256:][texture]
-    return linear
-
-
-def encode_texture(linear: npt.NDArray[Any], *, encoded: bool) -> ByteArray:
-    """Codes whose values are nearest to linear ones, any shape."""
-    if not encoded:
-        return np.asarray(np.round(np.clip(linear, 0.0, 1.0) * 255.0), dtype=np.uint8)
-    values = DECODE[256:]
-    codes: ByteArray = np.searchsorted(0.5 * (values[1:] + values[:-1]), linear).astype(np.uint8)
-    return codes
 
 
 def mip_levels(picture: ByteArray, *, encoded: bool, cutoff: float | None = None) -> list[ByteArray]:
@@ -169,7 +146,7 @@ def _picture(image: ByteArray | None, path: Path | None) -> ByteArray:
     if path is None:
         assert image is not None
         return image
-    own = load_texture(path)
+    own = load_emission(path)[0] if path.suffix.lower() in RADIANCE_SUFFIXES else load_texture(path)
     if image is None:
         return np.concatenate([own, np.full((*own.shape[:2], 1), 255, np.uint8)], axis=2)
     height, width = (max(image.shape[axis], own.shape[axis]) for axis in (0, 1))

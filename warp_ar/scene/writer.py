@@ -97,6 +97,8 @@ def _value(item: Any, base: Path | None) -> str:
     """A value as TOML; paths inside ``base`` are relative to it."""
     if isinstance(item, Path):
         item = (item.relative_to(base) if base and item.is_relative_to(base) else item).as_posix()
+    if isinstance(item, bool):
+        return str(item).lower()
     if isinstance(item, str):
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007F")  # TOML, unlike JSON, escapes DEL
     if isinstance(item, Board):

@@ -7,11 +7,15 @@ forms of the environment exist. Nobody asks here whether a stage has readers: th
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
+from warp_ar.kernels.area_lights import POINT_SAMPLES
 from warp_ar.kernels.expose import BOXES
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
+from warp_ar.scene.area_lights import emits_light
 from warp_ar.scene.object_materials import is_detailed, reflects_diffusely, reflects_glossily, scene_materials
 from warp_ar.scene.ray_scene import has_sized_lights, material_model, proxies_face, trace_config
 from warp_ar.stages.quality import Quality
@@ -21,6 +25,12 @@ FLAT = "flat"
 """Method of ``relight`` that needs nothing of the environment."""
 LOCAL = ("bounce", "brute_force")
 """Methods of ``relight`` that know which part of the environment reaches a point, and what lit surfaces send on."""
+
+
+AREA_SAMPLES: Mapping[str, int] = MappingProxyType(
+    {"point": POINT_SAMPLES, "coarse": 8, "fine": 32, "brute_force": 256}
+)
+"""Samples of what emits, per point, by method of ``area_light``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +67,8 @@ class Features:
     """Proxies that virtual light falls on light each other."""
     soft_lights: bool
     """Virtual lights with a size cast soft shadows."""
+    area_samples: int
+    """Samples of objects that emit, per point that they light; 0: none does."""
     near_field: bool
     """Objects show what surrounds them at close range."""
     irradiance: Literal["irradiance_sh", "irradiance_map"]
@@ -94,7 +106,9 @@ def find_features(request: Request) -> Features:
     exposed = "physical_added" in layers if isinstance(scale, str) else scale != 1.0
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
-    lit_by_both = bool(environment and scene.lights and scene.proxies)
+    shines = sheds_light(scene)
+    lit_by_both = bool(environment and shines and scene.proxies)
+    area_samples = AREA_SAMPLES[area_method(quality)] if any(map(emits_light, scene.objects)) else 0
     placed = recovered or (environment and not observed and request.emitters)
     emitters = placed and quality.method("recover") == "shading"
     by_series = quality.method("irradiance") == "sh2"
@@ -114,9 +128,10 @@ def find_features(request: Request) -> Features:
         ambient_visibility=lit_by_both and relight_method in LOCAL,
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
+        area_samples=area_samples,
         near_field=environment and quality.method("shade") == "one_bounce",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
-        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters),
+        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters, gathered=area_samples == 0),
     )
 
 
@@ -125,11 +140,22 @@ def has_environment(scene: Scene) -> bool:
     return bool(scene.probes) or scene.captured is not None
 
 
+def sheds_light(scene: Scene) -> bool:
+    """Whether any virtual light exists: one that is nothing else, or an object that emits."""
+    return bool(scene.lights) or any(map(emits_light, scene.objects))
+
+
+def area_method(quality: Quality) -> str:
+    """How light of objects that emit is found."""
+    method = quality.method("area_light")
+    return method if method in AREA_SAMPLES else "coarse"
+
+
 def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     layers = []
     if scene.objects:
         layers.append("virtual")
-    if scene.lights and scene.proxies:
+    if scene.proxies and sheds_light(scene):
         layers.append("physical_added")
     shadows = quality.method("environment_shadow") not in ("default", "none")
     if shadows and scene.objects and scene.proxies and has_environment(scene):
@@ -139,7 +165,7 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     return tuple(layers)
 
 
-def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLightConfig:
+def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool, gathered: bool) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
     return DistantLightConfig(
@@ -151,4 +177,5 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLi
         probes=bool(scene.probes),
         emitters=emitters,
         captured=scene.captured is not None,
+        gathered=gathered,
     )

@@ -16,7 +16,7 @@ from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.structs import PLANE
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
-from warp_ar.stages.features import Features
+from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
@@ -62,6 +62,7 @@ class Relight(Stage):
     settings: ClassVar[tuple[str, ...]] = (
         "edge_samples",
         "light_shadow",
+        "area_light",
     )
     unseen_method: ClassVar[str | None] = "paper"
     numerics: ClassVar[Numerics] = Numerics(
@@ -80,7 +81,7 @@ class Relight(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Reads what its method needs to know of the environment and the desk."""
-        if not features.request.scene.lights:
+        if not sheds_light(features.request.scene):
             return LeftOut("the scene has no virtual light")
         if not features.lit:
             return LeftOut("the scene has no proxy for virtual light to fall on")

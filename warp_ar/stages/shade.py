@@ -44,6 +44,7 @@ class Shade(Stage):
     settings: ClassVar[tuple[str, ...]] = (
         "edge_samples",
         "light_shadow",
+        "area_light",
     )
     unseen_method: ClassVar[str | None] = "environment"
     numerics: ClassVar[Numerics] = Numerics(

@@ -36,4 +36,5 @@ def relight_config(features: Features) -> relight.RelightConfig:
         features.ambient_visibility,
         features.bounced,
         features.request.quality.edge_samples,
+        features.area_samples,
     )

@@ -15,4 +15,5 @@ def shade_config(features: Features) -> ShadeConfig:
         edge_samples=features.request.quality.edge_samples,
         soft=features.soft_lights,
         near_field=features.near_field,
+        area_samples=features.area_samples,
     )
