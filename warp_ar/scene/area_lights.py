@@ -152,7 +152,7 @@ def _picture_means(item: Object, mesh: Mesh, material: MeshMaterial, mine: npt.N
     """Mean value of the picture that says what triangles emit, (m, 3); 1 where none does."""
     use = material.base if material.unlit else material.emissive
     if isinstance(item.material, EmissiveMaterial) and item.material.image is not None:
-        picture, use = load_emission(item.material.image)[0], TextureUse(0)
+        picture, use = load_emission(item.material.image)[0], TextureUse(0, wrap=("clamp", "clamp"))
     elif use is not None:
         picture = np.ascontiguousarray(mesh.images[use.image][..., :3])
     uvs = None if use is None else (mesh.uvs if use.uv_set == 0 else mesh.uvs_second)

@@ -380,7 +380,7 @@ class HostScene:
         for name in ("metallic_roughness", "normal", "occlusion"):
             record[f"{name}_texture"] = add(getattr(material, name), images, encoded=False)
         image = item.material.image if isinstance(item.material, scenes.EmissiveMaterial) else None
-        record["emissive_texture"] = add(material.emissive, images, encoded=True, path=image)
+        record["emissive_texture"] = add(material.emissive, images, encoded=True, path=image, clamp=True)
         record["normal_scale"], record["occlusion_strength"] = material.normal_scale, material.occlusion_strength
 
     def write_objects(

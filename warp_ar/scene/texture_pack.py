@@ -87,6 +87,7 @@ class TexturePack:
         encoded: bool,
         cutoff: float | None = None,
         path: Path | None = None,
+        clamp: bool = False,
     ) -> int:
         """Index of the record of a texture, -1 for none.
 
@@ -96,12 +97,13 @@ class TexturePack:
             encoded: Whether RGB is sRGB-encoded.
             cutoff: As ``mip_levels``.
             path: A picture of the scene instead, or one to multiply it by.
+            clamp: Whether a picture of the scene goes on beyond its border as at it, instead of anew.
         """
         if use is None and path is None:
             return -1
         image = None if use is None else images[use.image]
         place_key = (id(image), path, encoded, cutoff)
-        use = use or TextureUse(0)
+        use = use or TextureUse(0, wrap=("clamp", "clamp") if clamp else ("repeat", "repeat"))
         key = (place_key, use.uv_set, use.transform, use.wrap, use.nearest)
         if key not in self._uses:
             if place_key not in self._places:
