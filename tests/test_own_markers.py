@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import warp as wp
@@ -18,6 +19,7 @@ from warp_ar.scene import (
     Marker,
     Object,
     Pose,
+    Probe,
     Proxy,
     Scene,
     dumps_scene,
@@ -168,3 +170,45 @@ def test_markers_that_cannot_be(world: str, marker: str, message: str) -> None:
     with pytest.raises(SceneError, match=message) as caught:
         loads_scene(text, "a.toml")
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_ball_on_its_card_may_be_moved(device: str) -> None:
+    """The light is read off the ball wherever its card is, and stays as it was while that is lost."""
+    ball = Probe((0.0, 0.07, 0.035), 0.035, marker=CARD)
+    scene = Scene(CAMERA, marker=WORLD, probes=(ball,), objects=(Object("sphere", radius=0.02),))
+    camera_from_world = look(30.0)
+
+    def photograph(x: float | None, color: tuple[int, int, int]) -> np.ndarray:
+        if x is None:
+            return render((WORLD, camera_from_world))
+        card = camera_from_world.after(place(x, 0.02, 20.0))
+        frame = render((WORLD, camera_from_world), (CARD, card))
+        at = card.apply(np.array(ball.center))
+        middle = 640.0 * at[:2] / at[2] + [319.5, 239.5]
+        radius = round(1.1 * 640.0 * ball.radius / at[2])  # a little more: the outline is an ellipse
+        cv2.circle(frame, tuple(np.round(middle).astype(int).tolist()), radius, color, -1)
+        return frame
+
+    red, blue = (200, 20, 20), (20, 20, 200)
+    quality = PRESETS["paper"]
+    with Pipeline(
+        scene, device=device, quality=quality, outputs=("image", "environment"), synchronous=True
+    ) as pipeline:
+        means = []
+        for k, (x, color) in enumerate([(-0.12, red), *[(0.12, blue)] * 4, (None, red)]):
+            environment = pipeline(photograph(x, color), time_seconds=2.0 * k).environment
+            means.append(np.asarray(environment).mean(axis=(0, 1)))
+    assert means[0][0] > 4.0 * means[0][2]
+    assert means[4][2] > 4.0 * means[4][0]
+    np.testing.assert_allclose(means[5], means[4], rtol=0.05)
+
+
+def test_scene_files_say_the_markers_of_balls() -> None:
+    text = (
+        HEADER
+        + "[marker]\nsize = 0.08\n[probe]\ncenter = [0, 0.07, 0.035]\nradius = 0.035\nmarker = { id = 7, size = 0.05 }\n"
+    )
+    scene = loads_scene(text)
+    assert scene.probes[0].marker == CARD
+    assert own_markers(scene) == (CARD,)
+    assert loads_scene(dumps_scene(scene)).probes == scene.probes

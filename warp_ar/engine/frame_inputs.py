@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ar import scene as scenes
 from warp_ar.device import exclusive
 from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
@@ -105,7 +106,7 @@ class FrameInputs:
         add("params", self.block.device_array("params"))
         add("light_array", self.block.device_array("lights"))
         add("ray_scene", self.host_scene.ray_scene)
-        add("probes", wp.array(_probe_values(scene), dtype=Probe, device=device))
+        add("probes", wp.array(_probe_values(scene.probes), dtype=Probe, device=device))
         add("decode", wp.array(camera_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("encode", wp.array(encode_table(self._camera.transfer), dtype=wp.vec3, device=device))
         add("rays", wp.array(pixel_rays(self._camera), dtype=wp.vec2, device=device))
@@ -235,6 +236,10 @@ class FrameInputs:
         objects = scene.write_objects(block.host("objects"), frame.seconds, places)
         if scene.write_proxies(block.host("proxies"), places):
             yield "pose"  # all that asks where the receiver is asks where the camera is
+        if frame.pose is not None and scene.place_probes(frame.pose, places):
+            self._arrays["probes"].assign(_probe_values(scene.probes))
+            self._probes = scene.probes
+            yield "pose"
         if lights or frame.index == 0:
             yield "lights"
         if objects or frame.index == 0:
@@ -293,8 +298,8 @@ class FrameInputs:
         return True
 
 
-def _probe_values(scene: Scene) -> npt.NDArray[Any]:
-    values = np.zeros(len(scene.probes), dtype=np.dtype(Probe.numpy_dtype()))
-    for value, probe in zip(values, scene.probes, strict=True):
+def _probe_values(probes: Sequence[scenes.Probe]) -> npt.NDArray[Any]:
+    values = np.zeros(len(probes), dtype=np.dtype(Probe.numpy_dtype()))
+    for value, probe in zip(values, probes, strict=True):
         value["center"], value["radius"], value["reflectance"] = probe.center, probe.radius, probe.reflectance
     return values

@@ -414,7 +414,8 @@ def refine_balls(scene: Scene, source: Source, *, frames: int = 24) -> tuple[Sce
     probes = []
     for probe in scene.probes:
         others = [other for other in scene.probes if other is not probe]
-        fit = fit_ball(views, camera, probe, scene.proxies, others, search=REFINE_SEARCH) if views else None
+        fixed = views and probe.marker is None
+        fit = fit_ball(views, camera, probe, scene.proxies, others, search=REFINE_SEARCH) if fixed else None
         fits.append(fit)
         if fit is not None and fit.is_good:
             x, y, z = (float(v) for v in fit.center)

@@ -242,6 +242,8 @@ def _still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bo
         hidden = ((points[:, :2] > low - margin) & (points[:, :2] < high + margin)).all(axis=1)
         hidden &= np.abs(points[:, 2]) < 0.02
         for probe in scene.probes:
+            if probe.marker is not None:
+                continue
             hidden |= np.linalg.norm(points - np.array(probe.center), axis=1) < 2.5 * probe.radius
         for box in scene.proxies:
             if box.shape == "box":

@@ -1,4 +1,4 @@
-"""Markers that objects, lights and proxies ride on, beside the one that the world is fixed to.
+"""Markers that objects, lights, proxies and mirror balls ride on, beside the one that the world is fixed to.
 
 Each marker or board is followed on its own, as the world's is. What rides on one stands where its marker is in the
 world: with the camera's poses from both, world_from_marker = world_from_camera camera_from_marker.
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.input.tracking import Tracker
-from warp_ar.scene import Camera, Light, Marker, Object, Pose, Proxy, Scene
+from warp_ar.scene import Camera, Light, Marker, Object, Pose, Probe, Proxy, Scene
 
 Places = Mapping[Marker, Pose | None]
 """``world_from_marker`` of each marker, None where it is lost."""
@@ -20,7 +20,7 @@ Places = Mapping[Marker, Pose | None]
 
 def own_markers(scene: Scene) -> tuple[Marker, ...]:
     """Markers that anything of a scene rides on, each once."""
-    items: tuple[Object | Light | Proxy, ...] = (*scene.objects, *scene.lights, *scene.proxies)
+    items: tuple[Object | Light | Proxy | Probe, ...] = (*scene.objects, *scene.lights, *scene.proxies, *scene.probes)
     return tuple(dict.fromkeys(item.marker for item in items if item.marker is not None))
 
 
@@ -31,7 +31,7 @@ class OwnMarkers:
         """Follow the markers of a scene.
 
         Args:
-            scene: Whose objects, lights and proxies ride on them.
+            scene: Whose objects, lights, proxies and balls ride on them.
             camera: Of the frames.
         """
         self._trackers = {marker: Tracker(marker, camera) for marker in own_markers(scene)}

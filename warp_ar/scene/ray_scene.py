@@ -62,6 +62,7 @@ PICTURE_CELLS: Final = 16
 """Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
 _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
+_BEHIND: Final = -1e3
 _AWAY_SCALE: Final = 1e-6
 """Where shapes wait whose marker is lost: no ray meets them, and no kernel has to ask."""
 
@@ -215,7 +216,8 @@ class HostScene:
         self._placed = b""  # the objects that the polygons below are of
         self._outline = Outline(())
         self._shaded: Outline | None = None
-        self._balls = ball_outline(scene)
+        self.probes = scene.probes
+        self._balls = ball_outline(scene.probes)
         self._lights_edited = False
         self._gain = np.ones(3)
         self.write_objects(np.zeros_like(self._objects), 0.0)
@@ -296,7 +298,7 @@ class HostScene:
         self._place_objects()
         self.ray_scene.materials.assign(self._material_records())
         self._lit = None
-        self._balls = ball_outline(scene)
+        self._balls = ball_outline(self.probes)
         self._lights_edited = True
         self._write_area_lights(self.ray_scene.materials.device)
 
@@ -417,6 +419,29 @@ class HostScene:
         if changed:
             self._lit = self._shaded = None
         return changed
+
+    def place_probes(self, pose: Pose, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE) -> bool:
+        """Move ``probes`` to where their markers are, far behind the camera while one is lost; whether any moved.
+
+        Args:
+            pose: ``camera_from_world``.
+            places: As ``write_objects``.
+        """
+        if all(probe.marker is None for probe in self.scene.probes):
+            return False
+        behind = pose.inverse().apply(np.array([0.0, 0.0, _BEHIND]))
+        placed = []
+        for probe in self.scene.probes:
+            if probe.marker is not None:
+                place = places.get(probe.marker)
+                x, y, z = map(float, behind if place is None else place.apply(np.array(probe.center)))
+                probe = dataclasses.replace(probe, center=(x, y, z))
+            placed.append(probe)
+        if tuple(placed) == self.probes:
+            return False
+        self.probes = tuple(placed)
+        self._balls = ball_outline(self.probes)
+        return True
 
     def write_lights(
         self, records_out: npt.NDArray[Any], seconds: float, places: Mapping[scenes.Marker, Pose | None] = _NOWHERE

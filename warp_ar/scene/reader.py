@@ -383,7 +383,8 @@ def _read_probe(table: _Table) -> Probe:
         reflectance = cast(RGB, table.vector("reflectance", low=0.01, high=1.0))
     elif "reflectance" in table:
         reflectance = (table.number("reflectance", low=0.01, high=1.0),) * 3
-    return Probe(table.vec3("center", unit="metres"), table.length("radius"), reflectance)
+    own = _read_own_marker(table)
+    return Probe(table.vec3("center", unit="metres"), table.length("radius"), reflectance, own)
 
 
 def _read_proxy(table: _Table) -> Proxy:
@@ -708,7 +709,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     def many(section: str, keys: Sequence[str], read: Any, *, single: bool = False) -> tuple[Any, ...]:
         value = data.get(section, [])
         if single and isinstance(value, dict):
-            return (read(_Table(label, folder, section, value, keys)),)
+            return (read(in_world(_Table(label, folder, section, value, keys))),)
         if not isinstance(value, list):
             raise SceneError(f"{label}: {section}: there may be several: write [[{section}]] instead of [{section}]")
         return tuple(

@@ -122,6 +122,7 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("probe", "center"): ("metres", "[-0.12, 0.03, 0.0346]", "radius = 0.035"),
     ("probe", "radius"): ("metres", "0.035", "center = [-0.12, 0.03, 0.0346]"),
     ("probe", "reflectance"): ("0 to 1 per channel", "[0.85, 0.85, 0.87]", "center = [0.1, 0.0, 0.03]\nradius = 0.03"),
+    ("probe", "marker"): ("-", "{ id = 7, size = 0.05 }", "center = [0.0, 0.06, 0.0346]\nradius = 0.035"),
     ("proxy", "shape"): ("-", '"plane"', "size = [1.6, 1.2]"),
     ("proxy", "at"): ("metres", "[0.0, 0.21, 0.0446]", 'shape = "plane"\nsize = [1.6, 1.2]'),
     ("proxy", "rotate"): ("degrees", "[0.0, 0.0, 9.0]", 'shape = "plane"\nsize = [1.6, 1.2]'),

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -64,9 +64,9 @@ def box_faces(record: Any) -> list[FloatArray]:
     return [corners[list(face)] for face in _FACES]
 
 
-def ball_outline(scene: scenes.Scene) -> Outline:
-    """Boxes around the mirror balls."""
-    boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in scene.probes]
+def ball_outline(probes: Iterable[scenes.Probe]) -> Outline:
+    """Boxes around mirror balls."""
+    boxes = [np.array(probe.center) + probe.radius * _CORNERS for probe in probes]
     return Outline([box[list(face)] for box in boxes for face in _FACES])
 
 

@@ -50,7 +50,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
         fields = {key: getattr(item.animate, key) for key in keys_of(Animation)}
         return [f"animate = {value({key: entry for key, entry in fields.items() if entry is not None})}"]
 
-    def own_marker(item: Object | Light | Proxy) -> list[str]:
+    def own_marker(item: Object | Light | Proxy | Probe) -> list[str]:
         if item.marker is None:
             return []
         own = item.marker
@@ -68,7 +68,7 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     if scene.pose is not None:
         lines += ["", "[pose]", *_pose_lines(scene.pose, value)]
     for probe in scene.probes:
-        lines += ["", "[[probe]]", *table(probe, keys_of(Probe))]
+        lines += ["", "[[probe]]", *table(probe, ("center", "radius", "reflectance")), *own_marker(probe)]
     for proxy in scene.proxies:
         lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
         lines += own_marker(proxy)

@@ -100,7 +100,9 @@ def find_features(request: Request) -> Features:
     observed = environment and scene.captured is None
     bracketed = observed and quality.method("recover") not in ("default", "clipped")
     # Without a card or anything else that is modelled, nothing tells what clipped light does.
-    recovered = bracketed and (scene.has_marker or bool(scene.proxies))
+    # What lies around a ball that is moved is another each time.
+    still = all(probe.marker is None for probe in scene.probes)
+    recovered = bracketed and still and (scene.has_marker or bool(scene.proxies))
     layers = _find_layers(scene, quality)
     scale = scene.exposure.scale
     exposed = "physical_added" in layers if isinstance(scale, str) else scale != 1.0
