@@ -12,6 +12,10 @@ sampled evenly in that angle [Arv95], p = P / Omega: a term of (1) is never abov
 beyond bounds where a light touches a receiver. A smaller one is sampled evenly by area, p = P d^2 / (A cos_light).
 A sphere is sampled evenly in the cone that it is seen under [SW91].
 
+A ray to a place costs more than the place. So of ``CANDIDATES`` places one is drawn, with a chance in proportion to
+w = |L_k| cos_k / p_k, and stands for all of them: its term is multiplied by (sum of w) / (candidates w_k) [Tal05]. What
+is not hidden has the noise of all candidates then, what is half hidden that of the rays.
+
 Highlights are the light's own shape. The lobe of a surface is integrated in one of two ways, whichever is narrower:
 where the lobe's solid angle is less than that of the object's bounding sphere, by rays into the lobe; else by (1). The
 choice depends on point and object alone, and each direction is counted once: there is no bias.
@@ -28,6 +32,7 @@ still stands still. Noise falls as 1 / n, not as 1 / sqrt n, where nothing hides
 
 References:
     [Arv95] Arvo, "Stratified Sampling of Spherical Triangles", SIGGRAPH 1995.
+    [Tal05] Talbot, Cline, Egbert, "Importance Resampling for Global Illumination", EGSR 2005.
     [SW91] Shirley, Wang, "Direct Lighting Calculation by Monte Carlo Integration", EGWR 1991.
 """
 
@@ -38,6 +43,7 @@ import math
 
 import warp as wp
 
+from warp_ar.kernels.color import brightness
 from warp_ar.kernels.materials import Surface, emitted_radiance, material_at, reflect, schlick, surface_point
 from warp_ar.kernels.sampling import (
     frame_from_normal,
@@ -54,6 +60,12 @@ wp.set_module_options({"enable_backward": False})
 
 POINT_SAMPLES = 1
 """Number of samples that stands for lights at one point."""
+CANDIDATES = 4
+"""Places of which one is looked at from the point, where samples are few."""
+MANY_SAMPLES = 128
+"""Number of samples from which on each is a place of its own."""
+LEAST_FACING = wp.constant(wp.float32(0.05))
+"""What a place counts that a surface does not face: its lobe may still look there."""
 # Solid angles between which a triangle is sampled by its angle. Directions lose 1e-7 / angle^2 to float32: 1e-3 here,
 # where all of a triangle is seen nearly alike anyway. Above, it is nearly a half space.
 LEAST_SOLID_ANGLE = wp.constant(wp.float32(1.0e-2))
@@ -63,6 +75,7 @@ NEARLY = wp.constant(wp.float32(1.0 - 1.0e-4))
 # Steps of the sequence whose points fill a square evenly for any number of them: powers of 1 / the plastic number.
 STEP_U = wp.constant(wp.float32(0.7548776662466927))
 STEP_V = wp.constant(wp.float32(0.5698402909980532))
+STEP_W = wp.constant(wp.float32(0.6180339887498949))  # the golden ratio's, for one number
 FOUR_PI = wp.constant(wp.float32(4.0 * math.pi))
 
 
@@ -294,17 +307,43 @@ def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSam
 
 @functools.cache
 def make_area_sample(samples: int) -> wp.Function:
-    """``area_sample(scene, point, k, turn) -> AreaSample``: number k of ``area_count``; its irradiance is a summand."""
+    """``area_sample(scene, point, normal, k, count, turn) -> AreaSample``: number k of ``area_count``, a summand.
 
-    @wp.func(name=f"area_sample_{int(samples == POINT_SAMPLES)}", module="unique")
-    def area_sample(scene: RayScene, point: wp.vec3, k: wp.int32, count: wp.int32, turn: wp.float32) -> AreaSample:
-        sample = AreaSample()
+    ``normal`` is that of the surface that receives it.
+    """
+    candidates = 1 if samples >= MANY_SAMPLES else CANDIDATES
+
+    @wp.func(name=f"area_sample_{0 if samples == POINT_SAMPLES else candidates}", module="unique")
+    def area_sample(
+        scene: RayScene, point: wp.vec3, normal: wp.vec3, k: wp.int32, count: wp.int32, turn: wp.float32
+    ) -> AreaSample:
+        chosen = AreaSample()
         if wp.static(samples == POINT_SAMPLES):
-            sample = light_as_point(scene, scene.area_lights[k], point)
+            chosen = light_as_point(scene, scene.area_lights[k], point)
+        elif wp.static(candidates == 1):
+            chosen = draw_on_area(scene, point, area_numbers(k, count, turn))
+            chosen.irradiance_normal = chosen.irradiance_normal / wp.float32(count)
         else:
-            sample = draw_on_area(scene, point, area_numbers(k, count, turn))
-            sample.irradiance_normal = sample.irradiance_normal / wp.float32(count)
-        return sample
+            total = float(0.0)
+            worth = float(0.0)
+            u = fraction((wp.float32(k) + 0.5) * STEP_W + 16.0 * turn * STEP_U)
+            tries = wp.int32(wp.static(candidates))  # a variable: the loop stays one
+            for c in range(tries):
+                sample = draw_on_area(scene, point, area_numbers(k * tries + c, count * tries, turn))
+                weight = brightness(sample.irradiance_normal) * (LEAST_FACING + wp.max(wp.dot(normal, sample.wi), 0.0))
+                total += weight
+                if weight > 0.0:
+                    share = weight / total
+                    if u < share:
+                        chosen = sample
+                        worth = weight
+                        u = u / share
+                    else:
+                        u = (u - share) / wp.max(1.0 - share, 1.0e-6)
+            if worth > 0.0:
+                scale = total / (worth * wp.float32(count * tries))
+                chosen.irradiance_normal = scale * chosen.irradiance_normal
+        return chosen
 
     return area_sample
 

@@ -350,7 +350,7 @@ def make_area_response(config: RelightConfig) -> wp.Function:
         total = wp.vec3()
         count = area_count(scene)
         for k in range(count):
-            area = area_sample(scene, hit.point, k, count, turn)
+            area = area_sample(scene, hit.point, hit.normal, k, count, turn)
             n_dot_l = wp.max(wp.dot(hit.normal, area.wi), 0.0)
             if wp.max(area.irradiance_normal) <= 0.0 or wp.dot(hit.geometric_normal, area.wi) <= 0.0:
                 continue

@@ -131,7 +131,7 @@ def make_lit_by_areas(config: ShadeConfig) -> wp.Function:
         count = area_count(scene)
         lobe = lobe_solid_angle(surface)
         for k in range(count):
-            area = area_sample(scene, hit.point, k, count, turn)
+            area = area_sample(scene, hit.point, normal, k, count, turn)
             if wp.max(area.irradiance_normal) > 0.0 and wp.dot(geometric, area.wi) > 0.0:
                 lit = surface
                 if wp.static(by_rays):

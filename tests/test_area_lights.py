@@ -41,12 +41,12 @@ def gather_kernel(
     total = wp.vec3()
     if point_like:
         for k in range(scene.area_lights.shape[0]):
-            sample = as_points(scene, points[i], k, 1, 0.0)
+            sample = as_points(scene, points[i], normals[i], k, 1, 0.0)
             total += wp.max(wp.dot(sample.wi, normals[i]), 0.0) * sample.irradiance_normal
     else:
         count = area_count(scene)
         for k in range(count):
-            sample = area_sample(scene, points[i], k, count, wp.float32(j) / 16.0)
+            sample = area_sample(scene, points[i], normals[i], k, count, wp.float32(j) / 16.0)
             total += wp.max(wp.dot(sample.wi, normals[i]), 0.0) * sample.irradiance_normal
     irradiance_out[i, j] = total
 
@@ -61,7 +61,7 @@ def draw_kernel(
     numbers_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    samples_out[i] = area_sample(scene, points[i], i % N, N, wp.float32((i / N) % 16) / 16.0)
+    samples_out[i] = area_sample(scene, points[i], wp.vec3(0.0, 0.0, 1.0), i % N, N, wp.float32((i / N) % 16) / 16.0)
     numbers_out[i] = area_numbers(i % N, N, wp.float32((i / N) % 16) / 16.0)
 
 

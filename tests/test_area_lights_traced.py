@@ -75,7 +75,7 @@ def picture_kernel(
     if ground.shape >= 0:
         count = area_count(scene)
         for k in range(count):
-            sample = area_sample(scene, ground.point, k, count, turn)
+            sample = area_sample(scene, ground.point, ground.normal, k, count, turn)
             cosine = wp.dot(ground.geometric_normal, sample.wi)
             if cosine > 0.0:
                 light = LightSample()

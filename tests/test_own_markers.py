@@ -204,11 +204,8 @@ def test_a_ball_on_its_card_may_be_moved(device: str) -> None:
 
 
 def test_scene_files_say_the_markers_of_balls() -> None:
-    text = (
-        HEADER
-        + "[marker]\nsize = 0.08\n[probe]\ncenter = [0, 0.07, 0.035]\nradius = 0.035\nmarker = { id = 7, size = 0.05 }\n"
-    )
-    scene = loads_scene(text)
+    own = "center = [0, 0.07, 0.035]\nradius = 0.035\nmarker = { id = 7, size = 0.05 }\n"
+    scene = loads_scene(f"{HEADER}[marker]\nsize = 0.08\n[probe]\n{own}")
     assert scene.probes[0].marker == CARD
     assert own_markers(scene) == (CARD,)
     assert loads_scene(dumps_scene(scene)).probes == scene.probes
