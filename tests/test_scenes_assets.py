@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 SCENES = pathlib.Path(__file__).resolve().parents[1] / "scenes"
-NAMES = ("darken", "desk", "mirror", "torus", "wire_coincident", "wire_opposing")
+NAMES = ("darken", "desk", "mirror", "screen", "torus", "wire_coincident", "wire_opposing")
 CLIP_BYTES = 2_500_000
 """Largest clip that may be committed."""
 NORMAL_TOLERANCE = 1e-5
@@ -31,7 +31,8 @@ def test_the_scenes_are_these() -> None:
 def test_every_file_exists(name: str) -> None:
     scene = load(name)
     assert scene["name"] == name
-    files = [scene["source"]["path"]] + [item["file"] for item in scene.get("object", []) if "file" in item]
+    items = [*scene.get("object", []), *scene.get("light", [])]
+    files = [scene["source"]["path"], *(item[key] for item in items for key in ("file", "image") if key in item)]
     for file in files:
         assert (SCENES / file).is_file(), file
 
