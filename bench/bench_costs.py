@@ -37,9 +37,10 @@ def main(device: str) -> None:
     more = {"clock": "processor" if by_work else "wall", "load": round(os.getloadavg()[0], 1)}
     desk = open_scene("desk", FRAMES)
     darken = open_scene("darken", FRAMES)
-    lamp = sized_light(desk)
-    for setting in settings_of(lamp):
-        method_cost(lamp if setting.name == "light_shadow" else desk, setting, device, clock, more)
+    lamp, screen = sized_light(desk), open_scene("screen", FRAMES)
+    shows = {"light_shadow": lamp, "area_light": screen}
+    for setting in (*settings_of(lamp), *(setting for setting in settings_of(screen) if setting.name == "area_light")):
+        method_cost(shows.get(setting.name, desk), setting, device, clock, more)
     method_cost(
         darken, next(setting for setting in settings_of(darken) if setting.name == "expose"), device, clock, more
     )
