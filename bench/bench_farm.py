@@ -105,8 +105,8 @@ class Bench:
         names = [str(device.name) for device in wp.get_cuda_devices()] if self.device != "cpu" else []
         record = {
             "case": f"farm {case}",
+            "size": self.options.variation_size if self.part == "variations" else self.options.size,
             **figures,
-            "size": self.options.size,
             "quality": self.options.quality,
             "gpus": names,
             "cores": len(os.sched_getaffinity(0)),

@@ -6,7 +6,7 @@ import itertools
 import shutil
 import statistics
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from av.video.reformatter import VideoReformatter
 
 from bench.farm_recordings import RATE, TICK
 from warp_ar.device import usable_cores
+from warp_ar.engine.pipeline import Pipeline
 from warp_ar.farm.jobs import Job, parse_jobs, read_jobs
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.part_video import PartSink
@@ -101,7 +102,7 @@ def run_bounds(bench: Bench) -> None:
         milliseconds={name: round(wall, 3) for name, (wall, _) in steps.items()},
         processor_milliseconds={name: round(busy, 3) for name, (_, busy) in steps.items()},
         kernels_ms=kernels,
-        slowest_step=max(alone, key=lambda name: alone[name]),
+        slowest_step_on_host=max(alone, key=lambda name: alone[name]),
         frames=limit,
         machine_fps_by_processor=round(1e3 * usable_cores() / bench.costs["worker_processor"], 1),
     )
@@ -121,30 +122,38 @@ def _encode(path: Path, images: list[np.ndarray], limit: int) -> tuple[float, fl
     return 1e3 * wall / count, 1e3 * busy / count
 
 
-def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> float | None:
-    """Frames from the file to the host's picture, none written; returns the kernels' milliseconds on the device."""
+def _light(bench: Bench, steps: dict[str, tuple[float, float]], limit: int) -> dict[str, float]:
+    """Frames from the file to the host's picture, none written; returns the kernels' milliseconds on a CUDA device."""
     surveyed = bench.surveyed()
     jobs = parse_jobs(read_jobs(bench.write_jobs("light.toml", 1, limit)), "light.toml")
     folder = bench.folder / "light"
     shutil.copytree(surveyed / "clips", folder / "clips")
     device = "cpu" if bench.device == "cpu" else "cuda:0"
-    times: list[float] = []
+    kernels: dict[str, float] = {}
     with Lighter(jobs, folder, device) as lighter:
         for lit in lighter.light(Job("segment", 0, 0, 0, WARM)):
             _ = lit.image
         job = Job("segment", 0, 0, 0, limit + WARM)
         steps["light"] = _timed((lit.image for lit in lighter.light(job)), limit)
         if device != "cpu":
-            pipeline = lit.pipeline
-            begin, end = (wp.Event(device, enable_timing=True) for _ in range(2))
-            stream = wp.get_stream(device)
-            with wp.ScopedDevice(device):
-                for _ in range(60):
-                    for name in ("frame", "pose", "clock", "captured_light"):
-                        pipeline.arrays.touch(name)
-                    stream.record_event(begin)
-                    pipeline.scheduler.run()
-                    stream.record_event(end)
-                    times.append(wp.get_event_elapsed_time(begin, end))
+            kernels = {
+                "same light": _kernels(lit.pipeline, device, ("frame", "pose", "clock")),
+                "new light": _kernels(lit.pipeline, device, ("frame", "pose", "clock", "captured_light")),
+            }
     shutil.rmtree(folder)
-    return round(statistics.median(times[10:]), 4) if times else None
+    return kernels
+
+
+def _kernels(pipeline: Pipeline, device: str, changed: Sequence[str]) -> float:
+    """Median milliseconds on the device of a frame in which some inputs have changed."""
+    begin, end = (wp.Event(device, enable_timing=True) for _ in range(2))
+    stream, times = wp.get_stream(device), []
+    with wp.ScopedDevice(device):
+        for _ in range(60):
+            for name in changed:
+                pipeline.arrays.touch(name)
+            stream.record_event(begin)
+            pipeline.scheduler.run()
+            stream.record_event(end)
+            times.append(wp.get_event_elapsed_time(begin, end))
+    return round(statistics.median(times[10:]), 4)

@@ -68,7 +68,9 @@ def run_long(bench: Bench) -> None:
     survey, segments = jobs_done(folder, "survey"), jobs_done(folder, "segment")
     whole = seen.code == 0 and (folder / "long.mp4").is_file()
     minutes = bench.options.long_frames / RATE / 60
-    per_frame = seen.seconds / frames
+    by_frames = sum(job.end - job.start for job in survey)
+    if segments:
+        by_frames += max(job.end for job in segments) - min(job.start for job in segments)
     bench.tell(
         f"recording of {frames} frames in {SEGMENTS} segments",
         whole=whole,
@@ -76,7 +78,7 @@ def run_long(bench: Bench) -> None:
         seconds=round(seen.seconds, 1),
         survey_seconds=round(sum(job.end - job.start for job in survey), 1),
         **{f"segments_{name}": value for name, value in rates(segments, SEGMENTS).items()},
-        seconds_for_all_asked=round(per_frame * bench.options.long_frames),
+        seconds_for_all_asked=round(seen.seconds + by_frames * (bench.options.long_frames / frames - 1.0)),
         asked_minutes=round(minutes, 1),
         **seen.memory(),
         **seen.gpu_figures(),
@@ -264,15 +266,16 @@ def run_variations(bench: Bench) -> None:
         )
     common = set.intersection(*(set(found) for found in digests.values()))
     unlike = sorted(key for key in common if len({found[key] for found in digests.values()}) > 1)
+    indexes = [bench.folder / f"data-{count}/dataset/annotations.json" for count in digests]
+    whole = all(path.is_file() for path in indexes)
     bench.tell(
         "bytes of variations by 1, 2 and 4 workers",
         compared=len(common),
         asked=bench.options.variations,
         unlike=len(unlike),
         first_unlike=unlike[:10],
-        whole_data_sets=all((bench.folder / f"data-{n}/dataset/annotations.json").is_file() for n in digests),
-        annotations_equal=len({_file_digest(bench.folder / f"data-{n}/dataset/annotations.json") for n in digests})
-        == 1,
+        whole_data_sets=whole,
+        annotations_equal=len({_file_digest(path) for path in indexes}) == 1 if whole else None,
     )
     for count in digests:
         shutil.rmtree(bench.folder / f"data-{count}", ignore_errors=True)
@@ -310,7 +313,7 @@ def _digests(folder: Path) -> dict[str, str]:
 
 
 def _file_digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "none"
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _against_live(bench: Bench, jobs: Path) -> None:
