@@ -162,6 +162,38 @@ def test_normal_maps_tilt_the_normal(device, tmp_path):
         np.testing.assert_allclose(seen["normal"], np.tile(expected, (16, 1)), atol=1e-5)
 
 
+DEGENERATE = {
+    "none": None,
+    "one point": np.full_like(SQUARE_UVS, 0.25),
+    "one line": SQUARE_UVS * [1.0, 0.0],
+    "huge": SQUARE_UVS * 1e6,
+    "far": SQUARE_UVS + 1e7,
+}
+
+
+@pytest.mark.parametrize("uvs", DEGENERATE.values(), ids=DEGENERATE)
+@pytest.mark.parametrize("direction", [FORWARD, (0.0, 1e-3, 1.0)], ids=["ahead", "grazing"])
+def test_textures_at_their_ends(device, tmp_path, uvs, direction):
+    """No roughness, a normal map that lies flat, alpha, and coordinates that span no picture: numbers, unit normals."""
+    flat = np.full((16, 16, 3), (255, 128, 128), np.uint8)
+    path = square(
+        tmp_path,
+        uvs=DEGENERATE["one point"] if uvs is None else uvs,
+        baseColorTexture=lambda made: {"index": made.texture(picture(2))},
+        metallicRoughnessTexture=lambda made: {"index": made.texture(np.zeros((16, 16, 3), np.uint8))},
+        normalTexture=lambda made: {"index": made.texture(flat)},
+        alphaMode="MASK",
+        doubleSided=True,
+    )
+    origins = grid(8) if direction == FORWARD else grid(8) * [1.0, 0.0, 0.0] + [0.0, -1e-3, -1.0]
+    seen = look([Object("mesh", file=path)], origins, direction, device)
+    met = seen["t"] < 1e3
+    for name in ("diffuse", "f0", "roughness", "emission", "occlusion", "normal"):
+        assert np.isfinite(seen[name]).all(), name
+    np.testing.assert_allclose(np.linalg.norm(seen["normal"][met], axis=1), 1.0, atol=1e-5)
+    assert (seen["roughness"] == 0.0).all()
+
+
 def test_masks_let_rays_pass(device, tmp_path):
     """What lies behind a hole is seen, and lit through it; a masked texel is neither."""
     alpha = picture(5)
