@@ -6,9 +6,9 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 
 from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.engine.switcher import PipelineSwitcher, Target
@@ -71,7 +71,7 @@ def with_light(scene: Scene, light: str | Path) -> Scene:
     return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve()))
 
 
-class Session:
+class Session(Closing):
     """Opens a scene's source and lights its frames one after another.
 
     Iterating gives ``(frame, result)`` pairs. Use it in a ``with`` statement, so that devices and threads are let go.
@@ -155,14 +155,6 @@ class Session:
         except BaseException:
             self.source.close()
             raise
-
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""

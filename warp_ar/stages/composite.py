@@ -68,5 +68,5 @@ class Composite(Stage):
         if not device.is_cpu:
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
-        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
+        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirror_ball
         return [Pass(lambda rows: copy(image, frame), rows=height), Pass(launch, rows=height, extent=union_of(extents))]

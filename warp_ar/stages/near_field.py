@@ -79,7 +79,7 @@ class NearField(Stage):
         reads = ["frame", "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
-        reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
+        reads += [name for name in features.layers if name not in ("virtual", "mirror_ball")]
         return Wiring(tuple(reads), features.near_names)
 
     def idle(self, reach: Reach) -> str | None:
@@ -108,7 +108,7 @@ class NearField(Stage):
         if config.ratio:
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:
-            layers.added = arrays["physical_added"]
+            layers.added = arrays["added_light"]
         distant = make_distant_light(self.features, arrays, self.name)
         samples = arrays["environment_samples"] if config.distant.diffuse != "none" else None
         raw, near = near_field.NearLight(), near_field.NearLight()
@@ -144,5 +144,5 @@ class NearField(Stage):
             MIRROR_SAMPLES if any(sharp) else 0,
             SIDE,
             "shadow_ratio" in layers,
-            "physical_added" in layers,
+            "added_light" in layers,
         )

@@ -84,7 +84,7 @@ class Relight(Stage):
             return LeftOut("the scene has no virtual light")
         if not features.lit:
             return LeftOut("the scene has no proxy for virtual light to fall on")
-        return Wiring(relight_reads(features), ("physical_added",))
+        return Wiring(relight_reads(features), ("added_light",))
 
     def runs_after(self) -> tuple[str, ...]:
         """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
@@ -99,7 +99,7 @@ class Relight(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
-        specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
+        specs = {"added_light": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
@@ -123,7 +123,7 @@ class Relight(Stage):
         relight.make_relight_kernel(config)
         receiver = self._receiver(config, arrays)
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
-        added = arrays["physical_added"]
+        added = arrays["added_light"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
         def launch(rows: Rows | None) -> None:
