@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
 from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.scene import Scene, load_scene
@@ -180,7 +182,7 @@ def write_picture(path: Path, picture: TracedPicture) -> None:
     channels = {name: np.ascontiguousarray(picture.radiance[..., c]) for c, name in enumerate("RGB")}
     channels |= {f"error.{name}": np.ascontiguousarray(picture.error[..., c]) for c, name in enumerate("RGB")}
     image = OpenEXR.File(header, channels)
-    _write(path, lambda part: image.write(str(part)))
+    _write(path, functools.partial(write_exr, image=image))
 
 
 def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:

@@ -35,6 +35,7 @@ from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names
 from warp_ar.scene.object_materials import look_of as materials_of
 from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
+from warp_ar.signature import sign_png
 
 Matrix = npt.NDArray[np.float64]
 
@@ -215,7 +216,22 @@ def encode_texture(texture: npt.NDArray[np.uint8]) -> bytes:
     """PNG of a texture."""
     done, data = cv2.imencode(".png", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR))
     assert done
-    return bytes(data)
+    return sign_png(data.tobytes())
+
+
+def texture_file(path: Path, name: str) -> Path:
+    """Where the texture of a body goes that cannot lie in the file itself."""
+    return path.with_name(f"{path.stem}_{name}.png")
+
+
+def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
+    """All of them, by the names of their bodies."""
+    found = {}
+    for name, item in zip(surface_names(scene), scene.objects, strict=False):
+        mesh = mesh_of(item)
+        if mesh.uvs is not None and look_of(item, mesh).texture is not None:
+            found[name] = texture_file(path, name)
+    return found
 
 
 def key_frames(placements: Sequence[Matrix]) -> Sequence[Matrix]:
