@@ -72,7 +72,7 @@ def test_the_system_says_why_a_file_lacks_its_end(tmp_path: pathlib.Path) -> Non
     assert caught.value.errno == errno.EFBIG
 
 
-RADIANCE = np.random.default_rng(1).uniform(0.0, 4.0, (32, 64, 3)).astype(np.float32)
+RADIANCE = np.random.default_rng(1).uniform(0.0, 4.0, (4, 8, 3)).astype(np.float32)
 WRITERS = {
     "stmap": lambda path: write_stmap(path, RADIANCE[..., :2]),
     "environment": lambda path: write_environment(path, RADIANCE, overwrite=False),
@@ -86,11 +86,11 @@ WRITERS = {
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
 @pytest.mark.parametrize("name", WRITERS)
 def test_what_does_not_fit_is_not_there(tmp_path: pathlib.Path, name: str) -> None:
-    """Whole or absent, and told, wherever the space ends: OpenEXR's last bytes go unwatched."""
+    """Whole or absent, and told, wherever the space ends: OpenEXR itself looks at none of a buffer's last bytes."""
     WRITERS[name](tmp_path / "whole.exr")
     size = (tmp_path / "whole.exr").stat().st_size
     (tmp_path / "whole.exr").unlink()
-    for limit in (0, 100, size // 2, size - 1000, size - 1):
+    for limit in (0, 100, size // 2, size - 100, size - 1):
         with file_limit(limit), pytest.raises(SinkError, match=r"a\.exr cannot be written"):
             WRITERS[name](tmp_path / "a.exr")
         assert not list(tmp_path.iterdir())
