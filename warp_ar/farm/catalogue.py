@@ -136,7 +136,7 @@ class Dataset:
     exposure: Span
     """Scale of the exposure."""
     catalogue: tuple[ObjectSpec, ...]
-    lamps: tuple[LightSpec, ...]
+    kinds_of_light: tuple[LightSpec, ...]
 
 
 def read_dataset(label: str, folder: Path, data: object) -> Dataset:
@@ -158,7 +158,7 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     entries = table.data.get("light", [])
     if not isinstance(entries, list):
         table.fail("light", "expected [[dataset.light]]")
-    lamps = tuple(
+    kinds = tuple(
         _read_light(JobTable(label, folder, f"dataset.light[{index}]", entry, _LIGHT_KEYS))
         for index, entry in enumerate(entries)
     )
@@ -169,12 +169,12 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
         if not (x0 < x1 and y0 < y1) or spans.low != spans.high:
             table.fail("region", "expected [x0, y0, x1, y1] in metres with x0 < x1 and y0 < y1")
         region = (x0, y0, x1, y1)
-    lights = table.pair("lights", (1, 1) if lamps else (0, 0), low=0)
+    lights = table.pair("lights", (1, 1) if kinds else (0, 0), low=0)
     objects = table.pair("objects", (1, 3), low=0)
     for key, (_, most) in (("objects", objects), ("lights", lights)):
         if most > MOST:
             table.fail(key, f"expected {MOST} at most")
-    if lights[1] and not lamps:
+    if lights[1] and not kinds:
         table.fail("lights", "expected at least one [[dataset.light]] to draw them from")
     return Dataset(
         variations=table.integer("variations", 1, low=1),
@@ -186,7 +186,7 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
         margin=table.number("margin", 0.005, low=0.0, high=10.0),
         exposure=table.span("exposure", Span((1.0,), (1.0,)), low=0.01, high=16.0),
         catalogue=catalogue,
-        lamps=lamps,
+        kinds_of_light=kinds,
     )
 
 
@@ -277,9 +277,9 @@ def check_dataset(label: str, dataset: Dataset, base: Scene) -> None:
     """
     if dataset.objects[1] and not sum(spec.weight for spec in dataset.catalogue) > 0.0:
         raise JobsError(f"{label}: dataset.object: every weight is 0; one must be above")
-    if dataset.lights[1] and not sum(spec.weight for spec in dataset.lamps) > 0.0:
+    if dataset.lights[1] and not sum(spec.weight for spec in dataset.kinds_of_light) > 0.0:
         raise JobsError(f"{label}: dataset.light: every weight is 0; one must be above")
-    for section, specs in (("object", dataset.catalogue), ("light", dataset.lamps)):
+    for section, specs in (("object", dataset.catalogue), ("light", dataset.kinds_of_light)):
         for index, spec in enumerate(specs):
             for extreme in (_Extreme(0.0), _Extreme(math.nextafter(1.0, 0.0))):
                 scene = dataclasses.replace(base, source=None, objects=(), lights=())

@@ -20,7 +20,7 @@ class Composite(Stage):
     """Lays virtual light and virtual objects over the frame."""
 
     name: ClassVar[str] = "composite"
-    summary: ClassVar[str] = "frame, virtual light on the desk and virtual objects, in linear light"
+    summary: ClassVar[str] = "frame, virtual light on the receiver and virtual objects, in linear light"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32 to 8-bit codes by exact thresholds",
         bound=0.501,

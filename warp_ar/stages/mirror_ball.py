@@ -59,7 +59,7 @@ def mirrored_shading(features: Features) -> ShadeConfig:
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
-    """How the desk that a ball shows responds: cells of the frame say nothing about it."""
+    """How the receiver that a ball shows responds: cells of the frame say nothing about it."""
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
@@ -101,7 +101,7 @@ class MirrorBall(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what the objects and the desk are lit by."""
+        """Reads what the objects and the receiver are lit by."""
         quality = features.request.quality
         if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")

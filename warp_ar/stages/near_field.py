@@ -56,15 +56,15 @@ def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
 
 
 class NearField(Stage):
-    """Light that reaches objects past each other, and what they mirror of the desk and of each other."""
+    """Light that reaches objects past each other, and what they mirror of the receiver and of each other."""
 
     name: ClassVar[str] = "near_field"
-    summary: ClassVar[str] = "what of the desk and of other objects virtual objects show"
+    summary: ClassVar[str] = "what of the receiver and of other objects virtual objects show"
     unread: ClassVar[str] = "virtual objects show the distant environment only"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32",
         bound=6e-2,
-        cause="two rays of 64 at the picture's border see the desk or do not",
+        cause="two rays of 64 at the picture's border see the receiver or do not",
         measured=2e-07,
         rows=(5, 6, 8, 13, 14, 17, 18),
     )
