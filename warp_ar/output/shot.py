@@ -36,6 +36,7 @@ from warp_ar.scene.names import surface_names
 from warp_ar.scene.object_materials import look_of as materials_of
 from warp_ar.scene.shapes import box_mesh, sphere_mesh, torus_mesh
 from warp_ar.signature import sign_png
+from warp_ar.srgb import decode_srgb, encode_srgb
 
 Matrix = npt.NDArray[np.float64]
 
@@ -201,15 +202,12 @@ def _mean_color(color: Color) -> RGB:
 
 def to_linear(codes: npt.NDArray[np.uint8]) -> Matrix:
     """Linear values of sRGB codes."""
-    x = codes.astype(np.float64) / 255.0
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    return decode_srgb(codes.astype(np.float64) / 255.0)
 
 
 def to_srgb(values: Matrix) -> npt.NDArray[np.uint8]:
     """Codes of linear values, sRGB-encoded."""
-    x = np.clip(values, 0.0, 1.0)
-    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
-    return np.rint(255.0 * encoded).astype(np.uint8)
+    return np.rint(255.0 * encode_srgb(np.clip(values, 0.0, 1.0))).astype(np.uint8)
 
 
 def encode_texture(texture: npt.NDArray[np.uint8]) -> bytes:
