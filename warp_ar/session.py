@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from warp_ar.accuracy.budget import AutoPipeline
 from warp_ar.closing import Closing
@@ -136,25 +137,20 @@ class Session(Closing):
             self.bracket_notes = plan_bracket(exposures, shown).notes
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
-                self.pipeline = AutoPipeline(
-                    self.scene,
-                    budget_ms=budget,
-                    device=device,
-                    size=size,
-                    outputs=outputs,
-                    exposures=exposures,
-                    shown=shown,
-                )
+                given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
+                self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
             else:
-                # The pipeline before a change is kept: results that were handed out may still be read.
-                self._switcher = PipelineSwitcher(
-                    device=device, keep=1, profile=False, synchronous=not self.source.live
-                )
-                self._target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
-                self.pipeline = self._switcher.open(self._target)
+                target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
+                self.pipeline = self._open(target, device)
         except BaseException:
             self.source.close()
             raise
+
+    def _open(self, target: Target, device: str) -> Pipeline:
+        """A pipeline that can be changed; the one before is kept: results that were handed out may still be read."""
+        self._target = target
+        self._switcher = PipelineSwitcher(device=device, keep=1, profile=False, synchronous=not self.source.live)
+        return self._switcher.open(target)
 
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""

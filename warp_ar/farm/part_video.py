@@ -126,11 +126,7 @@ def join_parts(
             sound: Iterator[Any] = iter(())
             if source is not None:
                 sound = _sound(source, target, float(zero * tick), until)
-                for name, value in source.metadata.items():
-                    target.metadata.setdefault(name, value)
-                for name in _LANGUAGES:
-                    if name in source.streams.video[0].metadata:
-                        video.metadata[name] = source.streams.video[0].metadata[name]
+                _copy_metadata(source, target, video)
             target.metadata["comment"] = PROGRAM
             count = 0
             waiting = next(sound, None)
@@ -147,6 +143,14 @@ def join_parts(
     except (av.FFmpegError, OSError, ValueError) as error:
         raise SinkError(f"{output} cannot be joined: {reason(error)}") from error
     return count
+
+
+def _copy_metadata(source: Any, target: Any, video: Any) -> None:
+    """Into a file and its stream of pictures, what is said of a recording."""
+    for name, value in source.metadata.items():
+        target.metadata.setdefault(name, value)
+    said = source.streams.video[0].metadata
+    video.metadata.update({name: said[name] for name in _LANGUAGES if name in said})
 
 
 def _common_scale(tick: fractions.Fraction, source: Any) -> int:
