@@ -59,9 +59,14 @@ def make_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--exposures", type=_seconds, nargs="+", metavar="S", help="seconds of each photograph, not what EXIF says")
     add("--shown", type=Path, metavar="PHOTO", help="whose camera values the light is in (default: the best exposed)")
-    add("--transfer", default="srgb", help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)')
+    add(
+        "--transfer",
+        default="srgb",
+        metavar="NAME",
+        help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)',
+    )
     add("--focal-35mm", type=float, metavar="MM", help="focal length for a full frame, if EXIF does not tell")
-    add("--reflectance", type=float, default=0.85, help="of the ball (default: 0.85)")
+    add("--reflectance", type=float, default=0.85, metavar="R", help="of the ball (default: 0.85)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     support = parser.add_argument_group("the plane under the ball, from the shown photograph")
     support.add_argument(
