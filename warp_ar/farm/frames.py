@@ -17,6 +17,9 @@ from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource
 from warp_ar.input.sources import open_source
 from warp_ar.input.video_file import VideoFile
 
+CONVERTERS = 2
+"""Threads of a worker that turn decoded pictures into RGB: of all that is done in order, the slowest in a survey."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameIndex:
@@ -45,6 +48,8 @@ class VideoPart(VideoFile):
         end: Number behind the last.
         fps: Show frame n at n / fps instead of at its own time.
     """
+
+    _converters = CONVERTERS
 
     def __init__(self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None) -> None:
         super().__init__(path, fps=fps)
