@@ -213,9 +213,31 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
+        _check_exposure(label, jobs, clips[scene], base)
         if dataset is not None:
             check_dataset(label, dataset, base)
     return jobs
+
+
+def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None:
+    """Refuse exposures that depend on the frames before, where a job does not see those.
+
+    Raises:
+        JobsError: They do.
+    """
+    settings = jobs.settings
+    whole = settings.light == "preroll" and settings.segment_frames is None
+    if scene.source is not None and scene.source.metering == "automatic" and not whole:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says source.metering = "automatic", and its drift is told '
+            'from all frames before; expected run.light = "preroll" without segment_frames, or metering = "fixed"'
+        )
+    cut = settings.segment_frames is not None and settings.light != "preroll"
+    if scene.exposure.scale == "auto" and jobs.dataset is None and cut:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says exposure.scale = "auto", which adapts from frame to '
+            'frame; expected no run.segment_frames, run.light = "preroll", or a number as scale'
+        )
 
 
 def _read_settings(table: Table) -> Settings:

@@ -180,7 +180,6 @@ class Lighter:
                 size=source.size,
                 outputs=outputs,
                 synchronous=True,
-                follows_camera=False,
             )
             with pipeline:
                 pipeline.start_clock(0.0)

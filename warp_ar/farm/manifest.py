@@ -20,6 +20,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from warp_ar.errors import UsageError, WarpArError, reason
 from warp_ar.files import write_whole
 
@@ -79,7 +81,7 @@ class Manifest:
             self._open(len(whole))
 
     def _open(self, size: int) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
         try:
             self._file = os.open(self.path, flags, 0o666)
             os.ftruncate(self._file, size)
@@ -138,18 +140,19 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         RunError: Another driver has it.
     """
-    import fcntl
-
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
-    file = os.open(folder / LOCK, flags, 0o666)
+    lock = filelock.FileLock(folder / LOCK, timeout=0, mode=0o666)
     try:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"{folder} is being worked on by another driver; see: farm status {folder}") from error
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise RunError(f"{folder} is being worked on by another driver; see: farm status {folder}") from error
+    except (OSError, NotImplementedError) as error:
+        raise RunError(
+            f"{folder / LOCK} cannot be locked: {reason(error)}; a run needs a folder on a disk that can"
+        ) from error
+    try:
         yield
     finally:
-        os.close(file)
+        lock.release()
 
 
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
@@ -221,7 +224,7 @@ def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
     size, digest = 0, hashlib.sha256()
     for path in sorted(path for path in part.rglob("*") if path.is_file()):
         digest.update(path.relative_to(part).as_posix().encode() + b"\0")
-        with open(path, "rb") as stream:
+        with open(path, "r+b") as stream:  # Windows synchronises only what may be written
             digest.update(hashlib.file_digest(stream, "sha256").digest())
             os.fsync(stream.fileno())
         size += path.stat().st_size
@@ -239,7 +242,7 @@ def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
 
 def publish_file(part: Path, place: Path) -> None:
     """Move one file to its place, which it takes from a file that stood there."""
-    with open(part, "rb") as stream:
+    with open(part, "r+b") as stream:
         os.fsync(stream.fileno())
     place.parent.mkdir(parents=True, exist_ok=True)
     part.replace(place)

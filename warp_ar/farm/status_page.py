@@ -61,7 +61,7 @@ dl { display: grid; grid-template-columns: repeat(auto-fit, minmax(130px, 1fr));
 dl div { background: var(--panel); border: 1px solid var(--line); border-radius: 10px; padding: 8px 12px; }
 dt { color: var(--muted); font-size: 12px; } dd { margin: 0; font-size: 20px; font-weight: 600; }
 .scroll { overflow-x: auto; background: var(--panel); border: 1px solid var(--line); border-radius: 10px; }
-table { border-collapse: collapse; width: 100%; }
+table { border-collapse: collapse; width: 100%; min-width: 600px; }
 th { text-align: left; color: var(--muted); font-weight: 500; font-size: 12px; }
 th, td { padding: 6px 12px; border-bottom: 1px solid var(--line); vertical-align: top; overflow-wrap: anywhere; }
 tr:last-child td { border-bottom: 0; }
