@@ -13,6 +13,8 @@ import urllib.request
 import pytest
 
 from warp_ar.farm.cli import main
+from warp_ar.farm.manifest import locked
+from warp_ar.farm.status import read_status
 from warp_ar.farm.status_page import RECENT, log_of, make_server, recent_jobs, status_page, write_page
 
 
@@ -55,7 +57,9 @@ class Page(html.parser.HTMLParser):
 
 
 def test_the_page_says_what_stands_in_the_folder(tmp_path):
-    page = Page(status_page(write_run(tmp_path / "run"), lambda name: None, refresh=False))
+    run = write_run(tmp_path / "run")
+    with locked(run):
+        page = Page(status_page(run, lambda name: None, refresh=False))
     told = " ".join(page.text)
     for expected in ("60 of 80 jobs", "1 of 2 clips", "a driver is at work", "41.5", "cuda:1", "waiting", "5 min"):
         assert expected in told
@@ -70,7 +74,8 @@ def test_the_page_says_what_stands_in_the_folder(tmp_path):
 def test_links_of_a_file_lead_to_the_logs(tmp_path):
     run = write_run(tmp_path / "a run", jobs=3)
     (tmp_path / "pages").mkdir()
-    assert main(["status", str(run), "--html", str(tmp_path / "pages/status.html")]) == 0
+    with locked(run):
+        assert main(["status", str(run), "--html", str(tmp_path / "pages/status.html")]) == 0
     page = Page((tmp_path / "pages/status.html").read_text())
     assert len(page.links) == 5  # worker 0, its job, and three jobs that are done
     for link in page.links:
@@ -105,6 +110,17 @@ def test_lines_of_a_long_manifest_are_read_from_its_end(tmp_path):
     assert [told["job"] for told in found[:2]] == ["a/segment-001999", "a/segment-001998"]
     assert len(found) == RECENT
     assert log_of(run, "../run.json") is None
+
+
+@pytest.mark.parametrize("hours", [-30, 0, 30])
+def test_whether_a_driver_is_at_work_does_not_hang_on_clocks(tmp_path, hours):
+    run = write_run(tmp_path / "run", jobs=1)
+    progress = json.loads((run / "progress.json").read_text())
+    (run / "progress.json").write_text(json.dumps({**progress, "time": time.time() + 3600 * hours}))
+    assert not read_status(run)["running"]
+    with locked(run):
+        assert read_status(run)["running"]
+    assert not read_status(run)["running"]
 
 
 def test_wrong_places_are_told(tmp_path, capsys):

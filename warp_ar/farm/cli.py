@@ -97,7 +97,12 @@ def begin(options: argparse.Namespace) -> int:
     from warp_ar.farm.version import program_version
 
     data = read_jobs(options.jobs)
-    parse_jobs(data, str(options.jobs))  # before a folder is made
+    # Before a folder is made: what cannot be begun leaves none.
+    parse_jobs(data, str(options.jobs))
+    if options.ray is None:
+        from warp_ar.farm.pool import devices_of
+
+        devices_of(options.device, options.workers)
     begin_run(options.output, data, program_version())
     return work(options, options.output)
 

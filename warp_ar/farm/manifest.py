@@ -23,12 +23,15 @@ from typing import Any
 import filelock
 
 from warp_ar.errors import UsageError, WarpArError, reason
-from warp_ar.files import write_whole
+from warp_ar.files import kind_of, write_whole
 
 MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
 ASIDE = ".aside"
 """Folder of outputs that are not whole yet."""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+LOCK_SECONDS = 1.0
+"""Within which a lock must come free: who asks for a run's state may hold it for a moment."""
 
 
 class RunError(WarpArError):
@@ -140,7 +143,7 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         RunError: Another driver has it.
     """
-    lock = filelock.FileLock(folder / LOCK, timeout=0, mode=0o666)
+    lock = filelock.FileLock(folder / LOCK, timeout=LOCK_SECONDS, mode=0o666)
     try:
         lock.acquire()
     except filelock.Timeout as error:
@@ -155,6 +158,19 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def is_locked(folder: Path) -> bool | None:
+    """Whether a driver has a run, whatever the clocks say; None where the folder does not let that be found out."""
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with filelock.FileLock(folder / LOCK, timeout=0, mode=0o666):
+            return False
+    except filelock.Timeout:
+        return True
+    except (OSError, NotImplementedError):
+        return None
+
+
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
     """Make a run's folder and write what it is to do.
 
@@ -163,6 +179,9 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
         RunError: It cannot be written.
     """
     try:
+        if (kind := kind_of(folder)) not in ("folder", "nothing"):
+            told = "a file" if kind == "file" else kind
+            raise UsageError(f"--output {folder} is {told}; name a new folder")
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / RUN).exists():
             raise UsageError(f"{folder} holds a run already; go on with: farm resume {folder}, or name another folder")
