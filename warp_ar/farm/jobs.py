@@ -27,7 +27,9 @@ LIGHTS = ("follow", "fixed", "preroll")
 """Ways to light a clip whose scene has a mirror ball: by what was captured for each frame, by what was captured at the
 clip's end, or by what each segment finds for itself from some frames before it on."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll")
+DECODERS = ("cpu", "gpu")
+"""What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -43,6 +45,12 @@ class Settings:
     """Frames of a segment; None: a clip is one."""
     preroll: int = 48
     """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
+    decode: str = DECODERS[0]
+    """One of ``DECODERS``."""
+
+    def gpu_of(self, device: str) -> int | None:
+        """Number of the GPU that decodes for a worker on a device; None: the processor does."""
+        return int(device.partition(":")[2] or 0) if self.decode == "gpu" and device.startswith("cuda") else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,7 +251,8 @@ def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None
 def _read_settings(table: Table) -> Settings:
     quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
     size = table.integer("segment_frames", 0, low=1) if "segment_frames" in table else None
-    return Settings(quality, table.choice("light", LIGHTS, LIGHTS[0]), size, table.integer("preroll", 48, low=0))
+    light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode)
 
 
 def _read_clip(table: Table, names: dict[str, int]) -> Clip:

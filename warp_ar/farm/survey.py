@@ -236,7 +236,7 @@ def _look_at_frames(
             return
     outputs = ("pose", "environment") if look.captures else ("pose",)
     environment: Map | None = None
-    with open_part(path, index, first, end, fps) as source:
+    with open_part(path, index, first, end, fps, jobs.settings.gpu_of(device)) as source:
         pipeline = Pipeline(
             look.scene,
             device=device,

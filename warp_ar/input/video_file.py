@@ -86,9 +86,10 @@ class VideoFile(RecordedSource):
         self.size = (width, height)
         self.description = f"{self._path} ({codec}, {width}x{height}, {self.fps:g} fps)"
 
-    def _open(self) -> Any:
+    def _open(self, **how: Any) -> Any:
+        """The file's container; ``how``: more of PyAV's arguments."""
         try:
-            container = av.open(str(self._path), options=_OPTIONS)
+            container = av.open(str(self._path), options=_OPTIONS, **how)
         except (av.FFmpegError, OSError, ValueError) as error:
             raise SourceError(
                 f"{self._path} cannot be read as a video ({reason(error)}): damaged, cut off, or no video file"
