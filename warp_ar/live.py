@@ -345,6 +345,9 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
     """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
     with loading():
         from warp_ar.device import bound_arenas
+        from warp_ar.engine.modules import remember_references
+
+        remember_references()
         from warp_ar.viewer.host import Host
 
         bound_arenas()
@@ -480,6 +483,9 @@ def light_clip(options: argparse.Namespace) -> int:
 
 def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before.
+    from warp_ar.engine.modules import remember_references
+
+    remember_references()
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog, print_plan
     from warp_ar.output.side_files import SideFiles, parse_layers

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import hashlib
 import os
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -48,6 +50,36 @@ def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress |
         for module in found:
             with exclusive(device):
                 _load(module, device)
+
+
+def remember_references() -> None:
+    """Have Warp look for what a function of this package refers to once, not again for each kernel that calls it.
+
+    That is half of what it takes to find a kernel in the cache. For commands alone, whose process changes no function
+    and no constant once a module is imported. Where this Warp looks in another way, nothing changes.
+    """
+    adjoint = getattr(getattr(getattr(wp, "_src", None), "codegen", None), "Adjoint", None)
+    find = getattr(adjoint, "get_references", None)
+    if adjoint is None or find is None or hasattr(find, "__wrapped__"):
+        return
+
+    @functools.wraps(find)
+    def get_references(adj: Any) -> Any:
+        kept = adj.__dict__.get("_warp_ar_references")
+        if kept is not None:
+            return kept
+        found = find(adj)
+        home = sys.modules.get(adj.func.__module__)
+        # While a module is imported, a function may name one that comes below it.
+        if home is not None and _is_own(home) and not getattr(home.__spec__, "_initializing", False):
+            adj._warp_ar_references = found
+        return found
+
+    adjoint.get_references = get_references
+
+
+def _is_own(module: Any) -> bool:
+    return str(module.__name__).startswith("warp_ar.")
 
 
 def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
