@@ -134,6 +134,50 @@ def test_no_kernel_is_translated_to_tell_whether_it_is_cached(monkeypatch, quali
     assert [kernel.key for kernel in found if kernel.adj.has_unresolved_static_expressions] == []
 
 
+AHEAD = """
+import pathlib
+import warp as wp
+from warp_ar.device import resolve_device, usable_cores
+from warp_ar.engine import modules
+
+device = resolve_device("cpu")
+
+@wp.kernel(module="unique", enable_backward=False)
+def one_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 1
+
+def headers():
+    found = list(pathlib.Path(wp.config.kernel_cache_dir).glob("headers_*/*.pch"))
+    return [(path.name, path.stat().st_mtime_ns, path.stat().st_ino) for path in found]
+
+print(len(headers()))
+modules.parse_headers_ahead()
+modules.parse_headers_ahead()  # one is under way
+(thread,) = modules._AHEAD
+thread.join()
+kept = headers()
+print(len(kept))
+modules.load_modules([one_kernel], device)
+print(headers() == kept, len(modules._AHEAD))
+modules.parse_headers_ahead()  # they are there
+print(len(modules._AHEAD))
+"""
+
+
+def test_headers_are_parsed_once_ahead_of_the_kernels(tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache"), "TMPDIR": str(temporary)}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[1])
+    script = tmp_path / "script.py"
+    script.write_text(AHEAD)
+    command = [sys.executable, "-X", "dev", "-W", "error::ResourceWarning", str(script)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-4:] == ["0", "1", "True 0", "0"]
+    assert "ResourceWarning" not in run.stderr, run.stderr
+    assert list(temporary.iterdir()) == []
+
+
 NAMES = """
 import sys
 import warp as wp

@@ -341,13 +341,25 @@ def _page_address(options: argparse.Namespace) -> Address:
     return Address(options.host, port, options.token if known else secrets.token_hex(16), tls, origins)
 
 
+def _hurry_compilers(device: str) -> None:
+    """Start Warp; what can be done for its compilers beside the imports that follow, and before them, is."""
+    import warp as wp
+
+    from warp_ar.device import start_warp
+    from warp_ar.engine.modules import parse_headers_ahead, remember_references
+
+    start_warp()
+    remember_references()
+    if device == "cpu" or not wp.is_cuda_available():
+        parse_headers_ahead()
+
+
 def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
     """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
     with loading():
         from warp_ar.device import bound_arenas
-        from warp_ar.engine.modules import remember_references
 
-        remember_references()
+        _hurry_compilers(options.device)
         from warp_ar.viewer.host import Host
 
         bound_arenas()
@@ -483,9 +495,7 @@ def light_clip(options: argparse.Namespace) -> int:
 
 def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before.
-    from warp_ar.engine.modules import remember_references
-
-    remember_references()
+    _hurry_compilers(options.device)
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.output.report import RunLog, print_plan
     from warp_ar.output.side_files import SideFiles, parse_layers
