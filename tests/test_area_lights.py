@@ -316,3 +316,13 @@ def test_what_is_wrong_is_said_with_its_key(kind, keys, complaint):
         loads_scene(TEXT.format(kind=kind) + keys)
     assert complaint in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_page_knows_them():
+    from warp_ar.stages.quality import PRESETS
+    from warp_ar.viewer.edits import Wanted, wanted_record
+
+    scene = loads_scene(TEXT.format(kind="rect") + "size = [0.2, 0.1]")
+    (item,) = wanted_record(Wanted(scene, PRESETS["medium"]))["objects"]
+    assert (item["shape"], item["material"]["model"], item["material"]["intensity"]) == ("rect", "emissive", 2.0)
+    assert item["reach"] == pytest.approx(0.5 * np.hypot(0.2, 0.1))

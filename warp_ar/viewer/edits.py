@@ -15,6 +15,7 @@ from warp_ar.input.sheet import RINGS, SHEET, ball_center
 from warp_ar.scene import (
     Camera,
     CharucoBoard,
+    EmissiveMaterial,
     Exposure,
     FileMaterial,
     LambertMaterial,
@@ -59,6 +60,7 @@ _MODELS: Final[Mapping[str, type[Material]]] = {
     "phong": PhongMaterial,
     "metallic_roughness": MetallicRoughnessMaterial,
     "mirror": MirrorMaterial,
+    "emissive": EmissiveMaterial,
     "file": FileMaterial,
 }
 _PLANE, _BOX = Proxy("plane", size=(0.2, 0.15)), Proxy("box", at=(0.12, -0.08, 0.03), size=(0.06, 0.06, 0.06))
@@ -188,6 +190,8 @@ def _material(material: Material, key: str, value: Any) -> Material:
         first = iter(vars(material).values())  # of every model but the file's own its colour
         color: Any = next(first, LambertMaterial.base_color)
         made: Any = _MODELS[value]
+        if made is EmissiveMaterial and isinstance(color, Path):
+            color = EmissiveMaterial.color
         return cast(Material, made(color))
     if key not in vars(material):
         raise UsageError(f"material: {type(material).__name__} has no {key}; expected {', '.join(vars(material))}")
@@ -402,6 +406,6 @@ def _reach(item: Object) -> float:
         mesh = mesh_of(item)
         assert mesh is not None
         return item.scale * float(np.abs(mesh.bounds)[:, :2].mean())
-    if item.shape == "box":
+    if item.shape in ("box", "rect"):
         return item.scale * 0.5 * float(np.hypot(item.size[0], item.size[1]))
-    return item.scale * (item.radius + item.major_radius + item.minor_radius)
+    return item.scale * (item.radius + item.major_radius + item.minor_radius + 0.5 * item.length)

@@ -68,7 +68,7 @@ function color(label, value, change) {
 
 const shapeName = (proxy) => (proxy.shape === "plane" && proxy.rotate[0] ? "wall" : proxy.shape === "plane" ? "plane" : proxy.file?.replace(/\.\w+$/, "") ?? proxy.shape);
 
-const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", file: "The file's own" };
+const MODELS = { metallic_roughness: "Metallic-roughness", phong: "Phong", lambert: "Chalk", mirror: "Mirror", emissive: "Emits", file: "The file's own" };
 const EFFECTS = {
   objects: ["Virtual objects", ""],
   lights: ["Virtual lights", ""],
@@ -137,7 +137,7 @@ export class ScenePanel {
 
   #entry(part, index, item) {
     const key = `${part} ${index}`;
-    const tint = part === "light" ? item.color : part === "proxy" ? null : item.material.base_color ?? item.material.diffuse;
+    const tint = part === "light" ? item.color : part === "proxy" ? null : item.material.base_color ?? item.material.diffuse ?? item.material.color;
     const dot = el("i", { class: part });
     const css = Array.isArray(tint) ? (part === "light" ? lightColor(tint) : toHex(tint)) : "#999";
     dot.style.background = css;
