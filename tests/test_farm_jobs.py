@@ -66,8 +66,8 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ("schema = 1\n[[clip]]\nframes = [5, 2]\n", "clip[0].frames = [5, 2]: expected two whole numbers"),
         ('schema = 1\n[[clip]]\nname = "a/b"\n', 'clip[0].name = "a/b": expected letters'),
         ('schema = 1\n[[clip]]\nlight = "no.exr"\n', 'clip[0].light = "no.exr": there is no file'),
-        ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected "paper", "low"'),
-        ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected "follow"'),
+        ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected one of "paper", "low"'),
+        ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected one of "follow"'),
         ("schema = 1\n[run]\nsegment_frames = 0\n[[clip]]\n", "run.segment_frames = 0: expected a whole number from 1"),
         ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.object is missing: expected at least one"),
         (f"schema = 1\n[[clip]]\n[dataset]\nvariations = 0\n{BALL}", "dataset.variations = 0: expected a whole number"),
@@ -93,10 +93,16 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "sphere"\nradius = 0.1\nfile = "a.ply"\n',
             'not used with shape = "sphere"; its own keys are radius',
         ),
+        (
+            f"schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = [1] }}\n",
+            "material.model = [1]: expected one of",
+        ),
+        ("schema = 1\nn = " + "9" * 5000, "not valid TOML"),
+        (".".join("a" * 500) + " = 1\n", "a key of more than 16 parts"),
         (f"schema = 1\n[[clip]]\n[dataset]\n{BALL}weight = 0\n", "every weight is 0"),
         (
             f'schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = "wood" }}\n',
-            'model = "wood": expected "lambert"',
+            'model = "wood": expected one of "lambert"',
         ),
         (
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "torus"\n'

@@ -8,12 +8,12 @@ import dataclasses
 import gc
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.closing import Closing
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.farm.frames import open_part
@@ -46,7 +46,7 @@ class Lit:
         return self.frame.image if self.result is None else self.result.image
 
 
-class Lighter:
+class Lighter(Closing):
     """Lights segments and variations; one for each worker."""
 
     def __init__(self, jobs: JobFile, folder: Path, device: str) -> None:
@@ -61,14 +61,6 @@ class Lighter:
         self._pipelines: collections.OrderedDict[Any, Pipeline] = collections.OrderedDict()
         self._survey: tuple[int, Survey] | None = None
         self._key: tuple[int, int, Any] | None = None
-
-    def __enter__(self) -> Lighter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let the pipelines' threads go."""
