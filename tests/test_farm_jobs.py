@@ -142,3 +142,46 @@ def test_a_scene_of_a_camera_is_no_clip(tmp_path):
     )
     with pytest.raises(JobsError, match="names no recording; give the clip a path"):
         read(tmp_path, 'schema = 1\n[[clip]]\nscene = "scene.toml"\n')
+
+
+SCENE = """
+schema = 1
+[camera]
+field_of_view = 60
+[source]
+path = "a.mp4"
+{source}
+[marker]
+size = 0.08
+[probe]
+center = [-0.12, 0.03, 0.035]
+radius = 0.035
+{rest}
+"""
+AUTOMATIC = SCENE.format(source='metering = "automatic"', rest="")
+ADAPTING = SCENE.format(source="", rest='[exposure]\nscale = "auto"')
+
+
+@pytest.mark.parametrize(
+    ("scene", "run", "told"),
+    [
+        (AUTOMATIC, "", 'says source.metering = "automatic", and its drift is told from all frames before; expected'),
+        (AUTOMATIC, 'light = "preroll"\nsegment_frames = 4', 'expected run.light = "preroll" without segment_frames'),
+        (AUTOMATIC, 'light = "preroll"', None),
+        (ADAPTING, "segment_frames = 4", 'says exposure.scale = "auto", which adapts from frame to frame; expected no'),
+        (ADAPTING, "", None),
+        (ADAPTING, 'light = "preroll"\nsegment_frames = 4', None),
+    ],
+)
+def test_exposures_that_depend_on_frames_before_are_refused_where_a_job_does_not_see_those(tmp_path, scene, run, told):
+    (tmp_path / "a.mp4").write_bytes(b"0")
+    (tmp_path / "scene.toml").write_text(scene)
+    text = f'schema = 1\n[run]\n{run}\n[[clip]]\nscene = "scene.toml"\n'
+    if told is None:
+        assert read(tmp_path, text).clips[0].name == "scene"
+        return
+    with pytest.raises(JobsError) as caught:
+        read(tmp_path, text)
+    assert told in str(caught.value)
+    assert "clip scene: " in str(caught.value)
+    assert "\n" not in str(caught.value)

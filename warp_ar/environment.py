@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
@@ -83,4 +82,4 @@ def convert(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -6,12 +6,11 @@ import argparse
 import dataclasses
 import itertools
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
@@ -127,4 +126,4 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

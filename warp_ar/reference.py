@@ -10,7 +10,6 @@ import argparse
 import dataclasses
 import functools
 import re
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
@@ -223,4 +222,4 @@ def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

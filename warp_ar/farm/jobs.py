@@ -26,7 +26,9 @@ LIGHTS = ("follow", "fixed", "preroll")
 """Ways to light a clip whose scene has a mirror ball: by what was captured for each frame, by what was captured at the
 clip's end, or by what each segment finds for itself from some frames before it on."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll")
+DECODERS = ("cpu", "gpu")
+"""What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -42,6 +44,12 @@ class Settings:
     """Frames of a segment; None: a clip is one."""
     preroll: int = 48
     """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
+    decode: str = DECODERS[0]
+    """One of ``DECODERS``."""
+
+    def gpu_of(self, device: str) -> int | None:
+        """Number of the GPU that decodes for a worker on a device; None: the processor does."""
+        return int(device.partition(":")[2] or 0) if self.decode == "gpu" and device.startswith("cuda") else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,15 +216,38 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
+        _check_exposure(label, jobs, clips[scene], base)
         if dataset is not None:
             check_dataset(label, dataset, base)
     return jobs
 
 
+def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None:
+    """Refuse exposures that depend on the frames before, where a job does not see those.
+
+    Raises:
+        JobsError: They do.
+    """
+    settings = jobs.settings
+    whole = settings.light == "preroll" and settings.segment_frames is None
+    if scene.source is not None and scene.source.metering == "automatic" and not whole:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says source.metering = "automatic", and its drift is told '
+            'from all frames before; expected run.light = "preroll" without segment_frames, or metering = "fixed"'
+        )
+    cut = settings.segment_frames is not None and settings.light != "preroll"
+    if scene.exposure.scale == "auto" and jobs.dataset is None and cut:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says exposure.scale = "auto", which adapts from frame to '
+            'frame; expected no run.segment_frames, run.light = "preroll", or a number as scale'
+        )
+
+
 def _read_settings(table: JobTable) -> Settings:
     quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
     size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
-    return Settings(quality, table.choice("light", LIGHTS, LIGHTS[0]), size, table.integer("preroll", 48, low=0))
+    light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode)
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:
