@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from warp_ar.output.report import RunLog
     from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
-    from warp_ar.viewer.server import Address
+    from warp_ar.viewer.address import Address
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -326,7 +326,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
 
 def _page_address(options: argparse.Namespace) -> Address:
     """Where the page is served, and with which token and certificate."""
-    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, own_address
     from warp_ar.viewer.shared_light import check_origin
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -380,7 +380,8 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.viewer.server import LOOPBACK, Server
+    from warp_ar.viewer.address import LOOPBACK
+    from warp_ar.viewer.server import Server
 
     scene = _page_scene(options)
     address = _page_address(options)
