@@ -259,7 +259,7 @@ def _read_probe(table: _Table) -> Probe:
 
 def _read_proxy(table: _Table) -> Proxy:
     shape = table.choice("shape", PROXY_KEYS)
-    table.only("shape", shape, PROXY_KEYS[shape], ("size", "file"))
+    table.only("shape", PROXY_KEYS[shape], ("size", "file"))
     sides = {"plane": 2, "box": 3}.get(shape)
     return Proxy(
         shape=cast(Any, shape),
@@ -280,7 +280,7 @@ def _read_mesh_path(table: _Table) -> Path:
 
 def _read_object(table: _Table) -> Object:
     shape = table.choice("shape", OBJECT_KEYS)
-    table.only("shape", shape, OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
+    table.only("shape", OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
     major = table.length("major_radius") if shape == "torus" else Object.major_radius
     minor = table.length("minor_radius") if shape == "torus" else Object.minor_radius
     if shape == "torus" and minor >= major:
@@ -313,7 +313,7 @@ def _read_material(parent: _Table) -> Material:
     table = parent.inner("material", parent.data["material"], known)
     model = table.choice("model", MATERIALS)
     kind = MATERIALS[model]
-    table.only("model", model, keys_of(kind), known[1:])
+    table.only("model", keys_of(kind), known[1:])
     if kind is FileMaterial:
         return FileMaterial()
     if kind is PhongMaterial:
@@ -376,7 +376,7 @@ def _read_area_light(table: _Table, kind: str) -> AreaLight:
 def _read_light(table: _Table) -> Light | AreaLight:
     kinds = {**LIGHT_KEYS, **AREA_LIGHT_KEYS}
     kind = table.choice("kind", kinds)
-    table.only("kind", kind, kinds[kind], (key for keys in kinds.values() for key in keys))
+    table.only("kind", kinds[kind], (key for keys in kinds.values() for key in keys))
     if kind in AREA_LIGHT_KEYS:
         return _read_area_light(table, kind)
     spot = kind == "spot"
