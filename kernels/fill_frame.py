@@ -57,7 +57,7 @@ def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, r
 @wp.func
 def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
     """Whether a point of a surface lies in what a ball may shade."""
-    for k in range(probes.shape[0]):
+    for k in range(probes.shape[0]):  # noqa: SIM110 - kernels have no any()
         if wp.length(point - probes[k].center) < OWN_SHADOW * probes[k].radius:
             return True
     return False
