@@ -109,7 +109,8 @@ class BoardViews:
         self._size = self._size or size
         if size != self._size:
             first = f"{self._size[0]}x{self._size[1]}"
-            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}")
+            turned = "; hold the camera the same way for all" if size == self._size[::-1] else ""
+            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}{turned}")
         self._seen += 1
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.marker is None:
