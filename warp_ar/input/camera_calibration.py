@@ -34,6 +34,10 @@ _FEWEST_VIEWS = 4
 """Views without which the focal length is not determined with any certainty."""
 GOOD_VIEWS = 12
 """Views below which a warning is due."""
+LEAST_TILT = 15.0
+"""Degrees by which the board's tilt must differ: else focal length and distance cannot be told apart."""
+MOST_FOCAL = 0.03
+"""Share of the focal length that its interval of two standard deviations may have."""
 _COVERAGE_CELLS = (4, 6)
 """Rows and columns into which the picture is cut to see where the board has been."""
 
@@ -56,6 +60,17 @@ class CameraReport:
     """What would make it better, one line each."""
     marker: Marker
     """The board that was seen."""
+    tilts: tuple[float, float]
+    """Least and most that the board was tilted, degrees: of views that are alike, a deviation says nothing."""
+
+    @property
+    def doubt(self) -> str:
+        """Why the focal length is not to be believed, in words; empty where it is."""
+        if self.tilts[1] - self.tilts[0] < LEAST_TILT:
+            return f"the card was tilted by {self.tilts[0]:.0f} to {self.tilts[1]:.0f} degrees only"
+        if (share := 2 * self.focal_deviation / self.camera.fx) > MOST_FOCAL:
+            return f"the focal length is known to +/- {share:.0%} only"
+        return ""
 
 
 class BoardViews:
@@ -164,7 +179,7 @@ class BoardViews:
         if covered.mean() < 0.8:
             empty = [_place(row, column) for row, column in np.argwhere(~covered)]
             warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
-        if max(tilts) - min(tilts) < 15:
+        if max(tilts) - min(tilts) < LEAST_TILT:
             warnings.append(
                 f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: "
                 "the focal length is uncertain"
@@ -181,6 +196,7 @@ class BoardViews:
             float(covered.mean()),
             tuple(warnings),
             self.marker,
+            (min(tilts), max(tilts)),
         )
 
 

@@ -135,6 +135,21 @@ _DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
 """About what any camera's codes mean in linear light: ratios of some powers of two need no better."""
 
 
+def _open_device(device: Any) -> Any:
+    """OpenCV's capture, without its own words on stderr: what is wrong is said in one line."""
+    quiet: Any = cv2  # its stubs lack the log level
+    level = quiet.getLogLevel()
+    quiet.setLogLevel(_ERRORS_ONLY)
+    try:
+        return cv2.VideoCapture(device)
+    finally:
+        quiet.setLogLevel(level)
+
+
+_ERRORS_ONLY = 2
+"""OpenCV's log level: it warns of every backend that has no such device."""
+
+
 class CaptureDevice(LiveSource):
     """A camera through OpenCV: a thread reads all the time and keeps the newest frame.
 
@@ -158,7 +173,7 @@ class CaptureDevice(LiveSource):
         fps: float | None = None,
         grace: float = 2.0,
         exposures: Sequence[float] = (),
-        opener: Callable[[Any], _Capture] = cv2.VideoCapture,
+        opener: Callable[[Any], _Capture] = _open_device,
     ) -> None:
         super().__init__()
         check_fps(fps)
