@@ -53,7 +53,7 @@ FAINTEST: Final = 2.0
 """Codes per pixel that a step has in the darkest picture: four standard deviations of a camera's noise."""
 HAND: Final = 5.0
 """Pixels: standard deviation of a hand that points."""
-HANDS: Final = 24
+HANDS: Final = 12
 """Further hands from whose points the edges are tried."""
 STRONG: Final = 2.5
 """Times the least step from which on a step is strong enough: a print's edge is no better than a shadowed one."""
@@ -92,7 +92,7 @@ class OutlineFit:
     met: float
     """Share of its visible outline that lies on edges of the picture: the mean over its edges."""
     fitted: bool
-    """Whether edges of the picture tell its corners within ``TRUSTED``."""
+    """Whether edges of the picture tell its corners within ``TRUSTED``; where there are none it is as pointed out."""
     deviation: float
     """Standard deviation of its worst corner in metres, as far as edges and points tell; the camera's is not in it."""
     doubt: str
@@ -124,24 +124,19 @@ def fit_outline(
     start = _settled(kind, start, view, anchors)
     tried = _tried(kind, start, view, picture, anchors)
     if not tried:
-        return _as_pointed(kind, start, view, picture, anchors, "the picture shows too few of its edges")
+        deviation = _deviation(kind, start, view, None, anchors)
+        share, _ = _met(kind, start, view, picture)
+        return OutlineFit(_proxy(kind, start), share, False, deviation, "the picture shows too few of its edges")
     best = max(tried, key=lambda one: one.score)
     corners = _corners(kind, best.shape)
     apart = [_apart(corners, _corners(kind, one.shape)) for one in tried if one.score > best.score - RIVAL]
     if max(apart) > TRUSTED:
         doubt = f"edges that are {1e3 * max(apart):.0f} mm apart fit it alike"
-        return _as_pointed(kind, start, view, picture, anchors, doubt)
+        return OutlineFit(_proxy(kind, best.shape), best.met, False, max(apart) / 2, doubt)
     deviation = _deviation(kind, best.shape, view, picture, anchors)
     fitted = 2 * deviation < TRUSTED
     doubt = "" if fitted else f"its edges tell it only within {2e3 * deviation:.0f} mm"
     return OutlineFit(_proxy(kind, best.shape), best.met, fitted, deviation, doubt)
-
-
-def _as_pointed(
-    kind: str, shape: Array, view: _View, picture: _Picture, anchors: tuple[list[int], Array], doubt: str
-) -> OutlineFit:
-    deviation = _deviation(kind, shape, view, None, anchors)
-    return OutlineFit(_proxy(kind, shape), _met(kind, shape, view, picture)[0], False, deviation, doubt)
 
 
 def _apart(corners: Array, others: Array) -> float:

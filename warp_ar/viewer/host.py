@@ -193,9 +193,9 @@ class Host:
             lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", found.proxy)), f"point out a {kind}"
         )
         sides = " x ".join(f"{1e3 * side:.0f}" for side in found.proxy.size)
-        how = f"{found.met:.0%} of its outline lies on edges of the picture"
+        how = f"fitted to edges of the picture, within {2e3 * found.deviation:.0f} mm"
         if not found.fitted:
-            how = "as pointed out, for the picture shows too few of its edges"
+            how = f"not certain, for {found.doubt}. Look at its handles, or point it out anew from nearer and higher up"
         self._notify({"type": "notice", "text": f"{kind.capitalize()} of {sides} mm: {how}.", "bad": False})
 
     def _open_scene(self, name: str) -> None:
