@@ -98,7 +98,8 @@ def frames_that_fit(bench: Bench) -> int:
     cores = usable_cores()
     lit = max(bench.costs["worker"] / SEGMENTS, bench.costs["worker_processor"] / cores)
     # Surveyed once; lit by the run, then once by one run beside eight segments.
-    each = bench.costs["survey"] + lit + max(bench.costs["worker"], 2.0 * lit) + 2.0
+    # (without being encoded, which is half of a worker's time).
+    each = bench.costs["survey"] + lit + max(0.5 * bench.costs["worker"], 2.0 * lit) + 2.0
     fixed = 25.0  # workers' starts, and the recording
     frames = int(0.85 * (bench.left - fixed) * 1e3 / each)
     frames = max(min(frames, bench.options.long_frames), SEGMENTS * EDGE * 2)

@@ -17,6 +17,8 @@ TINT = np.array([1.0, 0.97, 0.94])
 """The camera's white balance, on codes."""
 ACROSS = 2
 """Rays per pixel along each side."""
+ROW = 1024
+"""Points that the sheet is looked up at together."""
 
 
 class RandomDesk:
@@ -48,14 +50,9 @@ class RandomDesk:
         """What lies at points (..., 3) of the table, linear."""
         x = (points[..., 0] + self.size[0] / 2) * PER_METRE - 0.5
         y = (self.top - points[..., 1]) * PER_METRE - 0.5
-        shape = x.shape
-        paper = cv2.remap(
-            self.paper,
-            x.reshape(-1, 1).astype(np.float32).reshape(shape[0], -1),
-            y.reshape(-1, 1).astype(np.float32).reshape(shape[0], -1),
-            cv2.INTER_LINEAR,
-            borderValue=-1.0,
-        ).reshape(shape)
+        # OpenCV takes no row of more than 32767.
+        rows = [np.resize(value.astype(np.float32), (-(-x.size // ROW), ROW)) for value in (x.ravel(), y.ravel())]
+        paper = cv2.remap(self.paper, *rows, cv2.INTER_LINEAR, borderValue=-1.0).ravel()[: x.size].reshape(x.shape)
         cell = np.floor(points[..., :2] / 0.05).astype(int) % 64
         return np.where(paper >= 0.03, paper, self.blocks[cell[..., 1], cell[..., 0]])
 
