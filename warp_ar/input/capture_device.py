@@ -137,17 +137,13 @@ _DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 def _open_device(device: Any) -> Any:
     """OpenCV's capture, without its own words on stderr: what is wrong is said in one line."""
-    quiet: Any = cv2  # its stubs lack the log level
-    level = quiet.getLogLevel()
-    quiet.setLogLevel(_ERRORS_ONLY)
+    log: Any = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of every backend that has no such device
     try:
         return cv2.VideoCapture(device)
     finally:
-        quiet.setLogLevel(level)
-
-
-_ERRORS_ONLY = 2
-"""OpenCV's log level: it warns of every backend that has no such device."""
+        log.setLogLevel(level)
 
 
 class CaptureDevice(LiveSource):
