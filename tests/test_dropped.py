@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import io
+import json
+import zipfile
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from tests.test_pipeline import make_scene
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.light.captured import Light
-from warp_ar.scene import dumps_scene, load_scene
+from warp_ar.output.places import files_of
+from warp_ar.scene import SourceSpec, dumps_scene, load_scene
 from warp_ar.scene.mesh_files import load_mesh
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import dropped, edits
+from warp_ar.viewer.bundle import pack_scene
 from warp_ar.viewer.dropped import DroppedFiles
 from warp_ar.viewer.edits import Wanted
 
@@ -143,3 +149,99 @@ def test_limits_are_said(files, wanted, monkeypatch):
     files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
     with pytest.raises(UsageError, match="1 files were dropped already"):
         files.take("box.ply", box(0.1, 0.1, 0.1), wanted)
+
+
+def textured(folder):
+    """A glTF that names a buffer and, in a folder beside it, a texture with a space in its name."""
+    made = trimesh.creation.box((0.1, 0.06, 0.2))
+    coordinates = np.random.default_rng(0).random((len(made.vertices), 2))
+    picture = Image.fromarray(np.full((4, 4, 3), (200, 30, 30), np.uint8))
+    made.visual = trimesh.visual.TextureVisuals(coordinates, image=picture)
+    for name, data in trimesh.Scene(made).export(file_type="gltf").items():
+        (folder / name).write_bytes(data)
+    text = json.loads((folder / "model.gltf").read_text())
+    (folder / "my maps").mkdir()
+    picture.save(folder / "my maps" / "red 1.png")
+    text["images"] = [{"uri": "my%20maps/red%201.png"}]
+    (folder / "model.gltf").write_text(json.dumps(text))
+    return folder / "model.gltf"
+
+
+@pytest.fixture
+def bundle(files, wanted, tmp_path):
+    """A scene with a dropped mesh, one that names other files, and captured light; and its ZIP."""
+    for name, data in (("my box.ply", box(0.1, 0.06, 0.2)), ("tower.glb", box(0.05, 0.2, 0.05, kind="glb"))):
+        wanted = files.take(name, data, wanted)[0](wanted)
+    light = Light(np.random.default_rng(0).random((8, 16, 3)).astype(np.float32), np.ones((8, 16), np.float32))
+    light.save(tmp_path / "own.exr")
+    wanted = files.take("own.exr", (tmp_path / "own.exr").read_bytes(), wanted)[0](wanted)
+    (tmp_path / "elsewhere").mkdir()
+    thing = dataclasses.replace(wanted.scene.objects[-1], file=textured(tmp_path / "elsewhere"))
+    scene = dataclasses.replace(wanted.scene, objects=(*wanted.scene.objects, thing), source=SourceSpec(tmp_path))
+    return scene, pack_scene(scene)
+
+
+def same(found, scene):
+    assert [item.at for item in found.objects] == [item.at for item in scene.objects]
+    for one, other in zip(found.objects, scene.objects, strict=True):
+        if other.file is not None:
+            assert np.array_equal(load_mesh(one.file).vertices, load_mesh(other.file).vertices)
+    assert load_mesh(found.objects[-1].file).images, "the texture stayed behind"
+    assert np.array_equal(Light.load(found.captured.file).radiance, Light.load(scene.captured.file).radiance)
+
+
+def test_a_scene_is_saved_with_its_files_and_loads_elsewhere(bundle, tmp_path, tmp_path_factory):
+    scene, data = bundle
+    there = tmp_path_factory.mktemp("there")
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        file.extractall(there)
+    found = load_scene(there)
+    same(found, scene)
+    assert all(path.is_relative_to(there) for path in files_of(dataclasses.replace(found, path=None)))
+    assert str(tmp_path) not in (there / "scene.toml").read_text()
+    assert found.source is None
+
+
+def test_such_a_scene_is_dropped_onto_another_page(bundle, tmp_path_factory):
+    scene, data = bundle
+    own = tmp_path_factory.mktemp("own")
+    shown = Wanted(make_scene(), PRESETS["low"])
+    make, label, _ = DroppedFiles(own).take("desk.zip", data, shown)
+    same(make(shown).scene, scene)
+    assert label == "open desk.zip"
+    # Saved from there it is the same again.
+    assert len(pack_scene(make(shown).scene)) == pytest.approx(len(data), rel=0.02)
+
+
+def packed(**members):
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in members.items():
+            file.writestr(name.replace("__", "/"), data)
+    return made.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ({"other.toml": "schema = 1"}, "holds no scene.toml"),
+        ({"scene.toml": "schema = 1", "..__evil.ply": "x"}, "nothing that a scene names"),
+        ({"scene.toml": "schema = 1", "run.sh": "x"}, "run.sh is nothing"),
+        ({"scene.toml": "schema = 1", "big.bin": bytes(1 << 27)}, "unpacks to 134,217,738 bytes"),
+        ({"scene.toml": 'schema = 1\nname = "/etc/passwd"'}, "names the file"),
+        ({"scene.toml": 'schema = 1\nname = "../../x.ply"'}, "names the file"),
+        ({"scene.toml": "schema = 9"}, "desk.zip"),
+    ],
+)
+def test_zips_of_others_are_refused(files, wanted, tmp_path, members, said):
+    with pytest.raises(WarpArError, match=said) as caught:
+        files.take("desk.zip", packed(**members), wanted)
+    assert str(tmp_path) not in str(caught.value)
+    assert list(tmp_path.iterdir()) == [], "what was refused was kept"
+
+
+def test_what_is_no_zip_is_refused(files, wanted, bundle):
+    _, data = bundle
+    for spoiled in (b"PK", b"", data[:300], data[:-400]):
+        with pytest.raises(UsageError, match="no ZIP that can be unpacked"):
+            DroppedFiles(files._folder).take("desk.zip", spoiled, wanted)

@@ -8,10 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.rendered_boxes import random_boxes_seen
 from tests.rendered_room import look_at
 from warp_ar.errors import UsageError
-from warp_ar.input.outline_fit import _FACES, fit_outline
-from warp_ar.scene import Camera, Pose, Proxy
+from warp_ar.input.check_pictures import take_look
+from warp_ar.input.outline_fit import _FACES, TRUSTED, fit_outline
+from warp_ar.input.sources import open_source
+from warp_ar.scene import Camera, Pose, Proxy, load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
 CAMERA = Camera(640, 480, 620.0, 620.0, 322.0, 236.0, (-0.08, 0.02, 0.0, 0.0, 0.0))
@@ -95,6 +98,65 @@ def test_edges_are_met(kind, reverse):
         assert 1e3 * np.linalg.norm(np.subtract(found.proxy.at, truth.at)) < PLACE_MM
         turn = (found.proxy.rotate[2] - truth.rotate[2] + 45) % 90 - 45
         assert abs(turn) < ANGLE
+
+
+BOXES = (2, 3, 4)
+"""Pictures of two boxes each: with prints along their edges, shadows beside them, and grain of the desk."""
+OFTEN = 0.5
+"""Share of the pointings that must be fitted: two thirds were of 60. The others have a print as near as their edge."""
+
+
+def seen_corners(box, camera, pose):
+    flat, _ = cv2.projectPoints(
+        pose.apply(corners(box)), np.zeros(3), np.zeros(3), camera.matrix(), np.array(camera.distortion)
+    )
+    return flat.reshape(-1, 2)
+
+
+def pointings(box, pose):
+    """Numbers of corners that somebody may point out: an edge of the base, above its end, and the next one behind."""
+    solid = corners(box)
+    eye = -pose.rotation.T @ pose.translation
+    for i, j in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        middle = (solid[i] + solid[j] + solid[i + 4] + solid[j + 4]) / 4
+        if (middle - solid.mean(0)) @ (eye - middle) > 0:
+            yield (i, j, j + 4, (j + 1) % 4 + 4)
+            yield (j, i, i + 4, (i - 1) % 4 + 4)
+
+
+def off(found, box):
+    """Metres that the worst corner is off; a box may be named from another one."""
+    return float(np.linalg.norm(corners(found.proxy)[:, None] - corners(box), axis=2).min(1).max())
+
+
+@pytest.mark.parametrize("kind", ["prints", "tin"])
+def test_what_is_called_fitted_is_within_what_is_said(kind):
+    tries = []
+    if kind == "prints":
+        for seed in BOXES:
+            image, boxes, camera, pose = random_boxes_seen(seed)
+            tries += [(image, camera, pose, box) for box in boxes]
+    else:
+        # A tin as bright as the wood behind it: its far edge is one of colour alone.
+        scene = load_scene("desk")
+        (box,) = (proxy for proxy in scene.proxies if proxy.shape == "box")
+        with open_source(scene.source.path) as source:
+            look = take_look(scene, source, 112, every=37)
+        tries = [(image, look.camera, pose, box) for image, pose in look.views]
+    fits = []
+    for number, (image, camera, pose, box) in enumerate(tries):
+        for turn, order in list(enumerate(pointings(box, pose)))[number % 2 :: 4]:
+            hand = np.random.default_rng(10 * number + turn).uniform(-POINTING + 1, POINTING - 1, (4, 2))
+            points = seen_corners(box, camera, pose)[list(order)] + hand
+            if ((points > 0) & (points < (camera.width - 1, camera.height - 1))).all():
+                found = fit_outline(image, camera, pose, "box", [tuple(point) for point in points])
+                fits.append(found.fitted)
+                if found.fitted:
+                    assert off(found, box) < TRUSTED, (number, order, found)
+                    assert off(found, box) < 2 * found.deviation, (number, order, found)
+                else:
+                    assert found.doubt
+    assert np.mean(fits) > OFTEN
 
 
 def test_without_edges_points_stay():

@@ -17,7 +17,7 @@ from warp_ar.output.sinks import open_sink, write_environment
 from warp_ar.scene import Camera, load_calibration
 from warp_ar.signature import PROGRAM, is_signed, sign_png
 
-REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), SHEET)
+REPORT = CameraReport(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), 0.1, (0.1,), 0.1, 1.0, (), SHEET, (5.0, 40.0))
 CURVE = np.repeat(np.linspace(0.0, 1.0, 256)[:, None] ** 2, 3, axis=1)
 
 

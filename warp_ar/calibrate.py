@@ -10,6 +10,7 @@ response  pictures of the card's greys, or of any scene at several exposures, to
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import itertools
 import json
 import math
@@ -21,12 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import UsageError
 from warp_ar.input.ball import posed_frames
 from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
+from warp_ar.input.check_ball import DULL, inside_contrast
 from warp_ar.input.checkup import source_of
 from warp_ar.input.grey_response import measure_grey_response
 from warp_ar.input.response import measure_response, write_response
@@ -36,8 +38,14 @@ from warp_ar.output.places import check_places, check_replaceable
 from warp_ar.scene import CharucoBoard, Marker, bundled_scenes, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 from warp_ar.scene.keys import INTRINSICS
+from warp_ar.scene.starter import guesses
 
 Image = NDArray[np.uint8]
+
+MOST_BALL = 0.1
+"""Share of the radius that its interval may have, and half of what the centre's may."""
+MOST_RESPONSE = 0.25
+"""Share of a middle code's value that its interval may have: usual cameras differ from sRGB by as much."""
 
 
 def _marker(options: argparse.Namespace) -> Marker | None:
@@ -58,6 +66,8 @@ _CAMERA = "[camera]\nwidth = 2\nheight = 2\nfx = 2.0\nfy = 2.0\ncx = 0.5\ncy = 0
 
 def _pictures(paths: Sequence[str], most: int | None = None) -> Iterable[Image]:
     for path in paths:
+        if (Path(path) / "scene.toml").is_file():
+            raise UsageError(f"{path}: is the folder of a scene; expected photographs or a film that you took")
         with open_source(path) as source:
             for frame in itertools.islice(source, most):
                 yield frame.image
@@ -124,7 +134,36 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run_ball(options: argparse.Namespace) -> None:
+def _run_camera(options: argparse.Namespace, target: Path | None) -> int:
+    marker, pictures = _marker(options), _pictures(options.pictures, options.frames)
+    if marker is not None and options.dictionary is None and isinstance(marker.board, CharucoBoard):
+        report = calibrate_camera(pictures, board=marker.board)
+    else:
+        report = calibrate_camera(pictures, marker)
+    c, interval = report.camera, 2 * report.focal_deviation
+    for warning in report.warnings:
+        say(warning)
+    if target is not None and report.doubt:
+        say(
+            f"{report.doubt}, in {len(report.view_errors)} views: nothing is written. Take more pictures of the card, "
+            "from other sides"
+        )
+        return EXIT_FAILED
+    write_camera(report, options.output)
+    print(f"{options.output}: fx {c.fx:.2f} fy {c.fy:.2f} (+/- {interval:.2f}) cx {c.cx:.2f} cy {c.cy:.2f}")
+    print(f"board: {report.marker.board} ({report.marker.dictionary})")
+    print(
+        f"reprojection error {report.error:.3f} pixels over {len(report.view_errors)} views "
+        f"(worst {max(report.view_errors):.3f}), {report.coverage:.0%} of the picture covered"
+    )
+    if target is not None:
+        amend_scene(target, "camera", {"calibration": options.output.name}, remove=(*INTRINSICS, "field_of_view"))
+        then = f"; next: python -m warp_ar.calibrate ball {options.write} --write"
+        print(f"{target}: [camera] names it now{then if load_scene(target).probes else ''}")
+    return EXIT_DONE
+
+
+def _run_ball(options: argparse.Namespace) -> int:
     scene = load_scene(options.scene)
     if options.write and scene.path in bundled_scenes().values():
         raise UsageError(f"--write: {options.scene} comes with the program and is not written into; copy it first")
@@ -138,7 +177,9 @@ def _run_ball(options: argparse.Namespace) -> None:
         views = posed_frames(source, scene.marker, camera, options.frames)
     if not views:
         raise UsageError(f"{spec}: no marker in the first {options.frames} frames; see [marker] in {options.scene}")
-    views = views[:: -(-len(views) // 12)]
+    for guess in guesses(scene):
+        say(f"{guess}; until then what follows is no better than that")
+    views, code = views[:: -(-len(views) // 12)], EXIT_DONE
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
         report = measure_ball(views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius)
@@ -154,18 +195,37 @@ def _run_ball(options: argparse.Namespace) -> None:
             say(
                 f"probe {index}: the frames are too alike to tell the radius; it is the scene's. Move the camera around"
             )
-        if options.write and scene.path is not None:
+        flat = inside_contrast(views, camera, dataclasses.replace(probe, center=report.center)) < DULL
+        if flat:
+            say(f"probe {index}: where it is, the picture is flat: is the ball there, uncovered and polished?")
+        worst = max(2 * (report.radius_deviation or 0.0), report.deviation) / report.radius
+        if flat:
+            code = EXIT_FAILED
+        elif worst > MOST_BALL:
+            say(
+                f"probe {index}: that is too wide to be used: have the whole ball in every frame, where [probe] has "
+                "it, and move the camera around it"
+            )
+            code = EXIT_FAILED
+        elif options.write and scene.path is not None:
             center = [round(value, 5) for value in report.center]
             amend_scene(scene.path, "probe", {"center": center, "radius": round(report.radius, 5)}, index=index)
-            print(f"{scene.path}: [probe] has them now")
+            print(f"{scene.path}: [probe] has them now; next: python -m warp_ar.doctor {options.scene}")
+    return code
 
 
-def _run_response(options: argparse.Namespace, target: Path | None) -> None:
+def _run_response(options: argparse.Namespace, target: Path | None) -> int:
     told = "sRGB: 0.2159"
     if options.exposures is None:
         found = measure_grey_response(_pictures(options.pictures, options.frames))
         curve = found.curve
         low, high = found.span
+        if target is not None and (interval := 2 * found.deviation[128].max()) > MOST_RESPONSE:
+            say(
+                f"the curve is known to +/- {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: "
+                "nothing is written. Take pictures of the card under exposures, or lamps, that differ more"
+            )
+            return EXIT_FAILED
         told += (
             f"; +/- {2 * found.deviation[128].max():.0%}, by {found.views} pictures with codes {low:.0f} to {high:.0f}"
         )
@@ -177,6 +237,7 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> None:
     if target is not None:
         amend_scene(target, "camera", {"transfer": options.output.name})
         print(f"{target}: [camera] names it now")
+    return EXIT_DONE
 
 
 def _check_output(options: argparse.Namespace) -> None:
@@ -209,31 +270,11 @@ def _run(options: argparse.Namespace) -> int:
             f"{options.output}: print at 100 %, not fitted to the page, and check with a ruler that 100 mm are 100 mm"
         )
     elif options.command == "camera":
-        marker, pictures = _marker(options), _pictures(options.pictures, options.frames)
-        if marker is not None and options.dictionary is None and isinstance(marker.board, CharucoBoard):
-            report = calibrate_camera(pictures, board=marker.board)
-        else:
-            report = calibrate_camera(pictures, marker)
-        write_camera(report, options.output)
-        c = report.camera
-        print(
-            f"{options.output}: fx {c.fx:.2f} fy {c.fy:.2f} (+/- {report.focal_deviation:.2f}) "
-            f"cx {c.cx:.2f} cy {c.cy:.2f}"
-        )
-        print(f"board: {report.marker.board} ({report.marker.dictionary})")
-        print(
-            f"reprojection error {report.error:.3f} pixels over {len(report.view_errors)} views "
-            f"(worst {max(report.view_errors):.3f}), {report.coverage:.0%} of the picture covered"
-        )
-        for warning in report.warnings:
-            say(warning)
-        if target is not None:
-            amend_scene(target, "camera", {"calibration": options.output.name}, remove=(*INTRINSICS, "field_of_view"))
-            print(f"{target}: [camera] names it now")
+        return _run_camera(options, target)
     elif options.command == "response":
-        _run_response(options, target)
+        return _run_response(options, target)
     else:
-        _run_ball(options)
+        return _run_ball(options)
     return EXIT_DONE
 
 

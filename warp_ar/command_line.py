@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import gc
+import re
 import signal
 import sys
 import threading
@@ -29,7 +31,20 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise the message as an error of usage."""
-        raise UsageError(f"{message}; see {self.prog} --help")
+        unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)
+        meant = difflib.get_close_matches(unknown[1], _options(self), n=1, cutoff=0.75) if unknown else []
+        hint = f"; did you mean {meant[0]}?" if meant else ""
+        raise UsageError(f"{message}{hint}; see {self.prog} --help")
+
+
+def _options(parser: argparse.ArgumentParser) -> list[str]:
+    """All options of a parser and of its commands."""
+    found = list(parser._option_string_actions)
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                found += _options(command)
+    return found
 
 
 class Terminated(KeyboardInterrupt):

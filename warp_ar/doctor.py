@@ -12,7 +12,7 @@ from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_comm
 from warp_ar.errors import UsageError, printable
 from warp_ar.input.checkup import FRAMES, check_up, source_of
 from warp_ar.input.finding import Finding, worst_first
-from warp_ar.scene import Scene, load_scene
+from warp_ar.scene import Scene, bundled_scenes, load_scene
 
 DEVICES = Path("/dev")
 """Where the system lists capture devices."""
@@ -92,13 +92,17 @@ def _run(options: argparse.Namespace) -> int:
     # What may not be opened is not tried: its own message would say less.
     checked = check_up(scene, None if access else source, frames=options.frames)
     found = worst_first([*found, *access, *checked])
+    own = None if scene.path in bundled_scenes().values() else str(options.scene)
     for line in told:
         print(line)
     for number, finding in enumerate(found, 1):
         print(f"{number}. {printable(finding.text)} [{finding.name}]")
         print(f"   spoils: {finding.cost}")
-        print(f"   do: {printable(finding.remedy)}")
-    if not found:
+        print(f"   do: {printable(finding.remedy_for(own))}")
+    if found:
+        print("FLIP is the mean visible difference of the lit picture, 0 to 1, measured for the fault in brackets;")
+        print("0.01 is seen only beside the right picture, 0.05 at once")
+    else:
         print("nothing wrong was found")
     return EXIT_FAILED if found else EXIT_DONE
 

@@ -249,12 +249,13 @@ def _quick_check(options: argparse.Namespace, scene: Scene) -> bool:
     except WarpArError:
         return False  # the run meets it too, and says it
     # What the run itself cannot start with, it says itself.
-    told = ("source.", "marker.", "camera.aspect")
+    told = ("source.", "camera.aspect")
     found = [finding for finding in checked.findings if not finding.name.startswith(told)]
     worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
     for finding in [*worst, *(finding for finding in found if finding.name == "camera.guessed")]:
         more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
-        say(f"{finding.text}; to do: {finding.remedy}{more}")
+        own = None if scene.path in bundled_scenes().values() else options.scene
+        say(f"{finding.text}; to do: {finding.remedy_for(own)}{more}")
     return checked.ball_seen
 
 

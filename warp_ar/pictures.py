@@ -16,7 +16,30 @@ from warp_ar.files import limits, read_bytes, too_much
 FORMATS = "PNG, JPEG, BMP, TIFF, WebP, GIF or PNM"
 """What is read: the formats whose headers are known here."""
 
+RAW = frozenset({".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"})
+"""Raw photographs, by their names' endings."""
+HEIF = frozenset({".heic", ".heif", ".hif", ".avif"})
+"""Pictures of phones that nothing here decodes, by their names' endings."""
+_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
+
 Size = tuple[int, int]
+
+
+def foreign_words(suffix: str, data: bytes = b"") -> str:
+    """Why a photograph cannot be read, and what to do about it; empty if it is of none of the kinds known for that.
+
+    Args:
+        suffix: Its name's ending, in lower case.
+        data: Its first bytes: phones' pictures are renamed to .jpg as they are.
+    """
+    if suffix in HEIF or (data[4:8] == b"ftyp" and data[8:12] in _BRANDS):
+        return (
+            "HEIC, which is not read: save it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; on a Mac: "
+            "sips -s format jpeg *.HEIC --out jpegs; else: heif-convert or ImageMagick)"
+        )
+    if suffix in RAW:
+        return "a raw photograph, which is not read: save it as JPEG, or as TIFF of 16 bits, in sRGB"
+    return ""
 
 
 def picture_size(data: bytes) -> Size | None:
@@ -74,6 +97,8 @@ def check_picture(data: bytes, error: type[WarpArError], label: str) -> None:
     if data.startswith(b"\x89PNG") and b"IEND\xaeB`\x82" not in data:
         raise error(f"{label} is cut off after {len(data)} bytes; copy the whole file")
     size = picture_size(data)
+    if size is None and (words := foreign_words("", data)):
+        raise error(f"{label} is {words}")
     if size is None:
         raise error(f"{label} cannot be decoded: damaged, cut off, or no image; use {FORMATS}")
     width, height = size

@@ -30,6 +30,8 @@ SEARCH = 5e-3
 """Metres around the outlines' centre in which the mirrored receiver is compared."""
 ASSUMED = 0.01
 """Share of a radius that is only assumed by which it may be off: a ruler's error."""
+LEAST_CONTRAST = 0.15
+"""Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
 SEARCH_DEVIATION = 0.0015
 """Metres: standard deviation of a centre that only a single outline's contrast tells."""
 
@@ -76,6 +78,11 @@ def measure_ball(
     outlines = find_outlines(few, camera, probe)
     if not outlines:
         report = outline_search(views, camera, probe.center, probe.radius)
+        if report.contrast < LEAST_CONTRAST:
+            raise UsageError(
+                f"no mirror ball is seen where [probe] center = {[round(x, 4) for x in probe.center]} has it; stand it "
+                "on the card's cross, have all of it in the picture, and check [probe]"
+            )
         return BallMeasurement(
             report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
         )

@@ -34,6 +34,12 @@ _FEWEST_VIEWS = 4
 """Views without which the focal length is not determined with any certainty."""
 GOOD_VIEWS = 12
 """Views below which a warning is due."""
+_GROUPS = 15
+"""Groups of views that are left out in turn: more cost time and tell the same."""
+LEAST_TILT = 15.0
+"""Degrees by which the board's tilt must differ: else focal length and distance cannot be told apart."""
+MOST_FOCAL = 0.03
+"""Share of the focal length that its interval of two standard deviations may have."""
 _COVERAGE_CELLS = (4, 6)
 """Rows and columns into which the picture is cut to see where the board has been."""
 
@@ -56,6 +62,17 @@ class CameraReport:
     """What would make it better, one line each."""
     marker: Marker
     """The board that was seen."""
+    tilts: tuple[float, float]
+    """Least and most that the board was tilted, degrees: of views that are alike, a deviation says nothing."""
+
+    @property
+    def doubt(self) -> str:
+        """Why the focal length is not to be believed, in words; empty where it is."""
+        if self.tilts[1] - self.tilts[0] < LEAST_TILT:
+            return f"the card was tilted by {self.tilts[0]:.0f} to {self.tilts[1]:.0f} degrees only"
+        if (share := 2 * self.focal_deviation / self.camera.fx) > MOST_FOCAL:
+            return f"the focal length is known to +/- {share:.0%} only"
+        return ""
 
 
 class BoardViews:
@@ -109,7 +126,8 @@ class BoardViews:
         self._size = self._size or size
         if size != self._size:
             first = f"{self._size[0]}x{self._size[1]}"
-            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}")
+            turned = "; hold the camera the same way for all" if size == self._size[::-1] else ""
+            raise UsageError(f"picture {self._seen}: {size[0]}x{size[1]}; expected the first one's {first}{turned}")
         self._seen += 1
         gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         if self.marker is None:
@@ -152,6 +170,7 @@ class BoardViews:
             result = _calibrate(kept, size)
             errors = np.ravel(result[-1])
         error, matrix, distortion, rotations, _, deviations, _, _ = result
+        deviation = max(float(np.ravel(deviations)[:2].max()), _spread(kept, size))
         camera = Camera(
             *size, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], tuple(map(float, np.ravel(distortion)))
         )
@@ -163,7 +182,7 @@ class BoardViews:
         if covered.mean() < 0.8:
             empty = [_place(row, column) for row, column in np.argwhere(~covered)]
             warnings.append(f"the board never reached {', '.join(dict.fromkeys(empty))}: distortion is a guess there")
-        if max(tilts) - min(tilts) < 15:
+        if max(tilts) - min(tilts) < LEAST_TILT:
             warnings.append(
                 f"the board was tilted by {min(tilts):.0f} to {max(tilts):.0f} degrees only: "
                 "the focal length is uncertain"
@@ -176,10 +195,11 @@ class BoardViews:
             camera,
             float(error),
             tuple(map(float, errors)),
-            float(np.ravel(deviations)[:2].max()),
+            deviation,
             float(covered.mean()),
             tuple(warnings),
             self.marker,
+            (min(tilts), max(tilts)),
         )
 
 
@@ -220,14 +240,34 @@ def _moved(corners: NDArray[Any], ids: NDArray[Any], others: NDArray[Any], other
 
 
 def _calibrate(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> Any:
-    pixels = [corners.astype(np.float32) for corners, _, _ in views]
-    points = [points.astype(np.float32) for _, _, points in views]
-    plain, full = (
-        cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
-        for flags in (cv2.CALIB_FIX_K3, 0)
-    )
+    plain, full = (_solve(views, size, flags) for flags in (cv2.CALIB_FIX_K3, 0))
     # The sixth-order term bends the corners of the picture wildly where it only fits noise.
     return full if full[0] < 0.9 * plain[0] else plain
+
+
+def _solve(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int], flags: int) -> Any:
+    pixels = [corners.astype(np.float32) for corners, _, _ in views]
+    points = [points.astype(np.float32) for _, _, points in views]
+    return cv2.calibrateCameraExtended(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+
+
+def _spread(views: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]], size: tuple[int, int]) -> float:
+    """Standard deviation of the focal length by leaving out views in turn (the jackknife), pixels.
+
+    Corners of one view are off alike (its blur, what the lens does beside the model), so that the deviation by
+    independent corners is too small. With f_g the focal length without group g of n,
+
+        s^2 = (n - 1) / n  sum_g (f_g - mean f)^2.
+    """
+    count = min(len(views), _GROUPS)
+    if count <= _FEWEST_VIEWS:
+        return 0.0
+    found = []
+    for group in range(count):
+        rest = [view for number, view in enumerate(views) if number % count != group]
+        matrix = _solve(rest, size, cv2.CALIB_FIX_K3)[1]
+        found.append((matrix[0, 0], matrix[1, 1]))
+    return float(np.sqrt((count - 1) * np.var(found, axis=0).max()))
 
 
 def _place(row: int, column: int) -> str:

@@ -135,6 +135,17 @@ _DECODE = (((np.arange(256) / 255 + 0.055) / 1.055) ** 2.4).astype(np.float32)
 """About what any camera's codes mean in linear light: ratios of some powers of two need no better."""
 
 
+def _open_device(device: Any) -> Any:
+    """OpenCV's capture, without its own words on stderr: what is wrong is said in one line."""
+    log: Any = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_ERROR)  # it warns of every backend that has no such device
+    try:
+        return cv2.VideoCapture(device)
+    finally:
+        log.setLogLevel(level)
+
+
 class CaptureDevice(LiveSource):
     """A camera through OpenCV: a thread reads all the time and keeps the newest frame.
 
@@ -158,7 +169,7 @@ class CaptureDevice(LiveSource):
         fps: float | None = None,
         grace: float = 2.0,
         exposures: Sequence[float] = (),
-        opener: Callable[[Any], _Capture] = cv2.VideoCapture,
+        opener: Callable[[Any], _Capture] = _open_device,
     ) -> None:
         super().__init__()
         check_fps(fps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from warp_ar.input.ball_finder import find_ball
 from warp_ar.input.ball_solve import BallSolution, find_outlines, ground_below, rough_circle, solve_ball
 from warp_ar.input.check_pictures import Look
 from warp_ar.input.finding import Finding
-from warp_ar.scene import Pose, Probe, Scene
+from warp_ar.scene import Camera, Pose, Probe, Scene
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -43,6 +44,13 @@ def check_balls(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
         label = "[probe]" if len(scene.probes) == 1 else f"[[probe]] {index}"
         found += _check_ball(scene, look, few, probe, label)
     return found
+
+
+def inside_contrast(views: Sequence[tuple[Image, Pose]], camera: Camera, probe: Probe) -> float:
+    """Standard deviation over mean inside a ball's outline, median over frames: of paper and paint below ``DULL``."""
+    circles = [(image, rough_circle(camera, pose, probe)) for image, pose in views]
+    parts = [_inside_of(image, circle) for image, circle in circles if circle is not None]
+    return float(np.median([part.std() / max(part.mean(), 1.0) for part in parts])) if parts else 0.0
 
 
 def _check_ball(

@@ -42,6 +42,8 @@ SHADOW: Final = 0.45
 """Logarithm of light across the card that a smooth fall does not explain."""
 BLURRED: Final = 6.0
 """Pixels from 10 to 90 % across a printed edge beyond which the picture is out of focus."""
+SHARP: Final = 0.14
+"""Share of a picture's contrast per pixel of its sharpest edges: in focus 0.4, blurred by 4 pixels 0.08 to 0.13."""
 DRIFT: Final = 0.12
 """Logarithm of exposure by which frames may differ."""
 TINT: Final = 0.06
@@ -68,13 +70,14 @@ class Look:
     """Linear value of each code, (256, 3)."""
 
 
-def take_look(scene: Scene, source: Source, frames: int) -> Look:
-    """Look at a source's first frames."""
+def take_look(scene: Scene, source: Source, frames: int, every: int = 1) -> Look:
+    """Look at every so many of a source's first frames; of alternating exposures the longest."""
     shown = (
         frame for frame in itertools.islice(source, frames) if frame.exposure_time in (None, *source.exposures[:1])
     )
     camera = scene.camera.scaled_to(*source.size)
-    return look_at(scene.marker, camera, ((frame.image, frame.time) for frame in shown))
+    some = itertools.islice(shown, 0, None, every)
+    return look_at(scene.marker, camera, ((frame.image, frame.time) for frame in some))
 
 
 def look_at(marker: Marker, camera: Camera, frames: Iterable[tuple[Image, float]]) -> Look:
@@ -149,6 +152,8 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
         )
     if float((image >= CLIPPED).mean()) > 0.7:
         return Finding("picture.clipped", "the picture is overexposed: most of it clips", "set a shorter exposure")
+    if _is_blurred(image):
+        return Finding("picture.blurred", "the picture is blurred", "focus on the card, and keep the camera still")
     name, seen = find_markers(image)
     if seen:
         numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
@@ -157,6 +162,14 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
     whole = "the whole card with its white margin" if marker.board else "the whole black square with its white margin"
     text = f"no {wanted} in {len(look.images)} frames; {whole} must be in the picture"
     return Finding("marker.unseen", text, "show all of it, flat, sharp and lit; check [marker]")
+
+
+def _is_blurred(image: Image) -> bool:
+    """Whether nothing in a picture that has contrast has a sharp edge."""
+    gray = cv2.medianBlur(_gray(image), 3).astype(np.float32)
+    low, high = np.percentile(gray, (1, 99))
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0, scale=1 / 8), cv2.Sobel(gray, cv2.CV_32F, 0, 1, scale=1 / 8))
+    return bool(high - low > 20 and np.percentile(slope, 99.9) < SHARP * (high - low))
 
 
 def _gray(image: Image) -> Image:

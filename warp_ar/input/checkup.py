@@ -23,6 +23,10 @@ FEW_VIEWS: Final = 5
 """Views in which paper and modelled shapes are looked for."""
 QUICK_FRAMES: Final = 12
 """Frames that the quick half looks at."""
+SPREAD: Final = 96
+"""Frames of ``PIXELS`` over which these are spread: drifts, and views from several sides, take seconds."""
+PIXELS: Final = 640 * 480
+"""Of larger pictures so many fewer frames are read that it takes as long."""
 
 
 def source_of(scene: Scene, given: str | int | Path | None = None) -> str | int | Path | None:
@@ -46,18 +50,24 @@ def check_up(
     """
     found = check_scene(scene)
     if source is not None:
-        found += _check_source(scene, source, QUICK_FRAMES if quick else frames, 1 if quick else 4, found)
+        found += _check_source(scene, source, None if quick else frames, 1 if quick else 4, found)
     return worst_first(found)
 
 
 def _check_source(
-    scene: Scene, source: str | int | Path, frames: int, views: int, before: list[Finding]
+    scene: Scene, source: str | int | Path, frames: int | None, views: int, before: list[Finding]
 ) -> list[Finding]:
     own = scene.source
     exposures = own.exposures or () if own is not None else ()
     try:
         with open_source(source, exposures=exposures) as opened:
-            look = take_look(scene, opened, frames)
+            every = 1
+            if frames is None:
+                width, height = opened.size
+                spread = round(SPREAD * min(PIXELS / (width * height), 1.0))
+                every = max(min(spread, opened.length or spread) // QUICK_FRAMES, 1)
+                frames = every * QUICK_FRAMES
+            look = take_look(scene, opened, frames, every)
     except SourceError as error:
         return [Finding("source.unreadable", str(error), "check [source], or give --source")]
     except SceneError as error:

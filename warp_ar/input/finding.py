@@ -20,6 +20,13 @@ class Finding:
     remedy: str
     """What to do: a command, or a key of the scene file."""
 
+    def remedy_for(self, scene: str | None) -> str:
+        """What to do, with the scene's own name where a command takes it; None: it is not written into."""
+        if scene is None:
+            return self.remedy
+        named = self.remedy.replace("calibrate camera PICTURES", f"calibrate camera PICTURES --write {scene}")
+        return named.replace("calibrate ball SCENE", f"calibrate ball {scene}")
+
     @property
     def error(self) -> float:
         """Mean FLIP of a picture lit with this fault against one lit without, 0 to 1; 1 where nothing can be lit."""

@@ -31,7 +31,7 @@ from warp_ar.input.source import (
     names_in,
     nearest_name,
 )
-from warp_ar.pictures import read_picture
+from warp_ar.pictures import foreign_words, read_picture
 
 Image = npt.NDArray[np.uint8]
 
@@ -73,6 +73,9 @@ class FrameFolder(RecordedSource):
             images = (name for name in names_in(path) if pathlib.Path(name).suffix.lower() in IMAGE_SUFFIXES)
             self._paths = [path / name for name in sorted(images, key=_natural_key)]
         if not self._paths:
+            for name in sorted(names_in(path)):
+                if words := foreign_words(pathlib.Path(name).suffix.lower()):
+                    raise SourceError(f"{path} holds no images that are read; {name} is {words}")
             raise SourceError(f"{path} holds no images; put frames there as {', '.join(sorted(IMAGE_SUFFIXES))}")
         told = _read_exposures(folder)
         self._exposures = told if isinstance(told, dict) else {}

@@ -2,9 +2,15 @@
 
 A shape has five or six numbers: where it stands, how it is turned about the vertical, and its sizes. The points give
 their start. Then, as in model-based tracking [DC02], every visible edge of the shape is sampled; from each sample the
-picture is searched along the edge's normal for the strongest step in brightness, and Gauss-Newton moves the shape so
-that its edges meet the steps. The points themselves hold it weakly, so that a shape without edges stays where it was
-pointed out.
+picture is searched along the edge's normal for the strongest step in colour, and Gauss-Newton moves the shape so that
+its edges meet the steps. The points themselves hold it weakly, so that a shape without edges stays where it was pointed
+out. A box may be as bright as the wood behind it, so that steps are told in RGB.
+
+Steps of other things (a print on the box, its shadow, the desk's grain) make wrong shapes that fit as well. So the fit
+starts from several sizes, and a shape counts as fitted only if no other one, more than ``TRUSTED`` away, fits nearly as
+well, and if the edges that were met tell its corners within ``TRUSTED``. For that each edge has an offset of its own of
+``EDGE`` pixels (its bevel, the card's pose, the lens) beside the scatter s of its n samples, so that it tells no more
+than n / (s^2 + n EDGE^2), and with J the derivatives of all samples the corners' covariance follows from (J^T W J)^-1.
 
 References:
     [DC02] T. Drummond and R. Cipolla. Real-time visual tracking of complex structures. PAMI 2002.
@@ -15,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, TypeAlias
 
 import cv2
@@ -35,12 +41,32 @@ MODELLED: Final = 30.0
 """The same at first for shapes that are modelled already: a ruler and a guess are worse than a hand."""
 ROUNDS: Final = 6
 """Steps of Gauss-Newton with each reach."""
+STILL: Final = 5e-5
+"""Metres and radians below which a step is none."""
 SPACING: Final = 4.0
 """Pixels between samples of an edge."""
 STEP: Final = 6.0
-"""Codes per pixel that a step must have: more than noise and wood have."""
-DEPTHS: Final = (1.0, 0.9, 0.8, 1.12, 1.25)
-"""Factors of the side that is pointed out worst, from which the edges are tried."""
+"""Codes per pixel that a step must have: more than noise and wood have; less in dark pictures, as theirs are."""
+BRIGHT: Final = 110.0
+"""Mean code of a picture from which on ``STEP`` holds."""
+FAINTEST: Final = 2.0
+"""Codes per pixel that a step has in the darkest picture: four standard deviations of a camera's noise."""
+HAND: Final = 5.0
+"""Pixels: standard deviation of a hand that points."""
+HANDS: Final = 12
+"""Further hands from whose points the edges are tried."""
+STRONG: Final = 2.5
+"""Times the least step from which on a step is strong enough: a print's edge is no better than a shadowed one."""
+TRUSTED: Final = 0.005
+"""Metres: two standard deviations of the worst corner of a shape that counts as fitted."""
+OUTLINE: Final = 30.0
+"""Logarithm of how much likelier an outline is that is wholly met than one that is not at all: half an edge, e^2."""
+RIVAL: Final = 3.0
+"""Logarithm of how much likelier the best shape must be than any other."""
+EDGE: Final = 0.3
+"""Pixels: standard deviation of what a whole edge is off by."""
+SCATTER: Final = 0.4
+"""Pixels: least standard deviation of one sample of an edge."""
 FARTHEST: Final = 12.0
 """Pixels that a corner may lie from where it was pointed out."""
 POINTED: Final = 8.0
@@ -64,9 +90,13 @@ class OutlineFit:
 
     proxy: Proxy
     met: float
-    """Share of its visible outline that lies on edges of the picture."""
+    """Share of its visible outline that lies on edges of the picture: the mean over its edges."""
     fitted: bool
-    """Whether the edges moved it; else it is as it was pointed out."""
+    """Whether edges of the picture tell its corners within ``TRUSTED``; where there are none it is as pointed out."""
+    deviation: float
+    """Standard deviation of its worst corner in metres, as far as edges and points tell; the camera's is not in it."""
+    doubt: str
+    """Why it is not fitted, in words; empty where it is."""
 
 
 def fit_outline(
@@ -89,36 +119,104 @@ def fit_outline(
     view = _View(camera, pose)
     start = {"plane": _start_plane, "wall": _start_wall, "box": _start_box}[kind](view, np.asarray(points, float))
     _check(kind, start)
-    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
+    picture = _Picture(image)
     anchors = _anchors(kind, start, view, np.asarray(points, float))
     start = _settled(kind, start, view, anchors)
-    best, met = start, 0.0
-    # A pixel is millimetres along the line of sight: the last side is tried at several lengths.
-    for factor, first in itertools.product(DEPTHS, (0, 1)):
-        shape = start.copy()
-        shape[4] *= factor
-        for reach in REACHES[first:]:
-            shape = _rounds(kind, shape, view, gray, reach, anchors)
+    tried = _tried(kind, start, view, picture, anchors)
+    if not tried:
+        deviation = _deviation(kind, start, view, None, anchors)
+        share, _ = _met(kind, start, view, picture)
+        return OutlineFit(_proxy(kind, start), share, False, deviation, "the picture shows too few of its edges")
+    best = max(tried, key=lambda one: one.score)
+    corners = _corners(kind, best.shape)
+    apart = [_apart(corners, _corners(kind, one.shape)) for one in tried if one.score > best.score - RIVAL]
+    if max(apart) > TRUSTED:
+        doubt = f"edges that are {1e3 * max(apart):.0f} mm apart fit it alike"
+        return OutlineFit(_proxy(kind, best.shape), best.met, False, max(apart) / 2, doubt)
+    deviation = _deviation(kind, best.shape, view, picture, anchors)
+    fitted = 2 * deviation < TRUSTED
+    doubt = "" if fitted else f"its edges tell it only within {2e3 * deviation:.0f} mm"
+    return OutlineFit(_proxy(kind, best.shape), best.met, fitted, deviation, doubt)
+
+
+def _apart(corners: Array, others: Array) -> float:
+    """How far corners (n, 3) are from the nearest of others at most, metres: a box may be named from another corner."""
+    return float(np.linalg.norm(corners[:, None] - others, axis=2).min(1).max())
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tried:
+    """A shape that edges meet."""
+
+    shape: Array
+    met: float
+    score: float
+    """Logarithm of its likelihood but for a constant: edges met, and how far a hand was off."""
+
+
+def _tried(kind: str, start: Array, view: _View, picture: _Picture, anchors: tuple[list[int], Array]) -> list[_Tried]:
+    """Shapes that enough edges meet."""
+    # Where a pixel is millimetres, a hand makes a shape of quite other sizes: what other hands would point out.
+    rng = np.random.default_rng(0)
+    chosen, pointed = anchors
+    hands = pointed + rng.normal(0.0, HAND, (HANDS, *pointed.shape))
+    starts = [start, *(_settled(kind, start, view, (chosen, hand)) for hand in hands)]
+    found = []
+    for first, reaches in itertools.product(starts, (REACHES, REACHES[1:], REACHES[2:])):
+        shape = first
+        for reach in reaches:
+            shape = _rounds(kind, shape, view, picture, reach, anchors)
+        off = view.pixels(_corners(kind, shape))[chosen] - pointed
         # Edges that lie far from where somebody pointed are others.
-        off = np.linalg.norm(view.pixels(_corners(kind, shape))[anchors[0]] - anchors[1], axis=1).max()
-        share = _met(kind, shape, view, gray) if off <= FARTHEST else 0.0
-        if share > met:
-            best, met = shape, share
-    fitted = met >= ENOUGH
-    if not fitted:
-        best, met = start, _met(kind, start, view, gray)
-    return OutlineFit(_proxy(kind, best), met, fitted)
+        if not np.linalg.norm(off, axis=1).max() <= FARTHEST:
+            continue
+        met, closely = _met(kind, shape, view, picture)
+        if met >= ENOUGH:
+            found.append(_Tried(shape, met, OUTLINE * closely - float((off**2).sum()) / (2 * HAND**2)))
+    return found
+
+
+def _deviation(
+    kind: str, shape: Array, view: _View, picture: _Picture | None, anchors: tuple[list[int], Array]
+) -> float:
+    """Standard deviation of the worst corner, metres, by the edges that are met and the points."""
+    chosen, _ = anchors
+    steps = 1e-4 * np.eye(len(shape))
+
+    def slopes(of: Callable[[Array], Array]) -> Array:
+        now = of(shape)
+        return np.stack([(of(shape + one) - now).ravel() / 1e-4 for one in steps], 1)
+
+    points = slopes(lambda numbers: view.pixels(_corners(kind, numbers))[chosen])
+    told = points.T @ points / POINTED**2
+    if picture is not None:
+        places, at, normals = _samples(kind, shape, view, picture.size)
+        offsets, strength = picture.steps(at, normals, REACHES[-1])
+        good = (strength > picture.step) & (np.abs(offsets) < MET)
+        along = slopes(lambda numbers: ((_points_of(_corners(kind, numbers), places, view) - at) * normals).sum(1))
+        names = np.array([8 * i + j for i, j, _ in places])
+        for name in np.unique(names[good]):
+            one = good & (names == name)
+            scatter = max(float(np.std(offsets[one])), SCATTER)
+            told += along[one].T @ along[one] / (scatter**2 + one.sum() * EDGE**2)
+    covariance = np.linalg.inv(told + 1e-9 * np.trace(told) * np.eye(len(shape)))
+    corners = slopes(lambda numbers: _corners(kind, numbers))
+    variances = np.einsum("ij,jk,ik->i", corners, covariance, corners).reshape(-1, 3).sum(1)
+    return math.sqrt(float(variances.max()))
 
 
 def _rounds(
-    kind: str, shape: Array, view: _View, gray: NDArray[np.float32], reach: float, anchors: tuple[list[int], Array]
+    kind: str, shape: Array, view: _View, picture: _Picture, reach: float, anchors: tuple[list[int], Array]
 ) -> Array:
     """A shape after some steps with one reach."""
     for _ in range(ROUNDS):
-        moved = _improve(kind, shape, view, gray, reach, anchors)
+        moved = _improve(kind, shape, view, picture, reach, anchors)
         if moved is None:
             break
+        still = np.abs(moved - shape).max() < STILL
         shape = moved
+        if still:
+            break
     return shape
 
 
@@ -151,23 +249,23 @@ def refit_outline(image: NDArray[np.uint8], camera: Camera, pose: Pose, proxy: P
     view = _View(camera, pose)
     if kind is None or view.eye[2] <= 0:
         return None
-    gray = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 0.8).astype(np.float32)
+    picture = _Picture(image)
     seen = view.pixels(_corners(kind, shape))
-    size = (gray.shape[1], gray.shape[0])
+    size = picture.size
     if not np.isfinite(seen).all() or not ((seen > 2) & (seen < (size[0] - 3, size[1] - 3))).all():
         return None  # of an outline that is cut off, what is left fits anywhere
-    start, before = shape, _met(kind, shape, view, gray)
+    start, before = shape, _met(kind, shape, view, picture)[0]
     anchors = (list(range(len(seen))), seen)
     for reach in (MODELLED, *REACHES):
         for _ in range(ROUNDS):
-            moved = _improve(kind, shape, view, gray, reach, anchors, free=3)
+            moved = _improve(kind, shape, view, picture, reach, anchors, free=3)
             if moved is None:
                 break
             shape = moved
     if not _is_sound(kind, shape):
         shape = start
     off = float(np.linalg.norm(view.pixels(_corners(kind, shape)) - seen, axis=1).max())
-    return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, gray), before, off)
+    return OutlineRefit(_proxy(kind, shape), _met(kind, shape, view, picture)[0], before, off)
 
 
 def _shape_of(proxy: Proxy) -> tuple[str | None, Array]:
@@ -210,6 +308,36 @@ class _View:
         if not (np.isfinite(far) & (far > 0)).all():
             raise UsageError("a point lies above the desk's horizon; point out corners that stand on the desk")
         return np.asarray((self.eye + far[:, None] * ways)[:, :2], float)
+
+
+class _Picture:
+    """A picture whose steps are looked for."""
+
+    def __init__(self, image: NDArray[np.uint8]) -> None:
+        self._colors = cv2.GaussianBlur(image, (0, 0), 0.8).astype(np.float32)
+        self.size = (image.shape[1], image.shape[0])
+        self.step = max(STEP * min(float(image.mean()) / BRIGHT, 1.0), FAINTEST)
+        """Codes per pixel that a step must have."""
+
+    def steps(self, at: Array, normals: Array, reach: float) -> tuple[Array, Array]:
+        """How far along its normal each sample's strongest step lies, pixels, and its strength, codes per pixel."""
+        offsets = np.arange(-reach, reach + 0.25, 0.5)
+        places = (at[:, None] + (offsets[:, None] * normals[:, None])).astype(np.float32)
+        values = cv2.remap(
+            self._colors, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        slope = np.sqrt(((values[:, 4:] - values[:, :-4]) ** 2).mean(-1)) / 2.0
+        middle = offsets[2:-2]
+        # Of two steps the nearer one, unless the other is much stronger.
+        weighed = np.minimum(slope, STRONG * self.step) * np.exp(-0.5 * (middle / (0.6 * reach)) ** 2)
+        best = weighed.argmax(1)
+        rows = np.arange(len(best))
+        low, high = np.clip(best - 1, 0, None), np.clip(best + 1, None, len(middle) - 1)
+        a, b, c = slope[rows, low], slope[rows, best], slope[rows, high]
+        bend = a - 2 * b + c
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fine = np.where((bend < 0) & (low < best) & (high > best), 0.5 * (a - c) / bend, 0.0)
+        return middle[best] + 0.5 * np.clip(fine, -1, 1), b
 
 
 def _turned(angle: float) -> Array:
@@ -343,25 +471,6 @@ def _points_of(corners: Array, places: Sequence[tuple[int, int, float]], view: _
     return view.pixels(points)
 
 
-def _steps(gray: NDArray[np.float32], at: Array, normals: Array, reach: float) -> tuple[Array, Array]:
-    """How far along its normal the strongest step of each sample lies, pixels, and its strength, codes per pixel."""
-    offsets = np.arange(-reach, reach + 0.25, 0.5)
-    places = (at[:, None] + (offsets[:, None] * normals[:, None])).astype(np.float32)
-    values = cv2.remap(gray, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    slope = np.abs(values[:, 4:] - values[:, :-4]) / 2.0
-    middle = offsets[2:-2]
-    # Of two steps the nearer one, unless the other is much stronger.
-    weighed = slope * np.exp(-0.5 * (middle / (0.6 * reach)) ** 2)
-    best = weighed.argmax(1)
-    rows = np.arange(len(best))
-    low, high = np.clip(best - 1, 0, None), np.clip(best + 1, None, len(middle) - 1)
-    a, b, c = slope[rows, low], slope[rows, best], slope[rows, high]
-    bend = a - 2 * b + c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fine = np.where((bend < 0) & (low < best) & (high > best), 0.5 * (a - c) / bend, 0.0)
-    return middle[best] + 0.5 * np.clip(fine, -1, 1), b
-
-
 def _anchors(kind: str, shape: Array, view: _View, points: Array) -> tuple[list[int], Array]:
     """Numbers of the shape's corners that were pointed out, and where they were."""
     seen = view.pixels(_corners(kind, shape))
@@ -389,19 +498,18 @@ def _improve(
     kind: str,
     shape: Array,
     view: _View,
-    gray: NDArray[np.float32],
+    picture: _Picture,
     reach: float,
     anchors: tuple[list[int], Array],
     free: int | None = None,
 ) -> Array | None:
     """One step of Gauss-Newton for the first ``free`` numbers; None where there is nothing to go by."""
-    size = (gray.shape[1], gray.shape[0])
-    places, at, normals = _samples(kind, shape, view, size)
+    places, at, normals = _samples(kind, shape, view, picture.size)
     if len(places) < 8:
         return None
-    offsets, strength = _steps(gray, at, normals, reach)
+    offsets, strength = picture.steps(at, normals, reach)
     # Tukey: a step of something else pulls no more.
-    weight = np.where(strength > STEP, np.clip(1 - (offsets / reach) ** 2, 0, None) ** 2, 0.0)
+    weight = np.where(strength > picture.step, np.clip(1 - (offsets / reach) ** 2, 0, None) ** 2, 0.0)
     chosen, pointed = anchors
 
     def seen(numbers: Array) -> Array:
@@ -422,12 +530,22 @@ def _improve(
     return moved if _is_sound(kind, moved) else None
 
 
-def _met(kind: str, shape: Array, view: _View, gray: NDArray[np.float32]) -> float:
-    places, at, normals = _samples(kind, shape, view, (gray.shape[1], gray.shape[0]))
+def _met(kind: str, shape: Array, view: _View, picture: _Picture) -> tuple[float, float]:
+    """Share of a shape's outline that lies on edges of the picture, and the same with those farther off counting less.
+
+    Each edge counts alike: a short one tells a side as well as a long one.
+    """
+    places, at, normals = _samples(kind, shape, view, picture.size)
     if not places:
-        return 0.0
-    offsets, strength = _steps(gray, at, normals, REACHES[-1])
-    return float(((strength > STEP) & (np.abs(offsets) < MET)).mean())
+        return 0.0, 0.0
+    offsets, strength = picture.steps(at, normals, REACHES[-1])
+    seen = strength > picture.step
+    names = np.array([8 * i + j for i, j, _ in places])
+    edges = [names == name for name in np.unique(names)]
+    met, closely = seen & (np.abs(offsets) < MET), seen * np.exp(-0.5 * (offsets / (0.5 * MET)) ** 2)
+    return float(np.mean([met[edge].mean() for edge in edges])), float(
+        np.mean([closely[edge].mean() for edge in edges])
+    )
 
 
 def _proxy(kind: str, shape: Array) -> Proxy:

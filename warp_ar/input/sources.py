@@ -21,6 +21,7 @@ from warp_ar.input.network_stream import SCHEMES, NetworkStream
 from warp_ar.input.source import DEFAULT_FPS, Frame, Source, check_exposures, check_fps, existing_path
 from warp_ar.input.synthetic import Synthetic
 from warp_ar.input.video_file import VideoFile
+from warp_ar.pictures import foreign_words
 
 __all__ = [
     "CaptureDevice",
@@ -76,4 +77,6 @@ def open_source(
     path = existing_path(pathlib.Path(spec))
     if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
         return FrameFolder(path, fps=fps or DEFAULT_FPS, loop=loop, exposures=exposures)
+    if words := foreign_words(path.suffix.lower()):
+        raise SourceError(f"{path} is {words}")
     return VideoFile(path, fps=fps, loop=loop, exposures=exposures)

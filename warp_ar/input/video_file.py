@@ -33,6 +33,9 @@ _FORMATS = (
 )
 _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
+_HDR = {16: "PQ", 18: "HLG"}
+"""Transfer characteristics of HDR by their numbers in ITU-T H.273: their codes are no light that a camera table has."""
+
 # Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
 _TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 
@@ -79,6 +82,12 @@ class VideoFile(RecordedSource):
             self.fps = fps or rate
             self.length = int(stream.frames) or round(seconds * rate) or None
             codec = stream.codec_context.name
+            if (kind := _HDR.get(int(stream.codec_context.color_trc))) is not None:
+                raise SourceError(
+                    f"{self._path} is HDR video ({kind}), whose codes are no measure of light here: record without HDR "
+                    "(iPhone: Settings, Camera, Record Video, HDR Video off; Android: 10-bit HDR off), or convert it "
+                    "to SDR, BT.709"
+                )
             first = next(self._pictures(container), None)
         if first is None:
             raise SourceError(f"{self._path}: frame 0 cannot be decoded: the video stream holds no picture")

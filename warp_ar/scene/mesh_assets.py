@@ -40,7 +40,8 @@ class Assets:
         """
         self.file_name = path.name
         self._path, self._library_due, self._pictures_follow = path, library_first, library_first
-        self._known: dict[str, bytes] = {}
+        self.known: dict[str, bytes] = {}
+        """What was read, by the name that the mesh file has for it."""
         self.problem: SceneError | None = None
 
     def get(self, name: str) -> bytes:
@@ -64,15 +65,15 @@ class Assets:
         return next((path for text in candidates if is_file(path := self._path.parent / text)), None)
 
     def _read(self, name: str, library: bool) -> bytes:
-        if name not in self._known:
+        if name not in self.known:
             limit = "text_bytes" if library else "picture_bytes" if self._pictures_follow else "mesh_bytes"
             path = self._found(name) or self._path.parent / name.strip()
             label = f"{self._path}: {path}, which it names,"
             data = read_bytes(path, limit, SceneError, label)
             if self._pictures_follow and not library:
                 check_picture(data, SceneError, label)
-            self._known[name] = data
-        return self._known[name]
+            self.known[name] = data
+        return self.known[name]
 
 
 def check_counts(path: Path, data: bytes) -> None:

@@ -96,7 +96,20 @@ def load_mesh(path: str | Path) -> Mesh:
             triangle, a vertex that is not finite, or a face with an index out of range. An OBJ without its MTL file is
             a mesh without materials.
     """
-    path = Path(path)
+    return _load(Path(path))[0]
+
+
+def files_beside(path: Path) -> dict[str, bytes]:
+    """The files that a mesh file names (materials, buffers, textures), by the names that it has for them.
+
+    Raises:
+        SceneError: As :func:`load_mesh`.
+    """
+    return _load(path)[1].known
+
+
+def _load(path: Path) -> tuple[Mesh, Assets]:
+    """A mesh, and what it was read from."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
     if not is_file(path):
@@ -115,7 +128,7 @@ def load_mesh(path: str | Path) -> Mesh:
             parts = _read_parts(path, data, assets, images, notes)
         if not parts:
             raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
-        return join_parts(f"{path}", parts, images, notes)
+        return join_parts(f"{path}", parts, images, notes), assets
     except SceneError:
         raise
     except _LOADER_ERRORS as error:

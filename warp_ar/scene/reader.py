@@ -487,6 +487,15 @@ def _scene_in(folder: Path) -> Path:
     return found[0]
 
 
+def _desks_beside(path: Path) -> list[str]:
+    """Folders with a scene beside a path that is not there, as one would write them."""
+    try:
+        beside = sorted(folder for folder in path.parent.iterdir() if is_folder(folder))[:200]
+        return [str(folder) for folder in beside if any(folder.glob("*.toml"))]
+    except (OSError, ValueError):
+        return []
+
+
 def load_scene(path_or_name: str | Path) -> Scene:
     """Read a scene file.
 
@@ -502,7 +511,8 @@ def load_scene(path_or_name: str | Path) -> Scene:
         path = _scene_in(path)
     if not is_file(path):
         if str(path_or_name) not in bundled:
-            hint = f"a file, or a bundled scene ({nearest(str(path_or_name), bundled)})" if bundled else "a scene file"
+            known = [*_desks_beside(path), *bundled]
+            hint = f"a file, or a bundled scene ({nearest(str(path_or_name), known)})" if known else "a scene file"
             raise SceneError(f"{path}: no such scene; expected {hint}")
         path = bundled[str(path_or_name)]
     return loads_scene(read_text(path, SceneError, expected="TOML"), path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +22,9 @@ from warp_ar.files import limits, parse_toml, too_much
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.places import files_of
-from warp_ar.scene import CapturedLight, Object, loads_scene
+from warp_ar.scene import CapturedLight, Object, load_scene, loads_scene
 from warp_ar.scene.mesh_files import MESH_SUFFIXES, load_mesh
+from warp_ar.viewer.bundle import unpack_scene
 from warp_ar.viewer.edits import Wanted, add_item
 
 MOST_BYTES: Final = 1 << 26
@@ -38,7 +40,7 @@ USUAL: Final = 0.12
 PLACE: Final = (0.12, -0.08)
 """Where it lands, metres."""
 LIGHTS: Final = (".exr", ".hdr")
-SUFFIXES: Final = (*MESH_SUFFIXES, *LIGHTS, ".toml")
+SUFFIXES: Final = (*MESH_SUFFIXES, *LIGHTS, ".toml", ".zip")
 
 Edit = tuple[Callable[[Wanted], Wanted], str, str]
 """What it makes of what is wanted, its name as an edit, and what is said about it."""
@@ -75,13 +77,21 @@ class DroppedFiles:
         path = self._folder / f"{self._count:02d}-{stem}{suffix}"
         path.write_bytes(data)
         try:
-            edit = _light_edit(_shown(name), path) if suffix in LIGHTS else _mesh_edit(_shown(name), path, wanted)
+            if suffix == ".zip":
+                edit = _bundle_edit(_shown(name), data, path.with_suffix(""), wanted)
+                path.unlink()
+            elif suffix in LIGHTS:
+                edit = _light_edit(_shown(name), path)
+            else:
+                edit = _mesh_edit(_shown(name), path, wanted)
         except WarpArError as error:
             # The folder is nobody's business. What was made of a file lies beside it.
             words = str(error)
             for made in self._folder.glob(f"{path.stem}.*"):
                 words = words.replace(str(made), _shown(name))
                 made.unlink()
+            words = words.replace(str(path.with_suffix("")), _shown(name))
+            shutil.rmtree(path.with_suffix(""), ignore_errors=True)
             raise UsageError(words) from error
         self._count += 1
         return edit
@@ -152,21 +162,40 @@ def _read_hdr(name: str, path: Path) -> Any:
     return np.ascontiguousarray(picture[..., 2::-1])
 
 
+def _bundle_edit(name: str, data: bytes, folder: Path, wanted: Wanted) -> Edit:
+    """A scene with all that it names."""
+    path = unpack_scene(name, data, folder, MOST_BYTES)
+    own = {file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file()}
+    _check_names(name, path.read_bytes(), {str(file) for file in files_of(wanted.scene)} | own)
+    scene = load_scene(path)
+    for item in scene.objects:
+        if item.file is not None and (count := len(load_mesh(item.file).faces)) > MOST_TRIANGLES:
+            raise UsageError(f"{name}: a mesh has {count:,} triangles; at most {MOST_TRIANGLES:,} are taken")
+    scene = dataclasses.replace(scene, path=wanted.scene.path)
+    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
+
+
 def _scene_edit(name: str, data: bytes, wanted: Wanted) -> Edit:
+    text = _check_names(name, data, {str(path) for path in files_of(wanted.scene)})
+    scene = dataclasses.replace(loads_scene(text, name), path=wanted.scene.path)
+    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
+
+
+def _check_names(name: str, data: bytes, known: set[str]) -> str:
+    """The text of a scene file that names no files but those that are known."""
     try:
         text = data.decode()
     except ValueError as error:
         raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
     document = parse_toml(text, name, UsageError)
-    known = {str(path) for path in files_of(wanted.scene)}
     for value in _texts(document):
         if value not in known and (re.search(r"[/\\]", value) or re.search(r"\.\w{2,5}$", value)):
             raise UsageError(
                 f"{name} names the file {value[:60]!r}; a scene with files of its own is opened by "
-                "python -m warp_ar.live, a dropped one may name only those of the scene that is shown"
+                "python -m warp_ar.live or dropped as a ZIP with them, a dropped one may name only those of the scene "
+                "that is shown"
             )
-    scene = dataclasses.replace(loads_scene(text, name), path=wanted.scene.path)
-    return lambda w: Wanted(scene, w.quality, cameras=w.cameras), f"open {name}", f"{name}: the scene is shown."
+    return text
 
 
 def _texts(value: Any) -> Iterable[str]:

@@ -23,6 +23,7 @@ from warp_ar.stages.quality import AUTO, DEFAULT_PRESET, PRESETS, Quality
 from warp_ar.viewer import calibration, edits, protocol
 from warp_ar.viewer.browser_camera import BrowserCamera
 from warp_ar.viewer.budget import BudgetSetting
+from warp_ar.viewer.bundle import pack_scene
 from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.controls import Controls, Notify, open_feed
 from warp_ar.viewer.dropped import DroppedFiles
@@ -192,9 +193,9 @@ class Host:
             lambda w: dataclasses.replace(w, scene=edits.add_item(w.scene, "proxy", found.proxy)), f"point out a {kind}"
         )
         sides = " x ".join(f"{1e3 * side:.0f}" for side in found.proxy.size)
-        how = f"{found.met:.0%} of its outline lies on edges of the picture"
+        how = f"fitted to edges of the picture, within {2e3 * found.deviation:.0f} mm"
         if not found.fitted:
-            how = "as pointed out, for the picture shows too few of its edges"
+            how = f"not certain, for {found.doubt}. Look at its handles, or point it out anew from nearer and higher up"
         self._notify({"type": "notice", "text": f"{kind.capitalize()} of {sides} mm: {how}.", "bad": False})
 
     def _open_scene(self, name: str) -> None:
@@ -314,6 +315,14 @@ class Host:
         scene = edits.beside(scene, Path(self._folder.name))
         folder = None if full_paths or scene.path is None else scene.path.parent
         return dumps_scene(dataclasses.replace(scene, path=None), folder)
+
+    def scene_bundle(self) -> bytes:
+        """The scene as it is shown, with all files that it names, as a ZIP.
+
+        Raises:
+            WarpArError: One of them cannot be read any more.
+        """
+        return pack_scene(make_target(self._controls.wanted, self._controls.feed).scene)
 
     # ---------------------------------------------------------------------------------------------------- what is told
 

@@ -217,6 +217,7 @@ class Server:
             "frame.png": ("image/png", host.snapshot),
             "environment.exr": ("image/x-exr", host.environment_exr),
             "scene.toml": ("application/toml", lambda: host.scene_toml(full_paths=self.address.loopback).encode()),
+            "scene.zip": ("application/zip", host.scene_bundle),
             "recording.mp4": ("video/mp4", host.recording),
             "camera.yml": ("application/yaml", host.camera_file),
             "response.txt": ("text/plain", host.response_file),

@@ -121,7 +121,7 @@ connection.addEventListener("calibration", ({ detail }) => {
   const fields = covered.flat();
   const enough = views >= wanted ? "enough" : `${wanted - views} more are good`;
   if (on) lines.push(`${views} view${views === 1 ? "" : "s"} so far, ${enough}; ${fields.filter(Boolean).length} of ${fields.length} fields reached. Hold the printed card before the camera, tilted another way each time, until every field of the picture is green.`);
-  else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${report.deviation.toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Undo takes it back. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
+  else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${(2 * report.deviation).toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Undo takes it back. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
   else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
   $("calibration-note").textContent = lines.join(" ");
 });

@@ -1,0 +1,103 @@
+"""Wrong orders, typos and poor pictures of somebody new: each line says what to do, and nothing worse is written."""
+
+from __future__ import annotations
+
+import imageio.v3
+import numpy as np
+import pytest
+
+from tests.printed_card import PrintedCard, poses
+from tests.rendered_room import look_at
+from warp_ar import __main__, calibrate, doctor, live
+from warp_ar.input.camera_calibration import MOST_FOCAL
+from warp_ar.scene import Camera, Pose, load_scene
+
+CAMERA = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
+
+
+def encode(linear):
+    return np.clip(linear, 0, 1) ** (1 / 2.2)
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """A folder with a new desk, and pictures of its card from one side, under one light."""
+    monkeypatch.chdir(tmp_path)
+    assert __main__.main(["init", "my_desk", "--radius", "0.03", "--source", "pictures"]) == 0
+    (tmp_path / "pictures").mkdir()
+    card = PrintedCard(np.random.default_rng(0))
+    for k in range(5):
+        # Moved across the picture, never tilted: focal length and distance cannot be told apart.
+        place = np.array([0.06 * k - 0.12, 0.04 * (k % 2), 0.0])
+        pose = Pose(*look_at(place + np.array([0.0, -0.01, 1.0]), place))
+        imageio.v3.imwrite(tmp_path / "pictures" / f"{k}.png", card.photograph(CAMERA, pose, 0.8, encode))
+    return tmp_path
+
+
+def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch):
+    monkeypatch.setattr(calibrate, "MOST_RESPONSE", 0.05)  # five pictures under one lamp tell 0.1
+    before = (desk / "my_desk" / "scene.toml").read_text()
+    for kind, said in (("camera", "the card was tilted by"), ("response", "the curve is known to")):
+        assert calibrate.main([kind, "pictures", "--write", "my_desk"]) == 1
+        assert said in (told := capsys.readouterr().err)
+        assert "nothing is written" in told
+    assert (desk / "my_desk" / "scene.toml").read_text() == before
+    assert not (desk / "my_desk" / "camera.yml").exists()
+    assert not (desk / "my_desk" / "response.txt").exists()
+
+
+def test_a_ball_that_is_not_there_is_not_written(desk, capsys):
+    before = (desk / "my_desk" / "scene.toml").read_text()
+    assert calibrate.main(["ball", "my_desk", "--write"]) != 0
+    told = capsys.readouterr().err
+    assert "the camera is guessed" in told
+    assert "no mirror ball is seen" in told or "too wide to be used" in told or "the picture is flat" in told
+    assert (desk / "my_desk" / "scene.toml").read_text() == before
+
+
+def test_the_folder_of_the_desk_is_no_picture(desk, capsys):
+    assert calibrate.main(["camera", "my_desk"]) == 2
+    assert "my_desk: is the folder of a scene; expected photographs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "said"),
+    [
+        (doctor.main, ["mydesk"], 'did you mean "my_desk"?'),
+        (live.main, ["my_desk", "--qualty", "low"], "did you mean --quality?"),
+        (calibrate.main, ["ball", "my_desk", "--sorce", "x"], "did you mean --source?"),
+        (__main__.main, ["doctr", "my_desk"], 'no command doctr; did you mean "doctor"?'),
+        (live.main, ["my_desk", "--radius", "3"], "unrecognized arguments: --radius 3; see"),
+    ],
+)
+def test_typos_are_told_from_what_was_meant(desk, main, arguments, said, capsys):
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_all_commands_are_listed(capsys):
+    assert __main__.main([]) == 0
+    said = capsys.readouterr().out
+    assert "python -m warp_ar.init my_desk" in said
+    from docs.hooks import COMMANDS
+
+    assert {name.removesuffix(".cli") for name in COMMANDS} == set(__main__.COMMANDS)
+
+
+def test_remedies_name_the_scene(desk, capsys):
+    assert doctor.main(["my_desk"]) == 1
+    said = capsys.readouterr().out
+    assert "do: python -m warp_ar.calibrate camera PICTURES --write my_desk" in said
+    assert "SCENE" not in said
+    assert "FLIP is the mean visible difference" in said
+
+
+def test_good_pictures_are_written_and_the_next_step_is_said(desk, capsys):
+    rng = np.random.default_rng(1)
+    card = PrintedCard(rng)
+    (desk / "more").mkdir()
+    for k, pose in enumerate(poses(rng, 16, far=(0.28, 0.42))):
+        imageio.v3.imwrite(desk / "more" / f"{k}.png", card.photograph(CAMERA, pose, 0.8, encode))
+    assert calibrate.main(["camera", "more", "--write", "my_desk"]) == 0
+    assert "next: python -m warp_ar.calibrate ball my_desk --write" in capsys.readouterr().out
+    assert abs(load_scene("my_desk").camera.fx / CAMERA.fx - 1) < MOST_FOCAL

@@ -1,0 +1,50 @@
+"""``python -m warp_ar``: all commands, and ``python -m warp_ar COMMAND ...`` as another way to run one."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from warp_ar.command_line import EXIT_DONE, run_command
+from warp_ar.errors import UsageError, printable
+from warp_ar.scene.messages import nearest
+
+COMMANDS = {
+    "init": "make a folder to start your own desk from, with the card to print",
+    "live": "light a scene: the page, or --output FILE; without a scene the bundled desk",
+    "calibrate": "measure camera, ball and response; print a card or marker",
+    "doctor": "say what is wrong with a set-up, and what to do",
+    "capture": "light from photographs of a mirror ball",
+    "environment": "write an environment for other programs",
+    "export": "write a shot for other programs",
+    "explain": "what a scene calls for, and why the rest is left out",
+    "farm": "light many recordings, make data sets",
+    "tradeoff": "what accuracy costs on this machine",
+    "paper": "the paper's figures",
+    "reference": "a path-traced picture that methods are judged by",
+}
+"""Every command with what it is for."""
+
+
+def _run(arguments: Sequence[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print("usage: python -m warp_ar COMMAND ...; --help after a command lists its options")
+        for name, text in COMMANDS.items():
+            print(f"  {name:12s} {text}")
+        print("to start: python -m warp_ar.live, or for your own desk python -m warp_ar.init my_desk")
+        return EXIT_DONE
+    name, *rest = arguments
+    if name not in COMMANDS:
+        raise UsageError(f"no command {printable(name)}; {nearest(name, COMMANDS)}")
+    module = importlib.import_module("warp_ar.farm.cli" if name == "farm" else f"warp_ar.{name}")
+    return int(module.main(rest))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    return run_command(lambda: _run(sys.argv[1:] if arguments is None else arguments))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
