@@ -86,6 +86,7 @@ class FrameInputs:
         """Codes at which channels saturate, as frames have told so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         self._saturation_is_known = False
+        self._encoded = 0.0, self.saturation.levels.copy()
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
@@ -130,13 +131,13 @@ class FrameInputs:
         if self._drift is None or frame.pose is None or isinstance(frame.image, wp.array):
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
+        self._drift.saturation = self.saturation.levels
         if not self._drift.observe(frame.image, frame.pose, frame.seconds):
             return None, False
         self.host_scene.set_gain(self._drift.gain)
         is_bent = contrast != self._drift.contrast
         if is_bent:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
@@ -147,7 +148,6 @@ class FrameInputs:
         self.host_scene.set_gain(self._drift.gain)
         if self._drift.contrast != 0.0:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
 
     def forget_drift(self) -> None:
         """Take the next frame for the camera's first."""
@@ -158,12 +158,14 @@ class FrameInputs:
         self.host_scene.set_gain(self._drift.gain)
         if is_bent:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer))
 
     def _write_decode(self) -> None:
         """Decode by what frames have told of the camera so far."""
-        contrast = 0.0 if self._drift is None else self._drift.contrast
-        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels, contrast))
+        contrast, levels = 0.0 if self._drift is None else self._drift.contrast, self.saturation.levels
+        self._arrays["decode"].assign(camera_table(self._camera.transfer, levels, contrast))
+        if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
+            self._arrays["encode"].assign(encode_table(self._camera.transfer, contrast, levels))
+            self._encoded = contrast, levels.copy()
 
     def close(self) -> None:
         """Stop the copying threads."""
@@ -261,8 +263,8 @@ class FrameInputs:
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
             outlines["light"] = scene.light_outline(bounced=True)
-        if "mirrored" in arrays:
-            outlines["ball"] = scene.ball_outline()
+        if "mirrored" in arrays or "reflected" in arrays:
+            outlines["ball"] = scene.mirror_outline(receivers="reflected" in arrays)
         if "shadow_ratio" in arrays:
             outlines["shadow"] = scene.shadow_outline()
         return outlines

@@ -40,7 +40,8 @@ class Features:
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
-    """Resources that are laid over the frame: of ``virtual``, ``physical_added``, ``shadow_ratio``, ``mirrored``."""
+    """Resources that are laid over the frame: of ``virtual``, ``physical_added``, ``shadow_ratio``, ``mirrored``,
+    ``reflected``; the last holds the one before."""
     exposed: bool
     """The picture is shown at another exposure than the camera's."""
     boxed: bool
@@ -116,7 +117,7 @@ def find_features(request: Request) -> Features:
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         near_field=environment and quality.method("shade") == "one_bounce",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
-        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters),
+        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters, mirrors="reflected" in layers),
     )
 
 
@@ -136,10 +137,17 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
         layers.append("shadow_ratio")
     if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
         layers.append("mirrored")
+    if (
+        layers
+        and scene.has_gloss
+        and has_environment(scene)
+        and quality.method("mirror_ball") not in ("default", "none")
+    ):
+        layers.append("reflected")
     return tuple(layers)
 
 
-def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLightConfig:
+def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool, mirrors: bool) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
     return DistantLightConfig(
@@ -147,7 +155,7 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool) -> DistantLi
         models=tuple(sorted(set(map(material_model, materials)))),
         textures=is_detailed(scene),
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
-        specular=environment and any(map(reflects_glossily, materials)),
+        specular=environment and (any(map(reflects_glossily, materials)) or mirrors),
         probes=bool(scene.probes),
         emitters=emitters,
         captured=scene.captured is not None,

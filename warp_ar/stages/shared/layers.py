@@ -10,7 +10,8 @@ from warp_ar.kernels import composite
 
 def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
     """The layers that there are, as kernels read them."""
-    names = ("virtual", "physical_added", "shadow_ratio", "mirrored")
+    mirrored = "reflected" if "reflected" in arrays else "mirrored"
+    names = ("virtual", "physical_added", "shadow_ratio", mirrored)
     return composite.make_layers(*(arrays.get(name) for name in names))
 
 
@@ -20,5 +21,5 @@ def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
         virtual="virtual" in layers,
         added="physical_added" in layers,
         ratio="shadow_ratio" in layers,
-        mirrored="mirrored" in layers,
+        mirrored="mirrored" in layers or "reflected" in layers,
     )
