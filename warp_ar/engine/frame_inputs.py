@@ -227,7 +227,9 @@ class FrameInputs:
             return
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
-        if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
+        if self.saturation.observe(
+            frame.image, ball_discs(self._probes, self._camera, frame.pose), float(self.gain.mean())
+        ):
             self._write_decode()
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:

@@ -217,7 +217,8 @@ class ProxyMaterial:
     roughness: float = 0.1
     """Perceptual, as glTF has it: 0 is a mirror, 1 as wide as can be; a polished table has about 0.1."""
     reflectance: RGB = (0.04, 0.04, 0.04)
-    """Specular reflectance where it is seen from ahead, glTF's F0: 0.04 is lacquer, glass or stone. One number is grey."""
+    """Specular reflectance where it is seen from ahead, glTF's F0; 0.04 is lacquer or glass. A file may give one number
+    for grey."""
 
 
 @dataclasses.dataclass(frozen=True)
