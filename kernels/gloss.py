@@ -376,7 +376,7 @@ def smooth_gloss_kernel(
     row_start: wp.int32,
     change: wp.array2d[wp.vec3],
     surface: wp.array2d[wp.int32],
-    mirrored: wp.array2d[wp.vec3],
+    mirror_ball: wp.array2d[wp.vec3],
     # Out:
     reflected_out: wp.array2d[wp.vec3],
 ):
@@ -394,8 +394,8 @@ def smooth_gloss_kernel(
                     total += change[k, m]
                     weights += 1.0
         result = total / weights
-    if mirrored.shape[0] > 0:
-        result += mirrored[i, j]
+    if mirror_ball.shape[0] > 0:
+        result += mirror_ball[i, j]
     reflected_out[i, j] = result
 
 
@@ -433,21 +433,26 @@ def gloss(
 
 
 def smooth_gloss(
-    change: wp.array, surface: wp.array, mirrored: wp.array | None, reflected_out: wp.array, *, rows: Rows | None = None
+    change: wp.array,
+    surface: wp.array,
+    mirror_ball: wp.array | None,
+    reflected_out: wp.array,
+    *,
+    rows: Rows | None = None,
 ) -> None:
     """Write what receivers and mirror balls change, the noise of rough receivers averaged over neighbours.
 
     Args:
         change: (H, W) vec3 of ``gloss``.
         surface: (H, W) int32 of ``gloss``.
-        mirrored: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
+        mirror_ball: (H, W) vec3 of ``mirror_ball``, which is added; None where there is none.
         reflected_out: (H, W) vec3.
         rows: Band of rows; None means all.
     """
     launch_rows(
         smooth_gloss_kernel,
         change.shape,
-        [change, surface, mirrored],
+        [change, surface, mirror_ball],
         [reflected_out],
         rows=rows,
         device=change.device,

@@ -265,7 +265,7 @@ class FrameInputs:
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
             outlines["light"] = scene.light_outline(bounced=True)
-        if "mirrored" in arrays or "reflected" in arrays:
+        if "mirror_ball" in arrays or "reflected" in arrays:
             outlines["ball"] = scene.mirror_outline(receivers="reflected" in arrays)
         if "shadow_ratio" in arrays:
             outlines["shadow"] = scene.shadow_outline()

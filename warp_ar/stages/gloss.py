@@ -46,7 +46,7 @@ class Gloss(Stage):
             return LeftOut("nothing virtual can be mirrored, or the quality leaves mirrors as the camera saw them")
         reads = {"pose", "frame", "objects", *distant_light_reads(features)}
         reads |= {"lights"} if features.request.scene.lights else set()
-        reads |= {name for name in features.layers if name in ("shadow_ratio", "physical_added", "mirrored")}
+        reads |= {name for name in features.layers if name in ("shadow_ratio", "added_light", "mirror_ball")}
         return Wiring(tuple(sorted(reads)), ("reflected",))
 
     def idle(self, reach: Reach) -> str | None:
@@ -70,20 +70,20 @@ class Gloss(Stage):
         gloss.make_gloss_kernel(config)
         arrays["gloss_surfaces"].assign(self._surfaces())
         sight, layers = gloss.Sight(), gloss.GlossLayers()
-        for field, name in (("shadow_ratio", "shadow_ratio"), ("added", "physical_added")):
+        for field, name in (("shadow_ratio", "shadow_ratio"), ("added", "added_light")):
             if name in self.wiring.reads:
                 setattr(layers, field, arrays[name])
         sight.scene, sight.picture, sight.probes = arrays["ray_scene"], find_picture(arrays), arrays["probes"]
         sight.distant, sight.layers = make_distant_light(self.features, arrays, self.name), layers
         lights = arrays["light_array"] if config.lights else None
         own = arrays["gloss_change"], arrays["gloss_surface"]
-        mirrored = arrays["mirrored"] if "mirrored" in self.wiring.reads else None
+        mirror_ball = arrays["mirror_ball"] if "mirror_ball" in self.wiring.reads else None
 
         def mirror(rows: Rows | None) -> None:
             gloss.gloss(config, arrays["params"], sight, lights, arrays["gloss_surfaces"], *own, rows=rows)
 
         def smooth(rows: Rows | None) -> None:
-            gloss.smooth_gloss(*own, mirrored, arrays["reflected"], rows=rows)
+            gloss.smooth_gloss(*own, mirror_ball, arrays["reflected"], rows=rows)
 
         height, extents = self.request.size[1], [GrowingRows(arrays["ball_rows"]) for _ in range(2)]
         return [Pass(one, rows=height, extent=extent) for one, extent in zip((mirror, smooth), extents, strict=True)]
