@@ -147,19 +147,23 @@ def camera_table(
     Returns:
         (257, 3) float32.
     """
-    values = without_contrast(_decode_values(transfer), contrast).astype(np.float32)
+    values = without_contrast(_decode_values(transfer), contrast, saturation).astype(np.float32)
     return np.concatenate([values, np.asarray(saturation, np.float32)[None]])
 
 
-def without_contrast(values: np.ndarray, contrast: float) -> np.ndarray:
+def without_contrast(
+    values: np.ndarray, contrast: float, saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255)
+) -> np.ndarray:
     """Linear value of every code of a camera that raises the contrast of what its transfer gives.
 
     With x that encoded value, 0 to 1, the code is y = x + a x (1 - x) (x - 1/2): both ends and the middle stay, for
-    a = 2 it is the smoothstep. It rises everywhere for -4 < a < 8.
+    a = 2 it is the smoothstep. It rises everywhere for -4 < a < 8. The curve ends where the camera does: x and y are
+    shares of the code at which a channel saturates.
 
     Args:
         values: Linear value of every code without that, (256, 3).
         contrast: a.
+        saturation: Code at which each channel saturates, (3,).
 
     Returns:
         (256, 3) float64.
@@ -167,11 +171,16 @@ def without_contrast(values: np.ndarray, contrast: float) -> np.ndarray:
     if contrast == 0.0:
         return values
     x, codes = np.linspace(0.0, 1.0, 4097), np.arange(256) / 255.0
-    plain = np.interp(codes, x + contrast * x * (1.0 - x) * (x - 0.5), x)
-    return np.stack([np.interp(plain, codes, values[:, c]) for c in range(3)], -1)
+    bent, ends = x + contrast * x * (1.0 - x) * (x - 0.5), np.asarray(saturation, np.float64) / 255.0
+    plain = [np.where(codes < end, end * np.interp(codes / end, bent, x), codes) for end in ends]
+    return np.stack([np.interp(plain[c], codes, values[:, c]) for c in range(3)], -1)
 
 
-def encode_table(transfer: str | pathlib.Path, contrast: float = 0.0) -> np.ndarray:
+def encode_table(
+    transfer: str | pathlib.Path,
+    contrast: float = 0.0,
+    saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255),
+) -> np.ndarray:
     """Table for the device function ``encode``; arguments and errors as ``camera_table``.
 
     Returns:
@@ -182,7 +191,7 @@ def encode_table(transfer: str | pathlib.Path, contrast: float = 0.0) -> np.ndar
     if contrast == 0.0 and (name == "linear" or name == "srgb" or name.startswith("gamma:")):
         exact = np.repeat(_formula(name, half_codes)[:, None], 3, axis=1)
     else:
-        values = without_contrast(_decode_values(transfer), contrast)
+        values = without_contrast(_decode_values(transfer), contrast, saturation)
         exact = 0.5 * (values[:-1] + values[1:])
     thresholds = exact.astype(np.float32)
     thresholds = np.where(thresholds < exact, np.nextafter(thresholds, np.float32(np.inf)), thresholds)

@@ -55,7 +55,7 @@ class FrameParams:
     light_rect: wp.vec4i  # the same for virtual light and shadow on the physical
     direct_rect: wp.vec4i  # the part of light_rect that light reaches without a bounce
     shadow_rect: wp.vec4i  # the same for what virtual objects do to the environment on the physical
-    ball_rect: wp.vec4i  # the same for mirror balls
+    ball_rect: wp.vec4i  # the same for mirror balls, and for receivers that mirror where there are any
 
 
 @wp.struct

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_ar.input.saturation import SaturationLevels, ball_codes, ball_discs
+from warp_ar.input.saturation import FULL, SaturationLevels, ball_codes, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, is_saturated, saturation_codes
 from warp_ar.scene import Camera, Probe
 from warp_ar.scene.pose import Pose
@@ -104,3 +104,33 @@ def test_kernels_take_levels_from_the_camera_table(device, saturation, code, exp
     codes = wp.array(np.array([code], np.uint8), dtype=wp.vec3ub, device=device)
     wp.launch(saturated_kernel, 1, [table, codes], [out], device=device)
     assert out.numpy()[0].tolist() == list(expected)
+
+
+def blurred_ball(level: float, spread: float, seed: int) -> np.ndarray:
+    """A disc on grey whose brightest part is neutral, around ``level``, as sharpening and a hard codec leave it."""
+    random = np.random.default_rng(seed)
+    image = np.full((80, 80, 3), 60, np.uint8)
+    image[20:60, 20:60] = random.integers(20, 225, (40, 40, 1))
+    top = np.clip(level + spread * random.normal(size=(14, 14, 1)), 0, 255)
+    image[30:44, 30:44] = np.round(top).astype(np.uint8)
+    return image
+
+
+def test_a_blurred_end_is_told_by_a_gain_that_does_not_move_it():
+    """The same codes at gains from 0.8 to 1.3: the camera ends there. Nothing is told while the gain stands still."""
+    disc = [(40.0, 40.0, 20.0)]
+    drifting, steady = SaturationLevels(), SaturationLevels()
+    for k, gain in enumerate((1.0, 1.15, 1.3, 1.1, 0.9, 0.8)):
+        image = blurred_ball(237.0, 3.0, k)
+        drifting.observe(image, disc, gain)
+        steady.observe(image, disc)
+    assert np.abs(drifting.levels - 237).max() <= 1
+    np.testing.assert_array_equal(steady.levels, FULL)
+
+
+def test_a_lit_surface_moves_with_the_gain():
+    """A white wall in the ball: its codes follow the gain by the transfer, and no level is believed."""
+    seen = SaturationLevels()
+    for k, gain in enumerate((1.0, 1.1, 1.15, 1.05, 0.9, 0.8)):
+        seen.observe(blurred_ball(225.0 * gain ** (1 / 2.2), 2.0, k), [(40.0, 40.0, 20.0)], gain)
+    np.testing.assert_array_equal(seen.levels, FULL)

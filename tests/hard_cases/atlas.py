@@ -53,7 +53,7 @@ CONCERNS: dict[int, tuple[str, ...]] = {
     5: ("unwrap", "recover", "irradiance", "prefilter", *_RAYS, "declip"),
     6: (*(stage for stage in METHODS if stage not in _GEOMETRY), PIPELINE),
     7: ("bracket", "accumulate", "recover", "expose", PIPELINE),
-    8: ("prefilter", "shade", "environment_shadow", "near_field", "mirror_ball"),
+    8: ("prefilter", "shade", "environment_shadow", "near_field", "mirror_ball", "gloss"),
     9: ("relight", "shade", "mirror_ball"),
     10: ("key_lights", "relight"),
     11: ("summed_area", "expose"),

@@ -87,6 +87,7 @@ class FrameInputs:
         """Codes at which channels saturate, as frames have told so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         self._saturation_is_known = False
+        self._encoded = 0.0, self.saturation.levels.copy()
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
@@ -131,13 +132,13 @@ class FrameInputs:
         if self._drift is None or frame.pose is None or isinstance(frame.image, wp.array):
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
+        self._drift.saturation = self.saturation.levels
         if not self._drift.observe(frame.image, frame.pose, frame.seconds):
             return None, False
         self.host_scene.set_gain(self._drift.gain)
         is_bent = contrast != self._drift.contrast
         if is_bent:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
         return np.asarray(self._drift.gain / gain), is_bent
 
     def continue_from(self, other: FrameInputs) -> None:
@@ -148,7 +149,6 @@ class FrameInputs:
         self.host_scene.set_gain(self._drift.gain)
         if self._drift.contrast != 0.0:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer, self._drift.contrast))
 
     def forget_drift(self) -> None:
         """Take the next frame for the camera's first."""
@@ -159,12 +159,14 @@ class FrameInputs:
         self.host_scene.set_gain(self._drift.gain)
         if is_bent:
             self._write_decode()
-            self._arrays["encode"].assign(encode_table(self._camera.transfer))
 
     def _write_decode(self) -> None:
         """Decode by what frames have told of the camera so far."""
-        contrast = 0.0 if self._drift is None else self._drift.contrast
-        self._arrays["decode"].assign(camera_table(self._camera.transfer, self.saturation.levels, contrast))
+        contrast, levels = 0.0 if self._drift is None else self._drift.contrast, self.saturation.levels
+        self._arrays["decode"].assign(camera_table(self._camera.transfer, levels, contrast))
+        if contrast != self._encoded[0] or (contrast != 0.0 and (levels != self._encoded[1]).any()):
+            self._arrays["encode"].assign(encode_table(self._camera.transfer, contrast, levels))
+            self._encoded = contrast, levels.copy()
 
     def close(self) -> None:
         """Stop the copying threads."""
@@ -226,7 +228,9 @@ class FrameInputs:
             return
         if frame.index >= WATCHED and frame.index % PERIOD:
             return
-        if self.saturation.observe(frame.image, ball_discs(self._probes, self._camera, frame.pose)):
+        if self.saturation.observe(
+            frame.image, ball_discs(self._probes, self._camera, frame.pose), float(self.gain.mean())
+        ):
             self._write_decode()
 
     def _place(self, frame: SeenFrame) -> Iterable[str]:
@@ -266,8 +270,8 @@ class FrameInputs:
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
             outlines["light"] = scene.light_outline(bounced=True)
-        if "mirror_ball" in arrays:
-            outlines["ball"] = scene.ball_outline()
+        if "mirror_ball" in arrays or "reflected" in arrays:
+            outlines["ball"] = scene.mirror_outline(receivers="reflected" in arrays)
         if "shadow_ratio" in arrays:
             outlines["shadow"] = scene.shadow_outline()
         return outlines

@@ -100,6 +100,8 @@ class ExposureDrift:
         self._next_looks = FIRST_LOOKS
         self.gain: Array = np.ones(3)
         """What the camera multiplies radiance by, against its first frame, RGB."""
+        self.saturation = np.full(3, 255)
+        """Code at which each channel saturates, as far as frames have told."""
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""
 
@@ -142,7 +144,7 @@ class ExposureDrift:
             codes: Of the points now, (n, 3).
             contrast: That the camera is taken to have.
         """
-        values = without_contrast(self._plain, contrast)
+        values = without_contrast(self._plain, contrast, self.saturation)
         table = np.log(np.maximum(values, 1e-6))
         now, first = (
             np.stack([np.interp(part[:, c], np.arange(256), table[:, c]) for c in range(3)], -1)
@@ -202,7 +204,7 @@ class ExposureDrift:
             return 0.0
         middle = [np.median(part, axis=0) for part in shown]
         for contrast in CONTRASTS:
-            table = without_contrast(self._plain, float(contrast))
+            table = without_contrast(self._plain, float(contrast), self.saturation)
             paper, ink = (np.array([np.interp(m[c], np.arange(256), table[:, c]) for c in range(3)]) for m in middle)
             if paper.sum() <= MOST_PRINT * ink.sum():
                 return float(contrast)

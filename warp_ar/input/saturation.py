@@ -15,6 +15,11 @@ Compression throws the channels' codes to both sides of a plateau, up to some te
 in full resolution. So a plateau of luma counts for all channels where its pixels are neutral: lamps drive all channels
 to the end, and few surfaces are so neutral.
 
+Where sharpening and hard compression blur a plateau too far for that, a camera that meters for itself tells all the
+same: what it shows of a lit surface moves with its gain, and a plateau does not. So where the top of the luma in the
+ball, neutral as above, stays within ``STILL`` codes over frames whose gains differ by ``MOVED`` and more, it is the
+level: a surface would have moved by some ten codes.
+
 A level that was seen holds for all frames after it, for the camera is the same. A frame whose codes heap up at 254 and
 255 anywhere in the picture takes it back for good.
 """
@@ -67,6 +72,18 @@ NEUTRAL_WIDE = 6.0
 """Codes by which the median pixel of such a plateau may be off it: chroma is compressed harder than luma."""
 LOPSIDED = 0.7
 """Most that a wide plateau may have above it, of what as many codes below it have: a lit surface has as much."""
+TOP = 3
+"""Codes to either side of a blurred plateau's own that belong to it."""
+TOP_SHARE = 0.02
+"""Share of the ball's pixels that it has."""
+TOP_STEEP = 2.0
+"""Ratio of its pixels to those of as many codes before it."""
+STILL = 4
+"""Codes over which it may be spread in time."""
+MOVED = 0.25
+"""Logarithm of the ratio of the largest gain to the least."""
+MOVED_FRAMES = 4
+"""Frames that must tell."""
 HELD_HEAP = 2e-3
 """Share of the whole picture that has codes 254 and 255 where a level that was seen is taken back: sharpening and
 compression throw some there."""
@@ -80,18 +97,26 @@ class SaturationLevels:
         self.levels: NDArray[np.int64] = np.full(3, FULL)
         """Code at which each channel saturates, (3,)."""
         self._is_full = np.zeros(3, bool)
+        self._tops: list[tuple[int, float]] = []
+        self._stays: int | None = None
 
-    def observe(self, image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> bool:
+    def observe(self, image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]], gain: float = 1.0) -> bool:
         """Look at one picture; returns whether a level has changed.
 
         Args:
             image: uint8 RGB (height, width, 3).
             balls: Centre x, y and radius of each ball, pixels.
+            gain: Of the camera, against its first frame, where that is known to drift.
         """
-        if self._is_full.all():
+        if self._is_full.all() and gain == 1.0:
             return False
         before = self.levels.copy()
         codes = ball_codes(image, balls)
+        if self._stays is None:
+            self._stays = self._unmoved(codes, gain)
+        if self._stays is not None:
+            self.levels[:] = self._stays
+            return bool((before != self.levels).any())
         found = luma_plateau(codes)
         for c in range(3):
             part = np.ascontiguousarray(image[::2, ::2, c])
@@ -107,6 +132,17 @@ class SaturationLevels:
             if self._is_full[c]:
                 self.levels[c] = FULL
         return bool((before != self.levels).any())
+
+    def _unmoved(self, codes: NDArray[np.uint8], gain: float) -> int | None:
+        """The code at which luma ends whatever the gain, or None where that is not told yet."""
+        top = luma_top(codes)
+        if top is None:
+            return None
+        self._tops = [*self._tops, (top, float(np.log(max(gain, 1e-6))))][-WATCHED:]
+        level, moved = np.array(self._tops).T
+        if len(level) < MOVED_FRAMES or np.ptp(moved) < MOVED or np.ptp(level) > STILL:
+            return None
+        return int(np.median(level))
 
 
 def find_plateau(counts: NDArray[np.int64], steep: float, above: float, width: int = WIDTH) -> int | None:
@@ -149,6 +185,25 @@ def luma_plateau(codes: NDArray[np.uint8]) -> int | None:
     on = codes[np.abs(luma - level) <= width].astype(np.float64)
     off = np.median(np.abs(on - level), axis=0).max()
     return level if off <= (NEUTRAL if width == WIDTH else NEUTRAL_WIDE) else None
+
+
+def luma_top(codes: NDArray[np.uint8]) -> int | None:
+    """The code around which the brightest pixels' luma crowds, below the usual level; None where it does not.
+
+    Args:
+        codes: Pixels, (n, 3).
+    """
+    luma = np.round(codes @ LUMA).astype(np.int64)
+    counts = np.bincount(luma, minlength=256)
+    around = np.convolve(counts, np.ones(2 * TOP + 1, np.int64), "same")
+    level = LEAST_LEVEL + int(np.argmax(around[LEAST_LEVEL : NEAR_FULL - TOP]))
+    on, below = int(around[level]), int(counts[level - 3 * TOP - 1 : level - TOP].sum())
+    if on < max(LEAST_PIXELS, TOP_SHARE * len(codes)) or on < TOP_STEEP * below:
+        return None
+    if counts[level + TOP + 1 :].sum() > 0.5 * on or counts[NEAR_FULL:].sum() > ABOVE * on:
+        return None
+    crowd = codes[np.abs(luma - level) <= TOP].astype(np.float64)
+    return level if np.median(np.abs(crowd - level), axis=0).max() <= NEUTRAL_WIDE else None
 
 
 def ball_codes(image: NDArray[np.uint8], balls: Sequence[tuple[float, float, float]]) -> NDArray[np.uint8]:

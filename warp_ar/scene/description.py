@@ -213,6 +213,17 @@ class Probe:
 
 
 @dataclasses.dataclass(frozen=True)
+class ProxyMaterial:
+    """How a proxy's surface mirrors, beside what it scatters; glTF's rough dielectric."""
+
+    roughness: float = 0.1
+    """Perceptual, as glTF has it: 0 is a mirror, 1 as wide as can be; a polished table has about 0.1."""
+    reflectance: RGB = (0.04, 0.04, 0.04)
+    """Specular reflectance where it is seen from ahead, glTF's F0; 0.04 is lacquer or glass. A file may give one number
+    for grey."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Proxy:
     """Simplified physical geometry: receives virtual light and shadow, and hides what is behind it."""
 
@@ -228,6 +239,8 @@ class Proxy:
     """Mesh file, in metres."""
     marker: Marker | None = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
+    material: ProxyMaterial | None = None
+    """How it mirrors what is virtual; matt if left out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -527,3 +540,8 @@ class Scene:
     """Simulated exposure."""
     path: Path | None = dataclasses.field(default=None, compare=False)
     """The file that the scene was read from."""
+
+    @property
+    def has_gloss(self) -> bool:
+        """Whether a receiver mirrors what is virtual."""
+        return any(proxy.material is not None for proxy in self.proxies)

@@ -218,6 +218,7 @@ class HostScene:
         self._shaded: Outline | None = None
         self.probes = scene.probes
         self._balls = ball_outline(scene.probes)
+        self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
         self._lights_edited = False
         self._gain = np.ones(3)
         self.write_objects(np.zeros_like(self._objects), 0.0)
@@ -299,6 +300,7 @@ class HostScene:
         self.ray_scene.materials.assign(self._material_records())
         self._lit = None
         self._balls = ball_outline(self.probes)
+        self._glossy = np.array([proxy.material is not None for proxy in scene.proxies], bool)
         self._lights_edited = True
         self._write_area_lights(self.ray_scene.materials.device)
 
@@ -497,9 +499,12 @@ class HostScene:
         """Records of the lights that have power: no other falls anywhere."""
         return self._lights[self._lights["intensity"].any(axis=1)]
 
-    def ball_outline(self) -> Outline:
-        """Where mirror balls are."""
-        return self._balls
+    def mirror_outline(self, *, receivers: bool = False) -> Outline:
+        """Where mirror balls are, and ``receivers`` that mirror."""
+        if not receivers:
+            return self._balls
+        faces = [face for record in _present(self._proxies[self._glossy]) for face in box_faces(record)]
+        return Outline([*self._balls.polygons, *faces])
 
     def shadow_outline(self) -> Outline:
         """Where virtual objects can change the environment on proxies."""

@@ -47,6 +47,7 @@ from warp_ar.scene.description import (
     PoseSpec,
     Probe,
     Proxy,
+    ProxyMaterial,
     Scene,
     SourceSpec,
 )
@@ -268,7 +269,21 @@ def _read_proxy(table: _Table) -> Proxy:
         size=() if sides is None else table.vector("size", sizes=(sides,), low=SMALLEST, unit="metres"),
         file=_read_mesh_path(table) if shape == "mesh" else None,
         marker=_read_own_marker(table),
+        material=_read_proxy_material(table),
     )
+
+
+def _read_proxy_material(parent: _Table) -> ProxyMaterial | None:
+    if "material" not in parent:
+        return None
+    section, given = parent.name("material"), parent.data["material"]
+    table = _Table(parent.label, parent.folder, section, given, keys_of(ProxyMaterial))
+    reflectance = ProxyMaterial.reflectance
+    if isinstance(table.data.get("reflectance"), list):
+        reflectance = cast(RGB, table.vector("reflectance", low=0.0, high=1.0))
+    elif "reflectance" in table:
+        reflectance = (table.number("reflectance", low=0.0, high=1.0),) * 3
+    return ProxyMaterial(table.number("roughness", ProxyMaterial.roughness, low=0.0, high=1.0), reflectance)
 
 
 def _read_mesh_path(table: _Table) -> Path:

@@ -31,6 +31,7 @@ from warp_ar.scene.description import (
     PhongMaterial,
     Probe,
     Proxy,
+    ProxyMaterial,
     SourceSpec,
 )
 
@@ -75,6 +76,7 @@ SECTIONS: Final[tuple[Section, ...]] = (
     Section("marker", False, "The printed marker or board that the world is fixed to.", (Marker,)),
     Section("probe", True, "A mirror ball; a single one may be written [probe].", (Probe,)),
     Section("proxy", True, "Simplified physical geometry that receives virtual light and shadow.", (Proxy,)),
+    Section("proxy.material", False, "How a proxy mirrors what is virtual.", (ProxyMaterial,)),
     Section("object", True, "A virtual object.", (Object,)),
     Section(
         "object.material",
@@ -129,6 +131,9 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("proxy", "size"): ("metres", "[0.2, 0.075, 0.09]", 'shape = "box"'),
     ("proxy", "file"): ("metres inside", '"table.ply"', 'shape = "mesh"'),
     ("proxy", "marker"): ("-", "{ id = 7, size = 0.05 }", 'shape = "box"\nsize = [0.1, 0.1, 0.1]'),
+    ("proxy", "material"): ("-", "{ roughness = 0.1 }", 'shape = "plane"\nsize = [1.6, 1.2]'),
+    ("proxy.material", "roughness"): ("0 to 1", "0.05", ""),
+    ("proxy.material", "reflectance"): ("0 to 1 per channel", "[0.04, 0.04, 0.05]", "roughness = 0.05"),
     ("object", "shape"): ("-", '"sphere"', "radius = 0.03"),
     ("object", "file"): ("metres inside", '"table.ply"', 'shape = "mesh"'),
     ("object", "radius"): ("metres", "0.03", 'shape = "sphere"'),
@@ -286,6 +291,8 @@ def example_scene(key: Key) -> str:
         lines += ["[marker]", "size = 0.08"]
     if key.section.startswith("object."):
         lines += ["[[object]]", 'shape = "sphere"', "radius = 0.03"]
+    if key.section.startswith("proxy."):
+        lines += ["[[proxy]]", 'shape = "plane"', "size = [1.6, 1.2]"]
     if key.section:
         lines += [f"[[{key.section}]]" if sections[key.section].several else f"[{key.section}]", key.beside]
         lines += [f"{key.name} = {key.example}"]

@@ -17,6 +17,7 @@ from warp_ar.scene.description import (
     PoseSpec,
     Probe,
     Proxy,
+    ProxyMaterial,
     Scene,
     SourceSpec,
 )
@@ -72,6 +73,8 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     for proxy in scene.proxies:
         lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
         lines += own_marker(proxy)
+        if proxy.material is not None:
+            lines += ["", "[proxy.material]", *table(proxy.material, keys_of(ProxyMaterial))]
     for item in scene.objects:
         if item.mesh is not None:
             raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")

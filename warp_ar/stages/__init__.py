@@ -30,6 +30,7 @@ _ORDER = (
     "near_field.NearField",
     "shade.Shade",
     "mirror_ball.MirrorBall",
+    "gloss.Gloss",
     "composite.Composite",
     "declip.Declip",
     "expose.Expose",

@@ -50,7 +50,8 @@ class Features:
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
-    """Resources that are laid over the frame: of ``virtual``, ``added_light``, ``shadow_ratio``, ``mirror_ball``."""
+    """Resources that are laid over the frame: of ``virtual``, ``added_light``, ``shadow_ratio``, ``mirror_ball``,
+    ``reflected``; the last holds the one before."""
     exposed: bool
     """The picture is shown at another exposure than the camera's."""
     boxed: bool
@@ -133,7 +134,13 @@ def find_features(request: Request) -> Features:
         area_samples=area_samples,
         near_field=environment and quality.method("shade") == "one_bounce",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
-        distant=_find_forms(scene, "sh" if by_series else "map", emitters=emitters, gathered=area_samples == 0),
+        distant=_find_forms(
+            scene,
+            "sh" if by_series else "map",
+            emitters=emitters,
+            gathered=area_samples == 0,
+            mirrors="reflected" in layers,
+        ),
     )
 
 
@@ -164,10 +171,19 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
         layers.append("shadow_ratio")
     if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
         layers.append("mirror_ball")
+    if (
+        layers
+        and scene.has_gloss
+        and has_environment(scene)
+        and quality.method("mirror_ball") not in ("default", "none")
+    ):
+        layers.append("reflected")
     return tuple(layers)
 
 
-def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool, gathered: bool) -> DistantLightConfig:
+def _find_forms(
+    scene: Scene, form: DiffuseForm, *, emitters: bool, gathered: bool, mirrors: bool
+) -> DistantLightConfig:
     materials = scene_materials(scene)
     environment = has_environment(scene)
     return DistantLightConfig(
@@ -175,7 +191,7 @@ def _find_forms(scene: Scene, form: DiffuseForm, *, emitters: bool, gathered: bo
         models=tuple(sorted(set(map(material_model, materials)))),
         textures=is_detailed(scene),
         diffuse=form if environment and any(map(reflects_diffusely, materials)) else "none",
-        specular=environment and any(map(reflects_glossily, materials)),
+        specular=environment and (any(map(reflects_glossily, materials)) or mirrors),
         probes=bool(scene.probes),
         emitters=emitters,
         captured=scene.captured is not None,

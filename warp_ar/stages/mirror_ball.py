@@ -11,7 +11,6 @@ import warp as wp
 from warp_ar.kernels import mirror_ball
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.relight import RelightConfig, make_receiver
-from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.scene.ray_scene import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
@@ -19,7 +18,7 @@ from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_li
 from warp_ar.stages.shared.picture import find_picture
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
-from warp_ar.stages.shared.shading import shade_config
+from warp_ar.stages.shared.shading import mirrored_shading, shade_config
 from warp_ar.stages.shared.variants import relight_variant, shade_variant, shares_kernels, trace_variant
 
 SAMPLES: Mapping[str, int] = {"single": 1, "smooth": 4, "brute_force": 64}
@@ -51,11 +50,6 @@ def mirror_variant(features: Features, device: Any) -> mirror_ball.MirrorBallCon
         relight_variant(mirrored_relighting(features), features, device),
         ratio=True,
     )
-
-
-def mirrored_shading(features: Features) -> ShadeConfig:
-    """How objects look: what a ball shows of one is too small for what surrounds it at close range."""
-    return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:

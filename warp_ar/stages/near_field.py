@@ -79,7 +79,7 @@ class NearField(Stage):
         reads = ["frame", "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
-        reads += [name for name in features.layers if name not in ("virtual", "mirror_ball")]
+        reads += [name for name in features.layers if name not in ("virtual", "mirror_ball", "reflected")]
         return Wiring(tuple(reads), features.near_names)
 
     def idle(self, reach: Reach) -> str | None:

@@ -70,7 +70,9 @@ class Prefilter(Stage):
 
     @property
     def _mirrors_only(self) -> bool:
-        mirrors = all(isinstance(material, MirrorMaterial) for material in glossy_materials(self.request.scene))
+        scene = self.request.scene
+        mirrors = all(isinstance(material, MirrorMaterial) for material in glossy_materials(scene))
+        mirrors &= not scene.has_gloss
         # Light that objects reflect onto the receiver is read as a wide lobe of every material.
         return mirrors and not self.features.shadowed
 

@@ -28,7 +28,9 @@ LAYERS: Mapping[str, Layer] = MappingProxyType(
         "objects": Layer("layer_objects", 0.0, "virtual objects: premultiplied linear radiance, coverage"),
         "shadow_ratio": Layer("layer_shadow_ratio", 1.0, "factor on the plate: shadows of the environment's light"),
         "added_light": Layer("layer_added_light", 0.0, "linear radiance that virtual lights add to the plate"),
-        "mirror_ball": Layer("layer_mirror_ball", 0.0, "change of the plate's radiance in the mirror balls"),
+        "mirror_ball": Layer(
+            "layer_mirror_ball", 0.0, "change of the plate's radiance in the mirror balls, and in receivers that mirror"
+        ),
         "ids": Layer("surface_ids", -1.0, "surface at the pixel's centre: objects, then proxies, then balls; -1: none"),
         "coverage": Layer("coverage", 0.0, "four surfaces that cover most of a pixel: number and share in turn"),
         "depth": Layer("depth", float("inf"), "metres along the camera's axis at the pixel's centre; infinite: none"),

@@ -21,7 +21,8 @@ SOURCES: Mapping[str, str] = {
     "added_light": "added_light",
     "mirror_ball": "mirror_ball",
 }
-"""Resource that a layer is taken from: ``objects`` names the objects' records there."""
+"""Resource that a layer is taken from: ``objects`` names the objects' records there; ``reflected`` holds
+``mirror_ball`` where receivers mirror too."""
 
 
 class Separate(Stage):
@@ -45,6 +46,7 @@ class Separate(Stage):
             return LeftOut(NOT_ASKED)
         reads = ["pose"] if any(name in SOURCES for name in asked) else []
         reads += [SOURCES[name] for name in asked if SOURCES.get(name) in features.layers]
+        reads += ["reflected"] * ("mirror_ball" in asked and "reflected" in features.layers)
         if "plate" in asked:
             reads.append("frame")
             # The guess of clipped pixels depends on the exposure's scale.
@@ -73,7 +75,7 @@ class Separate(Stage):
         for name in PICTURE_LAYERS:
             if LAYERS[name].resource in self.wiring.writes:
                 setattr(out, name, arrays[LAYERS[name].resource])
-        layers = layers_of({name: arrays[name] for name in SOURCES.values() if name in reads})
+        layers = layers_of({name: arrays[name] for name in (*SOURCES.values(), "reflected") if name in reads})
         plate = "plate" in self.wiring.writes
         inputs = (
             arrays["params"],

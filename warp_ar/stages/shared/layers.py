@@ -10,7 +10,8 @@ from warp_ar.kernels import composite
 
 def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
     """The layers that there are, as kernels read them."""
-    names = ("virtual", "added_light", "shadow_ratio", "mirror_ball")
+    mirror_ball = "reflected" if "reflected" in arrays else "mirror_ball"
+    names = ("virtual", "added_light", "shadow_ratio", mirror_ball)
     return composite.make_layers(*(arrays.get(name) for name in names))
 
 
@@ -20,5 +21,5 @@ def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
         virtual="virtual" in layers,
         added="added_light" in layers,
         ratio="shadow_ratio" in layers,
-        mirror_ball="mirror_ball" in layers,
+        mirror_ball="mirror_ball" in layers or "reflected" in layers,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.scene.ray_scene import light_kind
 from warp_ar.stages.features import Features
@@ -17,3 +19,8 @@ def shade_config(features: Features) -> ShadeConfig:
         near_field=features.near_field,
         area_samples=features.area_samples,
     )
+
+
+def mirrored_shading(features: Features) -> ShadeConfig:
+    """The same in what balls and receivers mirror: without what surrounds the objects at close range."""
+    return dataclasses.replace(shade_config(features), near_field=False, edge_samples=1)

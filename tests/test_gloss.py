@@ -1,0 +1,316 @@
+"""Polished receivers: closed forms, the float64 twin, hard cases, scene files, and the stage."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.error_model import check_error
+from tests.hard_cases.rig import SIZE, look_at, make_quality, make_scene
+from tests.reference import color as reference_color
+from tests.reference import gloss as reference
+from tests.reference.visibility import Body
+from tests.test_composite import tables
+from tests.test_mirror_ball import CHALK, DESK, FOCAL, RAYS, H, W, grey_frame, shape
+from tests.test_relight import constant_environment, records
+from warp_ar.engine.graph import make_plan
+from warp_ar.engine.pipeline import Pipeline
+from warp_ar.errors import SceneError
+from warp_ar.kernels import color, gloss
+from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
+from warp_ar.kernels.shade import ShadeConfig
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    POINT,
+    SPHERE,
+    TEXTURES,
+    FrameParams,
+    Light,
+    Material,
+    Probe,
+    RayScene,
+    Shape,
+    make_picture,
+)
+from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.scene import ProxyMaterial, dumps_scene, loads_scene
+from warp_ar.stages.request import Request
+
+EYE = np.array([0.02, -0.45, 0.3])
+CENTER, RADIUS = np.array([0.0, 0.06, 0.07]), 0.05
+POSE = look_at(EYE, CENTER * [1.0, 1.0, 0.0])
+BALL = shape(SPHERE, CENTER, (RADIUS,) * 3, 0)
+AROUND = np.array([0.5, 0.4, 0.3])
+F0 = np.array([0.04, 0.05, 0.06])
+DIFFERENCE = (np.array(CHALK["base_color"]) - 1.0) * AROUND
+LAMP = {"kind": POINT, "position": (0.05, 0.35, 0.3), "intensity": (0.3, 0.2, 0.1), "attenuation": (0, 0, 1)}
+# float32 positions, turned by a curved object's normal.
+FLOAT_ERROR = 1e-5
+# Relative spread of 4,096 rays, of which a lobe's tail brings a few hundred, and their four-pixel neighbourhood.
+RAYS_ERROR = 0.04
+
+
+def directions(pose=POSE, rays=RAYS):
+    return np.concatenate([rays, np.ones_like(rays[..., :1])], -1).astype(float) @ pose.inverse().rotation.T
+
+
+def run(
+    material,
+    objects=(BALL,),
+    proxies=(DESK,),
+    balls=(),
+    lights=(),
+    ratio=None,
+    samples=4,
+    pose=POSE,
+    frame=None,
+    rows=None,
+    around=AROUND,
+    smooth=False,
+):
+    """What the receiver changes, (H, W, 3), in even surroundings."""
+    roughness, f0 = material
+    kinds = tuple(sorted({one["kind"] for one in objects})), tuple(sorted({one["kind"] for one in proxies}))
+    trace = TraceConfig(*kinds)
+    lit = tuple(sorted({one["kind"] for one in lights}))
+    forms = DistantLightConfig(trace, (LAMBERT,), False, "sh", True, True)
+    config = gloss.GlossConfig(trace, samples, lit, ShadeConfig(forms, lit, 1) if objects else None)
+    inverse, whole = pose.inverse(), (0, H, 0, W)
+    params = records(
+        FrameParams,
+        {
+            "camera_position": inverse.translation,
+            "world_from_camera": inverse.rotation,
+            "focal": (FOCAL, FOCAL),
+            "principal": ((W - 1) / 2, (H - 1) / 2),
+            "ball_rect": whole,
+            "shadow_rect": whole,
+        },
+    )
+    sight = gloss.Sight()
+    sight.scene = RayScene()
+    sight.scene.objects, sight.scene.proxies = records(Shape, *objects), records(Shape, *proxies)
+    sight.scene.materials = records(Material, {**dict.fromkeys(TEXTURES, -1), **CHALK})
+    codes = grey_frame() if frame is None else frame
+    sight.picture = make_picture(wp.array(codes, dtype=wp.vec3ub), tables()[0], wp.array(RAYS, dtype=wp.vec2))
+    sight.probes = records(Probe, *balls)
+    distant = DistantLight()
+    distant.irradiance_sh = wp.array(constant_environment(around), dtype=wp.vec3)
+    distant.levels = wp.full(4096, wp.vec3(*map(float, around)), dtype=wp.vec3)
+    distant.level_height = 8
+    sight.distant = distant
+    layers = gloss.GlossLayers()
+    if ratio is not None:
+        layers.shadow_ratio = wp.array(ratio.astype(np.float32), dtype=wp.vec3)
+    sight.layers = layers
+    surfaces = records(gloss.Gloss, *[{"reflectance": f0, "roughness": roughness}] * len(proxies))
+    change, surface = wp.full((H, W), wp.vec3(9.0), dtype=wp.vec3), wp.zeros((H, W), dtype=wp.int32)
+    gloss.gloss(config, params, sight, records(Light, *lights), surfaces, change, surface, rows=rows)
+    if not smooth:
+        return change.numpy()
+    out = wp.zeros((H, W), dtype=wp.vec3)
+    gloss.smooth_gloss(change, surface, None, out)
+    return out.numpy()
+
+
+# --- closed forms and the twin
+
+
+def test_a_mirror_shows_a_ball_where_geometry_says(device):
+    """A plane mirror: within the mirrored outline Fresnel times what the ball differs by, nothing beside it."""
+    rays, body = directions().reshape(-1, 3), Body("sphere", np.eye(3), CENTER, 1.0, np.full(3, RADIUS))
+    expected, hit = reference.mirror(EYE, rays, [body], DIFFERENCE, F0)
+    inner, outer = (
+        reference.mirror(EYE, rays, [dataclasses.replace(body, extent=np.full(3, r))], DIFFERENCE, F0)[1]
+        for r in (0.95 * RADIUS, 1.05 * RADIUS)
+    )
+    sure = inner | ~outer
+    got = run((0.0, F0)).reshape(-1, 3)
+    assert inner.sum() > 100
+    assert (~outer).sum() > 1000
+    np.testing.assert_allclose(got[sure], expected[sure], atol=FLOAT_ERROR)
+    check_error("gloss", got[sure], expected[sure])
+    np.testing.assert_array_equal(got[~outer], 0.0)
+    edge = hit[~sure] | ~hit[~sure]
+    assert edge.any()
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.8])
+def test_a_rough_receiver_is_the_integral_over_its_lobe(device, roughness):
+    """GGX as printed, in float64, over the cone that the ball fills."""
+    got = run((roughness, F0), samples=4096)
+    peak = np.abs(got).max()
+    for row, column in ((24, 32), (30, 30), (36, 36), (40, 20)):
+        expected = reference.rough(EYE, directions()[row, column], CENTER, RADIUS, DIFFERENCE, F0, roughness**2)
+        np.testing.assert_allclose(got[row, column], expected, rtol=RAYS_ERROR, atol=0.01 * peak)
+    assert peak > 1e-4
+
+
+def test_few_rays_and_their_neighbours_are_near_many(device):
+    few, many = run((0.4, F0), samples=4, smooth=True), run((0.4, F0), samples=1024)
+    # Sixteen rays around each pixel's own four: a quarter of the noise is left.
+    np.testing.assert_allclose(few[8:-8, 8:-8], many[8:-8, 8:-8], atol=0.15 * np.abs(many).max())
+    assert np.abs(few - many).mean() < 0.02 * np.abs(many).max()
+
+
+def test_what_is_mirrored_is_not_shadowed(device):
+    """A ratio of 1/2 darkens what the receiver mirrors with the rest: half of it comes back, no more than is shown."""
+    bright = run((0.0, F0), objects=(), ratio=np.full((H, W, 3), 0.5))
+    _, wo = reference.primary(EYE, directions().reshape(-1, 3))
+    expected = 0.5 * reference.schlick(F0, wo[:, 2]) * AROUND
+    np.testing.assert_allclose(bright.reshape(-1, 3), expected, rtol=1e-4)
+    dark = np.full((H, W, 3), 8, np.uint8)
+    shown = reference_color.decode(color.decode_table("srgb"), dark)
+    held = run((0.0, (1.0, 1.0, 1.0)), objects=(), ratio=np.full((H, W, 3), 0.5), frame=dark)
+    np.testing.assert_allclose(held, 0.5 * shown, rtol=1e-5)
+
+
+def test_a_lamp_has_a_highlight(device):
+    """D F G2 / (4 cos_o) of the half vector, times the light's irradiance, shadowed by the ball."""
+    got = run((0.4, F0), lights=[LAMP], objects=()).reshape(-1, 3)
+    points, wo = reference.primary(EYE, directions().reshape(-1, 3))
+    to = np.array(LAMP["position"]) - points
+    distance = np.linalg.norm(to, axis=1, keepdims=True)
+    wi = to / distance
+    expected = reference.lobe(wo, wi, F0, 0.16) * np.array(LAMP["intensity"]) / distance**2
+    clear = expected.max(1) > 3e-4
+    assert clear.sum() > 200
+    np.testing.assert_allclose(got[clear], expected[clear], rtol=1e-4)
+    assert (got[expected.max(1) < 1e-4] == 0.0).all()
+    half_way = {**BALL, "position": 0.5 * (np.array(LAMP["position"]) + np.array([0.03, -0.02, 0.0]))}
+    shaded = run((0.4, F0), lights=[LAMP], objects=[half_way], around=np.zeros(3)).reshape(-1, 3)
+    peak = np.argmax(expected[:, 0])
+    assert shaded[peak, 0] < 0.5 * expected[peak, 0]
+
+
+# --- hard cases
+
+
+@pytest.mark.parametrize("height", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("roughness", [0.0, 1e-3, 0.1, 1.0])
+def test_grazing_view(device, height, roughness):
+    """Fresnel goes to 1, masking to 0: finite, and no more than the surroundings differ by."""
+    eye = np.array([0.0, -0.4, height])
+    got = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])), lights=[LAMP], samples=16)
+    assert np.isfinite(got).all()
+    plain = run((roughness, F0), pose=look_at(eye, np.array([0.0, 0.0, 0.0])), samples=16)
+    assert (np.abs(plain) <= np.abs(DIFFERENCE).max() + 1e-4).all()
+
+
+def test_next_to_no_roughness_is_a_mirror(device):
+    """Below and just above the width from which lobes are sampled."""
+    mirror, narrow = run((0.0, F0)), run((0.033, F0), samples=256)
+    inside = (np.abs(mirror).max(-1) > 0) & (np.abs(narrow).max(-1) > 0)
+    close = np.isclose(mirror, narrow, atol=0.1 * np.abs(mirror).max()).all(-1)
+    assert close[inside].mean() > 0.9
+    np.testing.assert_array_equal(run((1e-3, F0)), mirror)
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.3])
+def test_from_below_and_behind_nothing_is_mirrored(device, roughness):
+    """A plane faces its own +z; what is under it is not mirrored above it either."""
+    below = look_at(np.array([0.02, -0.45, -0.3]), np.zeros(3))
+    np.testing.assert_array_equal(run((roughness, F0), pose=below, lights=[LAMP]), 0.0)
+    under = {**BALL, "position": CENTER * [1.0, 1.0, -2.0]}
+    np.testing.assert_array_equal(run((roughness, F0), objects=[under]), 0.0)
+
+
+def test_a_matt_receiver_and_a_ball_before_it_do_not_change(device):
+    np.testing.assert_array_equal(run((0.3, np.zeros(3)), lights=[LAMP], ratio=np.full((H, W, 3), 0.5)), 0.0)
+    mirror = {"center": 0.5 * EYE, "radius": 0.1, "reflectance": (0.8, 0.8, 0.8)}
+    inverse = POSE.inverse()
+    ray = np.array([0.0, 0.0, 1.0]) @ inverse.rotation.T
+    towards = (np.array(mirror["center"]) - EYE) @ ray
+    assert towards > 0
+    covered = {**mirror, "center": EYE + 0.2 * ray / np.linalg.norm(ray), "radius": 0.15}
+    np.testing.assert_array_equal(run((0.3, F0), balls=[covered]), 0.0)
+
+
+def test_a_lamp_in_the_surface(device):
+    on = {**LAMP, "position": (0.02, 0.0, 0.0)}
+    assert np.isfinite(run((0.0, F0), lights=[on])).all()
+    assert np.isfinite(run((0.5, F0), lights=[{**on, "intensity": (1e6, 1e6, 1e6)}])).all()
+
+
+def test_bands_are_the_whole(device):
+    whole = run((0.3, F0), lights=[LAMP])
+    np.testing.assert_array_equal(run((0.3, F0), lights=[LAMP], rows=(10, 20))[10:20], whole[10:20])
+    np.testing.assert_array_equal(run((0.3, F0), lights=[LAMP]), whole)
+
+
+# --- scenes and the stage
+
+PLANE = """schema = 1
+[camera]
+width = 64
+height = 48
+fx = 60.0
+fy = 60.0
+cx = 31.5
+cy = 23.5
+[marker]
+size = 0.08
+[[proxy]]
+shape = "plane"
+size = [1.0, 1.0]
+"""
+
+
+def test_scene_files(tmp_path):
+    scene = loads_scene(PLANE + "[proxy.material]\nroughness = 0.2\nreflectance = 0.05\n")
+    assert scene.proxies[0].material == ProxyMaterial(0.2, (0.05, 0.05, 0.05))
+    assert loads_scene(dumps_scene(scene)) == scene
+    assert loads_scene(PLANE + "material = { reflectance = [0.1, 0.2, 0.3] }").proxies[0].material == ProxyMaterial(
+        0.1, (0.1, 0.2, 0.3)
+    )
+    assert loads_scene(PLANE).proxies[0].material is None
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("roughness = 1.5", r"proxy\[0\].material.roughness = 1.5"),
+        ("reflectance = -0.1", "reflectance.*-0.1"),
+        ("reflectance = [0.1, 0.2]", "reflectance"),
+        ('reflectance = "wood"', "reflectance"),
+        ("rougness = 0.1", "rougness.*roughness"),
+    ],
+)
+def test_a_wrong_material_is_named(given, words):
+    with pytest.raises(SceneError, match=words):
+        loads_scene(PLANE + "[proxy.material]\n" + given)
+
+
+def polished(**changes):
+    scene = make_scene(**changes)
+    plane = dataclasses.replace(scene.proxies[0], material=ProxyMaterial(0.2, (0.3, 0.3, 0.3)))
+    return dataclasses.replace(scene, proxies=(plane, *scene.proxies[1:]))
+
+
+def test_it_runs_only_where_a_proxy_has_a_material():
+    quality = make_quality()
+    matt, glossy = (make_plan(Request(scene, quality, SIZE)) for scene in (make_scene(), polished()))
+    assert "gloss" not in [stage.name for stage, _ in matt.stages]
+    assert "no proxy has a material" in dict(matt.left_out)["gloss"]
+    assert "gloss" in [stage.name for stage, _ in glossy.stages]
+    left = make_plan(Request(polished(), quality.with_methods(mirror_ball="none"), SIZE))
+    assert "quality" in dict(left.left_out)["gloss"]
+
+
+def test_the_picture_has_it(device):
+    """The receiver alone changes, and the layer of mirrors holds what the picture has."""
+    frame = np.full((SIZE[1], SIZE[0], 3), 120, np.uint8)
+    pose = look_at((0.02, -0.3, 0.35))
+    pictures, layers = [], []
+    for scene in (make_scene(), polished()):
+        with Pipeline(scene, device=device, quality=make_quality(), outputs=("image", "mirror_ball")) as pipeline:
+            result = pipeline(frame, time_seconds=0.0, pose=pose)
+            pictures.append(np.array(result.image).astype(int))
+            layers.append(np.array(result.layers["mirror_ball"]))
+    changed = (pictures[0] != pictures[1]).any(-1)
+    assert changed.mean() > 0.02
+    assert (layers[0] != layers[1]).any(-1).mean() > 0.02
+    assert not changed[(layers[0] == layers[1]).all(-1)].any()

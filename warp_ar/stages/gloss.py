@@ -1,0 +1,111 @@
+"""What polished receivers show of what is virtual."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_ar.kernels import gloss
+from warp_ar.scene.ray_scene import light_kind, proxies_face, trace_config
+from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
+from warp_ar.stages.features import Features
+from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
+from warp_ar.stages.shared.picture import find_picture
+from warp_ar.stages.shared.rows import GrowingRows
+from warp_ar.stages.shared.shading import mirrored_shading
+from warp_ar.stages.shared.variants import shade_variant, trace_variant
+
+SAMPLES: Mapping[str, int] = {"single": 4, "smooth": 16, "brute_force": 256}
+"""Rays per pixel of a rough receiver, by the method of ``mirror_ball``."""
+
+
+class Gloss(Stage):
+    """Virtual objects and lights, mirrored in receivers that have a material."""
+
+    name: ClassVar[str] = "gloss"
+    summary: ClassVar[str] = "what polished receivers mirror of virtual objects and lights, and what those hide there"
+    numerics: ClassVar[Numerics] = Numerics(
+        precision="float32; GGX by half vectors, no cancellation near the peak",
+        bound=2e-3,
+        cause="edges of what is mirrored fall to either side; 1e-7 of an angle in narrow highlights",
+        measured=1e-6,
+        rows=(6, 8, 13, 17),
+    )
+
+    @classmethod
+    def wire(cls, features: Features) -> Wiring | LeftOut:
+        """Reads what the objects are lit by, and the layers that a receiver mirrors."""
+        if not features.request.scene.has_gloss:
+            return LeftOut("no proxy has a material: the receiver is matt")
+        if not features.environment:
+            return LeftOut(NO_BALL)
+        if "reflected" not in features.layers:
+            return LeftOut("nothing virtual can be mirrored, or the quality leaves mirrors as the camera saw them")
+        reads = {"pose", "frame", "objects", *distant_light_reads(features)}
+        reads |= {"lights"} if features.request.scene.lights else set()
+        reads |= {name for name in features.layers if name in ("shadow_ratio", "added_light", "mirror_ball")}
+        return Wiring(tuple(sorted(reads)), ("reflected",))
+
+    def idle(self, reach: Reach) -> str | None:
+        """A receiver may show what is out of the picture itself."""
+        return None if reach.balls else "no receiver with a material is in the picture"
+
+    def arrays(self) -> Mapping[str, ArraySpec]:
+        """The change, before and after averaging, how proxies mirror, and tables that materials need."""
+        width, height = self.request.size
+        return {
+            "reflected": ArraySpec((height, width), wp.vec3),
+            "gloss_change": ArraySpec((height, width), wp.vec3),
+            "gloss_surface": ArraySpec((height, width), wp.int32),
+            "gloss_surfaces": ArraySpec((len(self.request.scene.proxies),), gloss.Gloss),
+            **distant_light_arrays(self.features, self.name),
+        }
+
+    def build(self, arrays: Arrays, device: Any) -> list[Pass]:
+        """What each pixel mirrors, then the mean over neighbours, in rows of receivers with a material and of balls."""
+        config = self._config(device)
+        gloss.make_gloss_kernel(config)
+        arrays["gloss_surfaces"].assign(self._surfaces())
+        sight, layers = gloss.Sight(), gloss.GlossLayers()
+        for field, name in (("shadow_ratio", "shadow_ratio"), ("added", "added_light")):
+            if name in self.wiring.reads:
+                setattr(layers, field, arrays[name])
+        sight.scene, sight.picture, sight.probes = arrays["ray_scene"], find_picture(arrays), arrays["probes"]
+        sight.distant, sight.layers = make_distant_light(self.features, arrays, self.name), layers
+        lights = arrays["light_array"] if config.lights else None
+        own = arrays["gloss_change"], arrays["gloss_surface"]
+        mirror_ball = arrays["mirror_ball"] if "mirror_ball" in self.wiring.reads else None
+
+        def mirror(rows: Rows | None) -> None:
+            gloss.gloss(config, arrays["params"], sight, lights, arrays["gloss_surfaces"], *own, rows=rows)
+
+        def smooth(rows: Rows | None) -> None:
+            gloss.smooth_gloss(*own, mirror_ball, arrays["reflected"], rows=rows)
+
+        height, extents = self.request.size[1], [GrowingRows(arrays["ball_rows"]) for _ in range(2)]
+        return [Pass(one, rows=height, extent=extent) for one, extent in zip((mirror, smooth), extents, strict=True)]
+
+    def _config(self, device: Any) -> gloss.GlossConfig:
+        """What the kernel is compiled for."""
+        features, scene = self.features, self.request.scene
+        shading = mirrored_shading(features) if scene.objects else None
+        return gloss.GlossConfig(
+            trace_variant(trace_config(scene), device),
+            SAMPLES[self.request.quality.method("mirror_ball")],
+            tuple(sorted({light_kind(light) for light in scene.lights})),
+            None if shading is None else shade_variant(shading, features, device),
+            features.emitters,
+            proxies_face(scene),
+        )
+
+    def _surfaces(self) -> Any:
+        """Records of ``Gloss``, one for each proxy."""
+        proxies = self.request.scene.proxies
+        records = np.zeros(len(proxies), np.dtype(gloss.Gloss.numpy_dtype()))
+        for record, proxy in zip(records, proxies, strict=True):
+            if proxy.material is not None:
+                record["reflectance"], record["roughness"] = proxy.material.reflectance, proxy.material.roughness
+        return records
