@@ -37,9 +37,10 @@ from warp_ar.command_line import (
 )
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
+from warp_ar.output.encoders import CODINGS, describe_encoders, parse_options
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import NullSink, Sink, open_sink
+from warp_ar.output.sinks import FOLDER_CODINGS, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
@@ -123,6 +124,20 @@ def _add_file_options(group: argparse._ArgumentGroup) -> None:
         type=Path,
         metavar="FILE.mp4|DIR",
         help="write frames instead of serving the page: a folder gets NNNN.png, a file H.264",
+    )
+    add(
+        "--coding",
+        choices=tuple(dict.fromkeys((*CODINGS, *FOLDER_CODINGS))),
+        default="8bit",
+        help="with --output: a video of 10bit, pq or hlg; a folder of 16bit (PNG) or exr (default: 8bit)",
+    )
+    add("--encoder", metavar="NAME|list", help="with --output FILE: FFmpeg's encoder; list: show those of this machine")
+    add(
+        "--encoder-option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="an option of the encoder by FFmpeg's name, such as crf=23; may be given again",
     )
     add(
         "--headless",
@@ -454,6 +469,11 @@ def run(options: argparse.Namespace) -> int:
         for name, path in bundled_scenes().items():
             print(f"{name:16s} {path}")
         return EXIT_DONE
+    if options.encoder == "list":
+        print("\n".join(describe_encoders()))
+        return EXIT_DONE
+    if options.output is None and (options.coding != "8bit" or options.encoder or options.encoder_option):
+        raise UsageError("--coding, --encoder and --encoder-option need --output, the file or folder to write")
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     if options.budget_ms is not None and not 0.0 < options.budget_ms < float("inf"):
@@ -469,6 +489,7 @@ def light_clip(options: argparse.Namespace) -> int:
     """Light a source's frames without a page, and write what options name."""
     # Here, for they load Warp: the page is to be there before.
     from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.engine.layers import RADIANCE
     from warp_ar.output.report import RunLog, print_plan
     from warp_ar.output.side_files import SideFiles, parse_layers
 
@@ -486,6 +507,8 @@ def light_clip(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
     )
     outputs, replaced = ["image", *side.outputs], list(side.replaced)
+    if options.coding != "8bit":
+        outputs.append(RADIANCE)
     if options.report is not None:
         replaced.append(_prepare_file(options.report, overwrite=options.overwrite))
         outputs.append("pose")
@@ -503,7 +526,16 @@ def light_clip(options: argparse.Namespace) -> int:
         sink: Sink = NullSink()
         if options.output is not None:
             size = session.pipeline.size
-            sink = open_sink(options.output, fps=source.fps, size=size, overwrite=options.overwrite)
+            sink = open_sink(
+                options.output,
+                fps=source.fps,
+                size=size,
+                overwrite=options.overwrite,
+                coding=options.coding,
+                transfer=str(session.scene.camera.transfer),
+                encoder=options.encoder,
+                encoder_options=parse_options(options.encoder_option),
+            )
         for words in (*replaced, sink.replaced):
             if words:
                 say(words)
@@ -578,7 +610,7 @@ def _light_frames(
             image, decode_ms = result.image, session.decode_ms
             evidence.add(frame.image, result)
             start = time.perf_counter()
-            sink.write(image)
+            sink.write(image if options.coding == "8bit" else result.radiance)
             encode_ms = (time.perf_counter() - start) * 1e3
             side.write(frame.image, result, session.scene)
             log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)

@@ -15,6 +15,7 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
 from warp_ar.input.exposures import plan_bracket
+from warp_ar.input.plate import check_linear
 from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
@@ -147,8 +148,12 @@ class Session:
                 )
             else:
                 # The pipeline before a change is kept: results that were handed out may still be read.
+                linear = self.source.deep != "" and not exposures
+                self.source.keeps_depth = linear
+                if self.source.deep == "light":
+                    check_linear(str(self.scene.camera.transfer))
                 self._switcher = PipelineSwitcher(
-                    device=device, keep=1, profile=False, synchronous=not self.source.live
+                    device=device, keep=1, profile=False, synchronous=not self.source.live, linear=linear
                 )
                 self._target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
                 self.pipeline = self._switcher.open(self._target)
@@ -224,14 +229,14 @@ class Session:
         kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
-                yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
         try:
             for frame in self._frames():
-                result = self.pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                result = self.pipeline.submit(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
                 ready.append((frame, result))
                 if len(ready) > 1:
                     yield ready.pop(0)

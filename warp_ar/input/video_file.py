@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import pathlib
 from collections.abc import Generator, Sequence
@@ -12,17 +11,15 @@ from typing import Any
 import av
 import numpy as np
 import numpy.typing as npt
-from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
+from warp_ar.input.deep_video import HD_HEIGHT, TO_RGB, depth_of, plate_from_video
+from warp_ar.input.plate import Plate, codes8
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
 Image = npt.NDArray[np.uint8]
-
-HD_HEIGHT = 720
-"""Rows from which a video that names no colour matrix is BT.709; below, BT.601: what players do, and encoders
-expect."""
 
 # Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
 _FORMATS = (
@@ -31,15 +28,13 @@ _FORMATS = (
 )
 _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
-# Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
-_TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-
 
 class VideoFile(RecordedSource):
     """A video file, its first video stream, turned upright as its metadata says.
 
     Colour is converted with the stream's own matrix and range; one that names none is taken as BT.709 from 720 rows up,
-    else BT.601. Frame times are the file's own (a variable rate is kept), counted from the first frame.
+    else BT.601: what players do, and encoders expect. Frame times are the file's own (a variable rate is kept), counted
+    from the first frame.
 
     Args:
         path: The file.
@@ -74,6 +69,7 @@ class VideoFile(RecordedSource):
             self.fps = fps or rate
             self.length = int(stream.frames) or round(seconds * rate) or None
             codec = stream.codec_context.name
+            self.deep = depth_of(stream.codec_context)
             first = next(self._pictures(container), None)
         if first is None:
             raise SourceError(f"{self._path}: frame 0 cannot be decoded: the video stream holds no picture")
@@ -112,7 +108,7 @@ class VideoFile(RecordedSource):
     def _decode(self) -> Generator[Frame, None, None]:
         with self._open() as container:
             first, previous = None, -math.inf
-            for index, (image, stamp) in enumerate(self._pictures(container)):
+            for index, (image, stamp, plate) in enumerate(self._pictures(container)):
                 check_size(image, self.size, str(self._path), index)
                 if self._retimed or stamp is None:
                     seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
@@ -121,10 +117,14 @@ class VideoFile(RecordedSource):
                     # Time never stands still or runs back, whatever a broken recorder wrote.
                     seconds = stamp - first if stamp - first > previous else previous + 1.0 / self.fps
                 previous = seconds
-                yield Frame(index, seconds, image)
+                yield Frame(index, seconds, image, plate=plate)
 
-    def _pictures(self, container: Any, first: int | None = None) -> Generator[tuple[Image, float | None], None, None]:
-        """Every picture with its time stamp in seconds; whatever precedes damage comes before the error.
+    def _pictures(
+        self, container: Any, first: int | None = None
+    ) -> Generator[tuple[Image, float | None, Plate | None], None, None]:
+        """Every picture with its time stamp in seconds, and its plate if that is kept.
+
+        Whatever precedes damage comes before the error.
 
         Args:
             container: Of the file.
@@ -133,7 +133,7 @@ class VideoFile(RecordedSource):
         """
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        to_rgb = functools.partial(rgb_from_video, VideoReformatter())
+        reformatter = VideoReformatter()
         count, packets, damage = 0, 0, ""
         demuxer = container.demux(stream)
         while not damage:
@@ -152,7 +152,7 @@ class VideoFile(RecordedSource):
                 damage = reason(error)
             for picture in pictures:
                 if first is None or picture.pts >= first:
-                    yield to_rgb(picture), picture.time
+                    yield self._taken(reformatter, picture)
                 count += 1
         # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
         if not damage and first is None and "mp4" in container.format.name and packets < stream.frames:
@@ -161,9 +161,18 @@ class VideoFile(RecordedSource):
             # Threads and reordering hold frames back; those before the damage are still good.
             with contextlib.suppress(av.FFmpegError):
                 for picture in stream.decode(None):
-                    yield to_rgb(picture), picture.time
+                    yield self._taken(reformatter, picture)
                     count += 1
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
+
+    def _taken(self, reformatter: VideoReformatter, picture: Any) -> tuple[Image, float | None, Plate | None]:
+        """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
+        if self.deep != "light":
+            plate = plate_from_video(reformatter, picture) if self.deep and self.keeps_depth else None
+            return rgb_from_video(reformatter, picture), picture.time, plate
+        plate = plate_from_video(reformatter, picture)
+        image = codes8(plate, "srgb") if plate.codes is None else plate.codes
+        return image, picture.time, plate if self.keeps_depth else None
 
 
 def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
@@ -171,6 +180,6 @@ def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
         matrix = Colorspace.ITU709 if picture.height >= HD_HEIGHT else Colorspace.ITU601
-    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=_TO_RGB, threads=1)
+    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=TO_RGB, threads=1)
     # Both count the angle counterclockwise.
     return np.ascontiguousarray(np.rot90(rgb.to_ndarray(), round(picture.rotation / 90)))

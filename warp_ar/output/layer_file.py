@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from warp_ar.engine.layers import compose_layers
 from warp_ar.errors import SinkError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
@@ -75,14 +76,6 @@ class LayerFrame:
     def copy(self) -> LayerFrame:
         """One whose frame may outlast the source's; layers are a result's own copies."""
         return dataclasses.replace(self, frame=self.frame.copy())
-
-
-def compose_layers(layers: Layers) -> npt.NDArray[np.float32]:
-    """Linear radiance of the picture, (height, width, 3), of its five layers; scaled by the exposure it is encoded."""
-    physical = layers["plate"] * layers["shadow_ratio"] + layers["added_light"] + layers["mirror_ball"]
-    objects = layers["objects"]
-    picture: npt.NDArray[np.float32] = (1.0 - objects[..., 3:]) * np.maximum(physical, 0.0) + objects[..., :3]
-    return picture
 
 
 def write_layers(path: pathlib.Path, frame: LayerFrame) -> None:

@@ -65,7 +65,7 @@ def mirrored_relighting(features: Features) -> RelightConfig:
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
     """What objects and, if ``lit``, the receiver are lit by."""
-    reads = {"pose", "frame"}
+    reads = {"pose", "frame"} | ({"linear_frame"} if features.request.linear else set())
     if "virtual" in features.layers:
         reads |= {"objects", *distant_light_reads(features)}
         reads |= {"lights"} if shade_config(features).lights else set()
@@ -161,7 +161,9 @@ class MirrorBall(Stage):
             arrays["shadow_ratio"] if config.ratio else None,
         )
 
+        linear = arrays["linear_frame"] if "linear_frame" in reads else None
+
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirrored"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirrored"], linear_frame=linear, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]
