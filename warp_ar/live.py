@@ -140,6 +140,13 @@ def _add_file_options(group: argparse._ArgumentGroup) -> None:
         help="an option of the encoder by FFmpeg's name, such as crf=23; may be given again",
     )
     add(
+        "--virtual-camera",
+        nargs="?",
+        const="",
+        metavar="DEVICE",
+        help="show frames as a camera that other programs open, such as /dev/video4 (default: the first there is)",
+    )
+    add(
         "--headless",
         action="store_true",
         help="no page, no progress bar, no table; writes only what other options name",
@@ -480,7 +487,7 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
-    if options.output is None and not options.headless:
+    if options.output is None and options.virtual_camera is None and not options.headless:
         return serve_page(options)
     return light_clip(options)
 
@@ -536,13 +543,14 @@ def light_clip(options: argparse.Namespace) -> int:
                 encoder=options.encoder,
                 encoder_options=parse_options(options.encoder_option),
             )
+        camera = _open_camera(options, session)
         for words in (*replaced, sink.replaced):
             if words:
                 say(words)
         log, evidence = RunLog(session.pipeline), _Evidence()
         try:
-            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink:
-                _light_frames(options, session, log, sink, side, stop, evidence)
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink, camera:
+                _light_frames(options, session, log, (sink, camera), side, stop, evidence)
             if stop.code is None:
                 _check_run(log, session, evidence)
         except WarpArError as error:
@@ -560,7 +568,8 @@ def light_clip(options: argparse.Namespace) -> int:
             _print_choice(session.pipeline)
         steps = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in log.steps().items())
         Console().print(f"side by side, in ms: {steps}", highlight=False)
-        where = "nowhere" if options.output is None else printable(options.output)
+        shown = printable(camera.description)
+        where = shown if options.output is None else printable(options.output)
         Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {where}", highlight=False, markup=False)
     return EXIT_DONE if stop.code is None else stop.code
 
@@ -586,13 +595,13 @@ def _light_frames(
     options: argparse.Namespace,
     session: Session,
     log: RunLog,
-    sink: Sink,
+    sinks: tuple[Sink, Sink],
     side: SideFiles,
     stop: _Stop,
     evidence: _Evidence,
 ) -> None:
     """Let frames flow until they end, or until a signal asks to stop."""
-    source = session.source
+    source, (sink, camera) = session.source, sinks
     total = (
         options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
     )
@@ -611,6 +620,7 @@ def _light_frames(
             evidence.add(frame.image, result)
             start = time.perf_counter()
             sink.write(image if options.coding == "8bit" else result.radiance)
+            camera.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3
             side.write(frame.image, result, session.scene)
             log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
@@ -619,6 +629,19 @@ def _light_frames(
                 _check_marker(log, session.scene, live=source.live)
             if stop.code is not None:
                 return
+
+
+def _open_camera(options: argparse.Namespace, session: Session) -> Sink:
+    """The virtual camera, if one is asked for."""
+    from warp_ar.output.virtual_camera import VirtualCameraSink
+
+    if options.virtual_camera is None:
+        return NullSink()
+    source, size = session.source, session.pipeline.size
+    # A clip's frames are shown at its rate; a camera's come at theirs.
+    camera = VirtualCameraSink(options.virtual_camera or None, fps=source.fps, size=size, paced=not source.live)
+    say(f"frames go to {camera.description}")
+    return camera
 
 
 def _count(log: RunLog, sink: Sink, side: SideFiles) -> str:
