@@ -78,7 +78,8 @@ class Work:
         seconds = time.perf_counter() - start
         frames = int(values.get("frames", 0))
         _note(log, f"done: {frames} frames in {seconds:.2f} s by worker {context.worker} on {context.device}")
-        return Outcome("done", {**values, "seconds": round(seconds, 3), "worker": context.worker})
+        told = {"seconds": round(seconds, 3), "ended": round(time.time(), 3), "worker": context.worker}
+        return Outcome("done", {**values, **told})
 
     def _do(self, job: Job, tell: Callable[[int], None], arguments: Any) -> dict[str, Any]:
         context, jobs = self.context, self.context.jobs
