@@ -129,8 +129,7 @@ def test_openimageio_reads_every_part(rendered, written, tmp_path):
     assert parts["objects"][0] == [f"objects.{c}" for c in "RGBA"]
     assert parts["depth"][0] == ["Z"]
     plate, ratio, added, ball, objects = (
-        parts[name][1].astype(np.float64)
-        for name in ("plate", "shadow_ratio", "added_light", "mirror_ball", "objects")
+        parts[name][1].astype(np.float64) for name in ("plate", "shadow_ratio", "added_light", "mirror_ball", "objects")
     )
     picture = (1.0 - objects[..., 3:]) * np.maximum(plate * ratio + added + ball, 0.0) + objects[..., :3]
     np.testing.assert_allclose(parts["picture"][1], picture, rtol=4.0 * HALF, atol=1e-4)

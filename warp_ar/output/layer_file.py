@@ -127,7 +127,8 @@ def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[
     if frame.camera_from_world is not None:
         header["cameraFromWorld"] = frame.camera_from_world.astype(np.float32)
         # OpenEXR's own attribute maps rows, to a camera that looks along its -z with y up.
-        header["worldToCamera"] = (np.diag([1.0, -1.0, -1.0, 1.0]) @ frame.camera_from_world).T.astype(np.float32)
+        rows = (np.diag([1.0, -1.0, -1.0, 1.0]) @ frame.camera_from_world).T
+        header["worldToCamera"] = np.ascontiguousarray(rows, np.float32)  # it is written as it lies in memory
     if frame.camera_matrix is not None:
         header["cameraMatrix"] = frame.camera_matrix.astype(np.float32)
     return OpenEXR.Part(header, channels, name)
