@@ -108,6 +108,7 @@ class Bench:
             "size": self.options.variation_size if self.part == "variations" else self.options.size,
             **figures,
             "quality": self.options.quality,
+            "decode": self.options.decode,
             "gpus": names,
             "cores": len(os.sched_getaffinity(0)),
             "warp": wp.__version__,
@@ -142,7 +143,8 @@ class Bench:
 
     def write_jobs(self, name: str, clips: int, segment_frames: int) -> Path:
         """A job file of so many clips that are one recording."""
-        run = f'schema = 1\n[run]\nquality = "{self.options.quality}"\nsegment_frames = {segment_frames}\n'
+        settings = f'quality = "{self.options.quality}"\ndecode = "{self.options.decode}"\n'
+        run = f"schema = 1\n[run]\n{settings}segment_frames = {segment_frames}\n"
         clip = '[[clip]]\nscene = "desk.toml"\npath = "desk.mp4"\nname = "c{:04d}"\n'
         path = self.folder / name
         path.write_text(run + "".join(clip.format(number) for number in range(clips)), encoding="utf-8")

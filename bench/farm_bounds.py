@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shutil
 import statistics
@@ -13,11 +14,13 @@ from typing import TYPE_CHECKING, Any
 import av
 import numpy as np
 import warp as wp
+from av.codec.hwaccel import HWAccel
 from av.video.reformatter import VideoReformatter
 
 from bench.farm_recordings import RATE, TICK
 from warp_ar.device import usable_cores
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.farm.frames import index_frames, open_part
 from warp_ar.farm.jobs import Job, parse_jobs, read_jobs
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.part_video import PartSink
@@ -82,6 +85,8 @@ def run_bounds(bench: Bench) -> None:
     with open_source(video) as source:
         steps["decode and convert to RGB"] = _timed(source, limit)
         images = [frame.image for frame in itertools.islice(source, limit + WARM)]
+    if bench.device != "cpu":
+        _decode_by_unit(bench, video, images, steps)
     reformatter = VideoReformatter()
     with av.open(str(video)) as container:
         pictures = list(itertools.islice(container.decode(video=0), limit + WARM))
@@ -106,6 +111,27 @@ def run_bounds(bench: Bench) -> None:
         frames=limit,
         machine_fps_by_processor=round(1e3 * usable_cores() / bench.costs["worker_processor"], 1),
     )
+
+
+def _decode_by_unit(bench: Bench, video: Path, images: list[np.ndarray], steps: dict[str, tuple[float, float]]) -> None:
+    """Frames by the GPU's decoding unit, and whether they are those of the processor to the bit."""
+    unit = HWAccel("cuda", device="0", allow_software_fallback=True)
+    try:
+        with av.open(str(video), hwaccel=unit) as container:
+            first = next(container.decode(video=0))
+            used = container.streams.video[0].codec_context.is_hwaccel
+            bench.tell("GPU's decoding unit", used=bool(used), pixels=first.format.name)
+    except (av.FFmpegError, OSError, NotImplementedError) as error:
+        bench.tell("GPU's decoding unit", used=False, error=str(error))
+        return
+    index = index_frames(video, None)
+    with contextlib.closing(open_part(video, index, 0, len(images), None, 0)) as source:
+        same = [bool((frame.image == image).all()) for frame, image in zip(source, images, strict=True)]
+    with contextlib.closing(open_part(video, index, 0, len(images), None, 0)) as source:
+        steps["decode by the GPU's unit and convert to RGB"] = _timed(source, len(images) - WARM)
+    with contextlib.closing(open_part(video, index, 0, len(images), None)) as source:
+        steps["decode and convert to RGB on two threads"] = _timed(source, len(images) - WARM)
+    bench.tell("pictures by the GPU's unit", compared=len(same), unlike=same.count(False))
 
 
 def _encode(path: Path, images: list[np.ndarray], limit: int) -> tuple[float, float]:

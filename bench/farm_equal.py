@@ -39,6 +39,7 @@ EDGE = 24
 RECORDING = """schema = 1
 [run]
 quality = "{quality}"
+decode = "{decode}"
 segment_frames = {segment}
 [[clip]]
 scene = "desk.toml"
@@ -62,7 +63,9 @@ def run_long(bench: Bench) -> None:
         f"a recording of {frames} frames in {time.monotonic() - start:.0f} s, {video.stat().st_size / 1e6:.0f} MB"
     )
     jobs = bench.folder / "long.toml"
-    jobs.write_text(RECORDING.format(quality=bench.options.quality, segment=-(-frames // SEGMENTS)))
+    options = bench.options
+    text = RECORDING.format(quality=options.quality, decode=options.decode, segment=-(-frames // SEGMENTS))
+    jobs.write_text(text)
     prepare(folder, jobs, None)
     seen = work(folder, SEGMENTS, bench.device, bench.say, limit=max(bench.left, 60.0))
     survey, segments = jobs_done(folder, "survey"), jobs_done(folder, "segment")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import math
 import pathlib
-from collections.abc import Generator, Sequence
-from typing import Any
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeAlias
 
 import av
 import numpy as np
@@ -20,6 +23,8 @@ from warp_ar.input.plate import Plate, codes8
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
 Image = npt.NDArray[np.uint8]
+Taken: TypeAlias = tuple[Image, float | None, Plate | None]
+"""A picture, its time stamp in seconds, and its plate if that is kept."""
 
 # Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
 _FORMATS = (
@@ -45,6 +50,9 @@ class VideoFile(RecordedSource):
     Raises:
         SourceError: The file does not exist, is no video, or its first frame cannot be decoded.
     """
+
+    _converters = 1
+    """Threads that convert pictures to RGB beside the one that decodes; 1: that one does."""
 
     def __init__(
         self,
@@ -77,9 +85,10 @@ class VideoFile(RecordedSource):
         self.size = (width, height)
         self.description = f"{self._path} ({codec}, {width}x{height}, {self.fps:g} fps)"
 
-    def _open(self) -> Any:
+    def _open(self, **how: Any) -> Any:
+        """The file's container; ``how``: more of PyAV's arguments."""
         try:
-            container = av.open(str(self._path), options=_OPTIONS)
+            container = av.open(str(self._path), options=_OPTIONS, **how)
         except (av.FFmpegError, OSError, ValueError) as error:
             raise SourceError(
                 f"{self._path} cannot be read as a video ({reason(error)}): damaged, cut off, or no video file"
@@ -119,9 +128,7 @@ class VideoFile(RecordedSource):
                 previous = seconds
                 yield Frame(index, seconds, image, plate=plate)
 
-    def _pictures(
-        self, container: Any, first: int | None = None
-    ) -> Generator[tuple[Image, float | None, Plate | None], None, None]:
+    def _pictures(self, container: Any, first: int | None = None) -> Generator[Taken, None, None]:
         """Every picture with its time stamp in seconds, and its plate if that is kept.
 
         Whatever precedes damage comes before the error.
@@ -131,9 +138,18 @@ class VideoFile(RecordedSource):
             first: Time stamp, in ticks of the stream, from which on pictures are wanted, where the container stands
                 somewhere before it; None: all are, from the start.
         """
+        pictures = self._decoded(container, first)
+        if self._converters == 1:
+            reformatter = VideoReformatter()
+            for picture in pictures:
+                yield self._taken(reformatter, picture)
+        else:
+            yield from _convert_beside(pictures, self._converters, self._taken)
+
+    def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
+        """As ``_pictures``, each as its codec has it."""
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        reformatter = VideoReformatter()
         count, packets, damage = 0, 0, ""
         demuxer = container.demux(stream)
         while not damage:
@@ -152,7 +168,7 @@ class VideoFile(RecordedSource):
                 damage = reason(error)
             for picture in pictures:
                 if first is None or picture.pts >= first:
-                    yield self._taken(reformatter, picture)
+                    yield picture
                 count += 1
         # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
         if not damage and first is None and "mp4" in container.format.name and packets < stream.frames:
@@ -161,11 +177,11 @@ class VideoFile(RecordedSource):
             # Threads and reordering hold frames back; those before the damage are still good.
             with contextlib.suppress(av.FFmpegError):
                 for picture in stream.decode(None):
-                    yield self._taken(reformatter, picture)
+                    yield picture
                     count += 1
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
-    def _taken(self, reformatter: VideoReformatter, picture: Any) -> tuple[Image, float | None, Plate | None]:
+    def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
         """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
         if self.deep != "light":
             plate = plate_from_video(reformatter, picture) if self.deep and self.keeps_depth else None
@@ -173,6 +189,36 @@ class VideoFile(RecordedSource):
         plate = plate_from_video(reformatter, picture)
         image = codes8(plate, "srgb") if plate.codes is None else plate.codes
         return image, picture.time, plate if self.keeps_depth else None
+
+
+def _convert_beside(
+    pictures: Iterator[Any], threads: int, take: Callable[[VideoReformatter, Any], Taken]
+) -> Generator[Taken, None, None]:
+    """Pictures in RGB with their times, in order, converted while the next are decoded; errors keep their place."""
+    own = threading.local()
+
+    def convert(picture: Any) -> Taken:
+        if not hasattr(own, "reformatter"):
+            own.reformatter = VideoReformatter()
+        return take(own.reformatter, picture)
+
+    waiting: collections.deque[Future[Taken]] = collections.deque()
+    damage: SourceError | None = None
+    with ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-convert") as pool:
+        try:
+            try:
+                for picture in pictures:
+                    waiting.append(pool.submit(convert, picture))
+                    if len(waiting) > threads:
+                        yield waiting.popleft().result()
+            except SourceError as error:
+                damage = error
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    if damage is not None:
+        raise damage
 
 
 def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:

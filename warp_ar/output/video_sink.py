@@ -9,6 +9,7 @@ from __future__ import annotations
 import fractions
 import math
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import av
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
-from warp_ar.output.encoders import CRF, Encoding, find_encoding
+from warp_ar.output.encoders import Encoding, find_encoding
 from warp_ar.output.places import check_replaceable
 from warp_ar.output.sink import ThreadedSink, check_image, check_radiance, make_folder
 from warp_ar.output.whole_fragments import WholeFragments
@@ -29,8 +30,6 @@ from warp_ar.signature import PROGRAM
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 VIDEO_SUFFIXES = tuple(_FORMATS)
 """What `VideoSink` writes."""
-
-__all__ = ["CRF", "FRAGMENT_SECONDS", "VIDEO_SUFFIXES", "VideoSink", "rgb_to_yuv", "yuv_picture"]
 
 FRAGMENT_SECONDS = 0.5
 """Longest time between key frames, and so between the fragments that reach the disk."""
@@ -133,27 +132,16 @@ class VideoSink(ThreadedSink):
         options = {**fragments, "flush_packets": "1"}
         self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
         self._container.metadata["comment"] = PROGRAM
-        self._stream = self._container.add_stream(
-            self._encoding.encoder,
-            rate=self._rate,
-            options={"g": str(group), **self._encoding.options},
-        )
-        self._stream.width, self._stream.height = width, height
-        self._stream.pix_fmt = self._encoding.pixel_format
-        context = self._stream.codec_context
+        self._stream = add_stream(self._container, self._rate, width, height, self._encoding, {"g": str(group)})
         if movie and self._encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
-            context.codec_tag = "hvc1"  # Apple's players know no other
-        context.color_range = ColorRange.MPEG
-        context.colorspace, context.color_primaries, context.color_trc = _TAGS[self._encoding.coding]
+            self._stream.codec_context.codec_tag = "hvc1"  # Apple's players know no other
         self._container.start_encoding()
         self._converter = rgb_to_yuv(width, height, 1 / self._rate, self._encoding.coding, self._encoding.pixel_format)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
             return  # FFmpeg may crash when it goes on after a failure.
-        height, width = image.shape[:2]
-        if height % 2 or width % 2:
-            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        image = of_even_size(image)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
@@ -211,6 +199,40 @@ def _count_frames(path: pathlib.Path) -> int:
             return sum(packet.size > 0 for packet in container.demux(video=0))
     except (av.FFmpegError, OSError, ValueError):
         return 0
+
+
+def add_stream(
+    container: Any, rate: fractions.Fraction, width: int, height: int, encoding: Encoding, options: Mapping[str, str]
+) -> Any:
+    """A stream of video in a new container, tagged as what it is.
+
+    Args:
+        container: PyAV's.
+        rate: Frames per second.
+        width: Even.
+        height: Even.
+        encoding: How it is encoded.
+        options: Of the encoder; those of ``encoding`` go before them.
+    """
+    stream = container.add_stream(encoding.encoder, rate=rate, options={**options, **encoding.options})
+    stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixel_format
+    context = stream.codec_context
+    context.color_range = ColorRange.MPEG
+    context.colorspace, context.color_primaries, context.color_trc = _TAGS[encoding.coding]
+    return stream
+
+
+def add_h264(container: Any, rate: fractions.Fraction, width: int, height: int, options: Mapping[str, str]) -> Any:
+    """A stream of H.264 in a new container, of colours as they are commonly understood; as `add_stream`."""
+    return add_stream(container, rate, width, height, find_encoding(), options)
+
+
+def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A picture whose last row or column stands twice where its size is odd: chroma has half the size."""
+    height, width = image.shape[:2]
+    if height % 2 or width % 2:
+        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    return image
 
 
 def rgb_to_yuv(
