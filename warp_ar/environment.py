@@ -7,11 +7,12 @@ import dataclasses
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.color_spaces import COLOR_SPACES, grey_card_scale
 from warp_ar.output.environment_axes import AXES, LAYOUTS
@@ -60,7 +61,7 @@ def _time(text: str) -> datetime.datetime:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    return run_command(lambda: convert(make_parser().parse_args(arguments)), SinkError)
+    return run_command(lambda: convert(make_parser().parse_args(arguments)))
 
 
 def convert(options: argparse.Namespace) -> int:
@@ -82,16 +83,13 @@ def convert(options: argparse.Namespace) -> int:
     if options.grey_card:
         radiance, info = _scaled(radiance, info)
     replaced = check_replaceable(output, overwrite=options.overwrite)
-    write_environment(
-        output,
-        radiance,
-        overwrite=options.overwrite,
-        axes=options.axes,
-        layout=options.layout,
-        size=options.size,
-        info=info,
-        color_space=options.color_space,
-    )
+    form: dict[str, Any] = {"axes": options.axes, "layout": options.layout, "size": options.size, "info": info}
+    form["color_space"] = options.color_space
+    try:
+        write_environment(output, radiance, overwrite=options.overwrite, **form)
+    except SinkError as error:
+        say(error)
+        return EXIT_FAILED
     if replaced:
         say(replaced)
     return EXIT_DONE
