@@ -132,6 +132,44 @@ def decode_table(transfer: str | pathlib.Path) -> np.ndarray:
     return _decode_values(transfer).astype(np.float32)
 
 
+def decode_codes(transfer: str | pathlib.Path, encoded: np.ndarray) -> np.ndarray:
+    """Linear value of codes of any depth.
+
+    Args:
+        transfer: As for ``decode_table``; a measured response is interpolated linearly between its codes.
+        encoded: Codes over the largest one, (n,), 0 to 1.
+
+    Returns:
+        (n, 3) float64.
+    """
+    name = str(transfer)
+    if name in ("srgb", "linear") or name.startswith("gamma:"):
+        return np.repeat(_formula(name, encoded)[:, None], 3, axis=1)
+    values, codes = _decode_values(transfer), np.arange(256) / 255.0
+    return np.stack([np.interp(encoded, codes, values[:, c]) for c in range(3)], -1)
+
+
+def encode_codes(transfer: str | pathlib.Path, light: np.ndarray) -> np.ndarray:
+    """Codes of linear values over the largest code, not rounded; the inverse of ``decode_codes``.
+
+    Args:
+        transfer: As for ``decode_table``.
+        light: (..., 3); what is below 0 or above 1 is cut.
+
+    Returns:
+        float64 of the same shape, 0 to 1.
+    """
+    name, x = str(transfer), np.clip(np.nan_to_num(np.asarray(light, np.float64), nan=0.0), 0.0, 1.0)
+    if name == "linear":
+        return x
+    if name == "srgb":
+        return np.where(x <= 0.04045 / 12.92, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
+    if name.startswith("gamma:"):
+        return x ** (1.0 / _gamma(name))
+    values, codes = _decode_values(transfer), np.arange(256) / 255.0
+    return np.stack([np.interp(x[..., c], values[:, c], codes) for c in range(3)], -1)
+
+
 def camera_table(
     transfer: str | pathlib.Path,
     saturation: np.ndarray | tuple[int, int, int] = (255, 255, 255),

@@ -101,6 +101,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         distant: DistantLight,
         receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
+        linear_frame: wp.array2d[wp.vec3],
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
     ):
@@ -112,6 +113,8 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         origin = params[0].camera_position
         ray = receiver.picture.rays[i, j]
         shown = decode(receiver.picture.decode_table, receiver.picture.frame[i, j])
+        if linear_frame.shape[0] > 0:
+            shown = linear_frame[i, j]
         change = wp.vec3(0.0, 0.0, 0.0)
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
@@ -172,6 +175,7 @@ def mirror_ball(
     shadow_ratio: wp.array | None,
     mirrored_out: wp.array,
     *,
+    linear_frame: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
@@ -185,13 +189,14 @@ def mirror_ball(
         receiver: From ``make_receiver``; picture and probes are always needed.
         shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
+        linear_frame: (H, W) vec3, the frame as linear radiance where more than 8 bits of it are known.
         rows: Band of rows; None means all.
     """
     rays = receiver.picture.rays
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [params, scene, lights, distant, receiver, shadow_ratio],
+        [params, scene, lights, distant, receiver, shadow_ratio, linear_frame],
         [mirrored_out],
         rows=rows,
         device=rays.device,

@@ -23,10 +23,9 @@ what lies behind the ball could leak in: pixels nearer than ``rim_start`` to the
 per steradian is worth.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
+from typing import Self
 
 import warp as wp
 
@@ -106,9 +105,9 @@ class ProjectConfig:
     occluders: tuple[int, ...] = ()
     """Kinds of proxy in the scene: any of PLANE, BOX, MESH."""
 
-    def general(self) -> ProjectConfig:
+    def general(self) -> Self:
         """For any scene."""
-        return ProjectConfig(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
+        return type(self)(tuple(sorted(map(int, (PLANE, BOX, MESH)))))
 
 
 @functools.cache
@@ -285,18 +284,53 @@ def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
     return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
 
 
+mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
+
+
+@wp.func
+def keep_linear(table: wp.array[wp.vec3], value: wp.vec3) -> wp.vec3:
+    """A pixel of a linear frame, in the place of ``decode``."""
+    return value
+
+
+@wp.func
+def clip_levels(table: wp.array[wp.vec3]) -> mat23:
+    """Where the channels of a linear frame clip, and where beside another one that does."""
+    return mat23(table[0][0], table[0][1], table[0][2], table[1][0], table[1][1], table[1][2])
+
+
+@wp.func
+def is_at_clipping(value: wp.vec3, levels: mat23) -> wp.vec3:
+    """1 in the channels of a linear pixel that clip, in the place of ``is_saturated``."""
+    beside = wp.bool(False)
+    for channel in range(3):
+        beside = beside or value[channel] >= levels[0, channel]
+    least = levels[0]
+    if beside:
+        least = levels[1]
+    return wp.vec3(
+        wp.where(value[0] >= least[0], 1.0, 0.0),
+        wp.where(value[1] >= least[1], 1.0, 0.0),
+        wp.where(value[2] >= least[2], 1.0, 0.0),
+    )
+
+
 @functools.cache
-def make_gather_probe_kernel(method: str) -> wp.Kernel:
-    """Kernel of one method; raises ValueError for an unknown one."""
+def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
+    """Kernel of one method, of frames of 8-bit codes or ``linear`` ones; raises ValueError for an unknown method."""
     if method not in METHODS:
         raise ValueError(f"unwrap: no method {method!r}; expected {', '.join(METHODS)}")
+    pixel = wp.vec3 if linear else wp.vec3ub
+    to_light = keep_linear if linear else decode
+    find_levels = clip_levels if linear else saturation_codes
+    clips = is_at_clipping if linear else is_saturated
 
     @wp.kernel(module="unique", enable_backward=False)
     def gather_probe_kernel(
         # In:
         row_start: wp.int32,
         lanes: wp.int32,
-        frame: wp.array2d[wp.vec3ub],
+        frame: wp.array2d[pixel],
         table: wp.array[wp.vec3],
         probes: wp.array[Probe],
         corners: wp.array3d[wp.vec3],
@@ -313,7 +347,7 @@ def make_gather_probe_kernel(method: str) -> wp.Kernel:
         width = radiance_out.shape[1]
         last_row = wp.float32(frame.shape[0] - 1)
         last_column = wp.float32(frame.shape[1] - 1)
-        saturation = saturation_codes(table)
+        saturation = find_levels(table)
 
         radiance = wp.vec3(0.0, 0.0, 0.0)
         clipped = wp.vec3(0.0, 0.0, 0.0)
@@ -369,10 +403,10 @@ def make_gather_probe_kernel(method: str) -> wp.Kernel:
                         p01 = frame[i, j1]
                         p10 = frame[i1, j]
                         p11 = frame[i1, j1]
-                        top = mix(decode(table, p00), decode(table, p01), fx)
-                        value = mix(top, mix(decode(table, p10), decode(table, p11), fx), fy)
-                        top = mix(is_saturated(p00, saturation), is_saturated(p01, saturation), fx)
-                        saturated = mix(top, mix(is_saturated(p10, saturation), is_saturated(p11, saturation), fx), fy)
+                        top = mix(to_light(table, p00), to_light(table, p01), fx)
+                        value = mix(top, mix(to_light(table, p10), to_light(table, p11), fx), fy)
+                        top = mix(clips(p00, saturation), clips(p01, saturation), fx)
+                        saturated = mix(top, mix(clips(p10, saturation), clips(p11, saturation), fx), fy)
                         total += weight
                         mean = mix(mean, value, weight / total)
                         mean_clipped = mix(mean_clipped, saturated, weight / total)
@@ -440,8 +474,9 @@ def gather_probe(
     """Average the frame over every texel's footprint and undo the ball's reflectance.
 
     Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
-        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
+        decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
+            another channel that does, (2,).
         probes: ``Probe`` (P); reflectances must be positive.
         corners: From ``project_corners``, (h + 1, w + 1, P).
         radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
@@ -461,7 +496,7 @@ def gather_probe(
     if method == "area" and radiance_out.device.is_cuda:
         lanes = GATHER_LANES if radiance_out.size <= FEW_TEXELS else 2
     launch_rows(
-        make_gather_probe_kernel(method),
+        make_gather_probe_kernel(method, frame.dtype is wp.vec3),
         (*radiance_out.shape, lanes),
         [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
         [radiance_out, confidence_out, clipped_out],

@@ -8,13 +8,15 @@ import re
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 
 import warp_ar
 from tests.test_sources import write_video
-from warp_ar.input.frame_folder import IMAGE_SUFFIXES
+from warp_ar.input.frame_folder import IMAGE_SUFFIXES, LINEAR_SUFFIX
 from warp_ar.input.sources import open_source
+from warp_ar.kernels.color import decode_table
 from warp_ar.output.environment_file import ENVIRONMENT_SUFFIXES
 from warp_ar.output.gltf_file import GLTF_SUFFIX
 from warp_ar.output.track_file import TRACK_SUFFIX
@@ -65,7 +67,12 @@ def smooth() -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", sorted(IMAGE_SUFFIXES))
 def test_pictures_of_every_ending_are_frames(tmp_path: pathlib.Path, suffix: str) -> None:
-    (tmp_path / f"0{suffix}").write_bytes(cv2.imencode(suffix, smooth()[..., ::-1])[1].tobytes())
+    if suffix == LINEAR_SUFFIX:
+        light = decode_table("srgb")[smooth(), [0, 1, 2]]
+        kind = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(kind, {"RGB": light}).write(str(tmp_path / f"0{suffix}"))
+    else:
+        (tmp_path / f"0{suffix}").write_bytes(cv2.imencode(suffix, smooth()[..., ::-1])[1].tobytes())
     with open_source(tmp_path) as source:
         frames = [frame.image for frame in source]
     assert len(frames) == 1

@@ -99,6 +99,40 @@ def test_the_header_places_the_camera(rendered, written):
     known = np.isfinite(depth)
     in_camera = places @ header["cameraFromWorld"][:3, :3].T + header["cameraFromWorld"][:3, 3]
     np.testing.assert_allclose(in_camera[known, 2], depth[known], rtol=1e-5)
+    # OpenEXR's own attribute: rows are mapped, the camera looks along -z, y is up.
+    of_compositors = np.concatenate([places, np.ones((len(places), 1))], 1) @ header["worldToCamera"]
+    np.testing.assert_allclose(of_compositors[known, :3], in_camera[known] * (1, -1, -1), atol=1e-5)
+
+
+def test_openimageio_reads_every_part(rendered, written, tmp_path):
+    """Names, types, windows and numbers as compositors see them, and the documented formula by what they read."""
+    oiio = pytest.importorskip("OpenImageIO")
+    scene, frame, result = rendered
+    write_layers(tmp_path / "a.exr", layer_frame(frame, result, scene))
+    opened = oiio.ImageInput.open(str(tmp_path / "a.exr"))
+    parts = {}
+    while opened.seek_subimage(len(parts), 0):
+        spec = opened.spec()
+        assert (spec.x, spec.y, spec.full_x, spec.full_y) == (0, 0, 0, 0)
+        assert (spec.width, spec.height) == (spec.full_width, spec.full_height) == frame.shape[1::-1]
+        wide = spec.getattribute("name") in ("ids", "coverage", "depth", "normals", "position", "motion")
+        assert str(spec.format) == ("uint" if spec.getattribute("name") == "ids" else "float" if wide else "half")
+        assert spec.getattribute("worldToCamera") is not None
+        number = len(parts)
+        parts[spec.getattribute("name")] = (
+            list(spec.channelnames),
+            np.asarray(opened.read_image(number, 0, 0, spec.nchannels, "float")),
+        )
+    opened.close()
+    assert list(parts) == list(written)
+    assert parts["picture"][0] == ["R", "G", "B"]
+    assert parts["objects"][0] == [f"objects.{c}" for c in "RGBA"]
+    assert parts["depth"][0] == ["Z"]
+    plate, ratio, added, ball, objects = (
+        parts[name][1].astype(np.float64) for name in ("plate", "shadow_ratio", "added_light", "mirror_ball", "objects")
+    )
+    picture = (1.0 - objects[..., 3:]) * np.maximum(plate * ratio + added + ball, 0.0) + objects[..., :3]
+    np.testing.assert_allclose(parts["picture"][1], picture, rtol=4.0 * HALF, atol=1e-4)
 
 
 def test_mattes_are_named(rendered, written):

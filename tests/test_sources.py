@@ -185,9 +185,9 @@ def test_grey_alpha_and_16_bit_become_rgb(tmp_path: pathlib.Path) -> None:
     assert (color == (1, 2, 3)).all()
 
 
-def test_float_image_is_an_error(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "0.tif").write_bytes(cv2.imencode(".tif", np.full((4, 4, 3), np.nan, np.float32))[1].tobytes())
-    assert "float32" in error_of(tmp_path)
+def test_image_of_32_bit_numbers_is_an_error(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "0.tif").write_bytes(cv2.imencode(".tif", np.full((4, 4, 3), 7, np.int32))[1].tobytes())
+    assert "holds int32 values; 8 or 16 bits, or floats, are needed" in error_of(tmp_path)
 
 
 def test_exposures_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:

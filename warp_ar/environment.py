@@ -7,17 +7,25 @@ import dataclasses
 import datetime
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, UsageError
+from warp_ar.output.color_spaces import COLOR_SPACES, grey_card_scale
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
     ENVIRONMENT_SUFFIXES,
+    EnvironmentInfo,
     read_environment,
     read_environment_info,
     write_environment,
 )
 from warp_ar.output.places import check_places, check_replaceable
+
+Radiance = npt.NDArray[np.float32]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -37,6 +45,9 @@ def make_parser() -> argparse.ArgumentParser:
     text = "where: longitude and latitude in degrees, altitude in metres"
     add("--place", type=float, nargs=3, metavar=("EAST", "NORTH", "ALTITUDE"), help=text)
     add("--white-luminance", type=float, metavar="CD", help="cd/m^2 of the value 1 (default: as the file says)")
+    text = "rec709 (this program's own), or acescg, by OpenColorIO, to .exr (default: rec709)"
+    add("--color-space", choices=tuple(COLOR_SPACES), default="rec709", help=text)
+    add("--grey-card", action="store_true", help="scale the light: a grey card lying on the marker has 0.18")
     add("--overwrite", action="store_true", help="replace a file that this program did not write")
     return parser
 
@@ -69,8 +80,11 @@ def convert(options: argparse.Namespace) -> int:
     info = read_environment_info(options.environment)
     info = dataclasses.replace(info, **{name: value for name, value in given.items() if value is not None})
     radiance = read_environment(options.environment)
+    if options.grey_card:
+        radiance, info = _scaled(radiance, info)
     replaced = check_replaceable(output, overwrite=options.overwrite)
-    form = {"axes": options.axes, "layout": options.layout, "size": options.size, "info": info}
+    form: dict[str, Any] = {"axes": options.axes, "layout": options.layout, "size": options.size, "info": info}
+    form["color_space"] = options.color_space
     try:
         write_environment(output, radiance, overwrite=options.overwrite, **form)
     except SinkError as error:
@@ -79,6 +93,19 @@ def convert(options: argparse.Namespace) -> int:
     if replaced:
         say(replaced)
     return EXIT_DONE
+
+
+def _scaled(radiance: Radiance, info: EnvironmentInfo) -> tuple[Radiance, EnvironmentInfo]:
+    """An environment under which a grey card has 0.18, and what that makes of its levels."""
+    scale = grey_card_scale(radiance)
+    say(f"the light is multiplied by {scale:.6g}")
+    luminance = info.luminance_of_one()
+    info = dataclasses.replace(
+        info,
+        white_level=scale * info.white_level,
+        white_luminance=None if luminance is None else luminance / scale,
+    )
+    return np.ascontiguousarray(radiance * np.float32(scale)), info
 
 
 if __name__ == "__main__":

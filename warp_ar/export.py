@@ -78,7 +78,7 @@ def export(options: argparse.Namespace) -> int:
         beside.pop("environment", None)
     else:
         write_environment(beside["environment"], radiance, overwrite=True, axes="y-up")
-        shot = dataclasses.replace(shot, environment=beside["environment"])
+        shot = dataclasses.replace(shot, environment=beside["environment"], radiance=radiance)
     for name, make in (("undistort", undistort_map), ("distort", distort_map)):
         if name in beside:
             write_stmap(beside[name], make(shot.camera))

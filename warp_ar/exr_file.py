@@ -1,4 +1,4 @@
-"""OpenEXR files that are written whole, or not at all.
+"""OpenEXR files: pictures read as linear light; files that are written whole, or not at all.
 
 OpenEXR writes through a buffer whose last part reaches the disk when the file is closed, and does not look at what
 became of it: on a full disk a file may lack its end without a word. Here the end is looked at.
@@ -10,14 +10,77 @@ import errno
 import os
 import pathlib
 import struct
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import OpenEXR
+
+from warp_ar.errors import WarpArError, reason
+from warp_ar.files import limits, too_much
+from warp_ar.signals import REC_709, converted
 
 _LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 """Rows of a chunk, by the number of the compression: none, RLE, ZIPS, ZIP, PIZ, PXR24, B44, B44A, DWAA, DWAB."""
 _MAGIC = b"\x76\x2f\x31\x01"
 _SEVERAL_PARTS = 0x10
 """Bit of the second byte of the version's four."""
+
+
+def read_linear_exr(path: pathlib.Path, error: type[WarpArError], label: str) -> npt.NDArray[np.float32]:
+    """Linear RGB of an OpenEXR's first part, in Rec. 709's primaries.
+
+    Args:
+        path: The file; it has channels R, G and B, or Y for grey.
+        error: What to raise.
+        label: What messages call the picture.
+
+    Returns:
+        (height, width, 3) of the display window; black where the file holds nothing of it.
+
+    Raises:
+        WarpArError: As ``error``: it is no OpenEXR, damaged, too large, or has other channels.
+    """
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            header = dict(file.header())
+        windows = [
+            [np.asarray(corner, np.int64) for corner in header[name]] for name in ("dataWindow", "displayWindow")
+        ]
+        sizes = [tuple(int(side) for side in high - low + 1) for low, high in windows]
+    except (RuntimeError, OSError, ValueError, KeyError) as problem:
+        raise error(f"{label} cannot be read as OpenEXR: {reason(problem)}") from problem
+    for width, height in sizes:
+        if width * height > limits().picture_pixels:
+            raise error(too_much(f"{label} is {width}x{height}: it", width * height, "pixels", "picture_pixels"))
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    except (RuntimeError, OSError, ValueError, KeyError) as problem:
+        raise error(f"{label} cannot be read as OpenEXR: {reason(problem)}") from problem
+    names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
+    if names[0] not in channels:
+        raise error(f"{label} has channels {', '.join(channels)}; R, G and B, or Y, are needed")
+    if len({channels[name].shape for name in names}) > 1:
+        raise error(f"{label} has channels of several sizes; R, G and B of one size are needed")
+    picture = np.stack([channels[name].astype(np.float32) for name in names], -1)
+    told = header.get("chromaticities")
+    source: Any = REC_709 if told is None else tuple(map(float, told))
+    return _in_window(converted(picture, source, REC_709), *windows)
+
+
+def _in_window(picture: npt.NDArray[np.float32], data: Any, display: Any) -> npt.NDArray[np.float32]:
+    """What of a picture of one window lies in another, which may hold more."""
+    (low, _), (first, last) = data, display
+    (left, top), (width, height) = low - first, last - first + 1
+    rows, columns = picture.shape[:2]
+    if (left, top, columns, rows) == (0, 0, width, height):
+        return picture
+    out = np.zeros((height, width, 3), np.float32)
+    y0, y1, x0, x1 = max(top, 0), min(top + rows, height), max(left, 0), min(left + columns, width)
+    if y0 < y1 and x0 < x1:
+        out[y0:y1, x0:x1] = picture[y0 - top : y1 - top, x0 - left : x1 - left]
+    return out
 
 
 def write_exr(path: pathlib.Path, image: OpenEXR.File) -> None:

@@ -39,9 +39,10 @@ from warp_ar.command_line import (
 )
 from warp_ar.errors import UsageError, WarpArError, printable, reason
 from warp_ar.files import write_whole
+from warp_ar.output.encoders import CODINGS, describe_encoders, parse_options
 from warp_ar.output.places import check_places, check_replaceable, files_of
 from warp_ar.output.sink import make_folder
-from warp_ar.output.sinks import NullSink, Sink, open_sink
+from warp_ar.output.sinks import FOLDER_CODINGS, NullSink, Sink, open_sink
 from warp_ar.scene import Scene, bundled_scenes, load_scene
 from warp_ar.signature import PROGRAM
 from warp_ar.stages.quality import AUTO, DEFAULT_BUDGET_MS, DEFAULT_PRESET, PRESETS
@@ -125,6 +126,27 @@ def _add_file_options(group: argparse._ArgumentGroup) -> None:
         type=Path,
         metavar="FILE.mp4|DIR",
         help="write frames instead of serving the page: a folder gets NNNN.png, a file H.264",
+    )
+    add(
+        "--coding",
+        choices=tuple(dict.fromkeys((*CODINGS, *FOLDER_CODINGS))),
+        default="8bit",
+        help="with --output: a video of 10bit, pq or hlg; a folder of 16bit (PNG) or exr (default: 8bit)",
+    )
+    add("--encoder", metavar="NAME|list", help="with --output FILE: FFmpeg's encoder; list: show those of this machine")
+    add(
+        "--encoder-option",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="an option of the encoder by FFmpeg's name, such as crf=23; may be given again",
+    )
+    add(
+        "--virtual-camera",
+        nargs="?",
+        const="",
+        metavar="DEVICE",
+        help="show frames as a camera that other programs open, such as /dev/video4 (default: the first there is)",
     )
     add(
         "--headless",
@@ -478,13 +500,18 @@ def run(options: argparse.Namespace) -> int:
         for name, path in bundled_scenes().items():
             print(f"{name:16s} {path}")
         return EXIT_DONE
+    if options.encoder == "list":
+        print("\n".join(describe_encoders()))
+        return EXIT_DONE
+    if options.output is None and (options.coding != "8bit" or options.encoder or options.encoder_option):
+        raise UsageError("--coding, --encoder and --encoder-option need --output, the file or folder to write")
     if options.frames is not None and options.frames < 1:
         raise UsageError(f"--frames {options.frames}: expected a number of frames, 1 or more")
     if options.budget_ms is not None and not 0.0 < options.budget_ms < float("inf"):
         raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
-    if options.output is None and not options.headless:
+    if options.output is None and options.virtual_camera is None and not options.headless:
         return serve_page(options)
     return light_clip(options)
 
@@ -505,6 +532,7 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
     _hurry_compilers(options.device)
     from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.engine.layers import RADIANCE
     from warp_ar.output.report import RunLog, print_plan
     from warp_ar.output.side_files import SideFiles, parse_layers
 
@@ -516,6 +544,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         overwrite=options.overwrite,
     )
     outputs, replaced = ["image", *side.outputs], list(side.replaced)
+    if options.coding != "8bit":
+        outputs.append(RADIANCE)
     if options.report is not None:
         replaced.append(_prepare_file(options.report, overwrite=options.overwrite))
         outputs.append("pose")
@@ -534,14 +564,24 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         sink: Sink = NullSink()
         if options.output is not None:
             size = session.pipeline.size
-            sink = open_sink(options.output, fps=source.fps, size=size, overwrite=options.overwrite)
+            sink = open_sink(
+                options.output,
+                fps=source.fps,
+                size=size,
+                overwrite=options.overwrite,
+                coding=options.coding,
+                transfer=str(session.scene.camera.transfer),
+                encoder=options.encoder,
+                encoder_options=parse_options(options.encoder_option),
+            )
+        camera = _open_camera(options, session)
         for words in (*replaced, sink.replaced):
             if words:
                 say(words)
         log, evidence = RunLog(session.pipeline), _Evidence(ball_seen=ball_seen)
         try:
-            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink:
-                _light_frames(options, session, log, sink, side, stop, evidence)
+            with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink, camera:
+                _light_frames(options, session, log, (sink, camera), side, stop, evidence)
             if stop.code is None:
                 _check_run(log, session, evidence)
         except WarpArError as error:
@@ -559,7 +599,8 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
             _print_choice(session.pipeline)
         steps = ", ".join(f"{name} {milliseconds:.1f}" for name, milliseconds in log.steps().items())
         Console().print(f"side by side, in ms: {steps}", highlight=False)
-        where = "nowhere" if options.output is None else printable(options.output)
+        shown = printable(camera.description)
+        where = shown if options.output is None else printable(options.output)
         Console().print(f"{log.count} frames, {log.fps:.1f} fps, written to {where}", highlight=False, markup=False)
     return EXIT_DONE if stop.code is None else stop.code
 
@@ -585,13 +626,13 @@ def _light_frames(
     options: argparse.Namespace,
     session: Session,
     log: RunLog,
-    sink: Sink,
+    sinks: tuple[Sink, Sink],
     side: SideFiles,
     stop: _Stop,
     evidence: _Evidence,
 ) -> None:
     """Let frames flow until they end, or until a signal asks to stop."""
-    source = session.source
+    source, (sink, camera) = session.source, sinks
     total = (
         options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
     )
@@ -609,7 +650,8 @@ def _light_frames(
             image, decode_ms = result.image, session.decode_ms
             evidence.add(frame.image, result)
             start = time.perf_counter()
-            sink.write(image)
+            sink.write(image if options.coding == "8bit" else result.radiance)
+            camera.write(image)
             encode_ms = (time.perf_counter() - start) * 1e3
             side.write(frame.image, result, session.scene)
             log.add(result, decode_ms=decode_ms, encode_ms=encode_ms)
@@ -618,6 +660,19 @@ def _light_frames(
                 _check_marker(log, session.scene, live=source.live)
             if stop.code is not None:
                 return
+
+
+def _open_camera(options: argparse.Namespace, session: Session) -> Sink:
+    """The virtual camera, if one is asked for."""
+    from warp_ar.output.virtual_camera import VirtualCameraSink
+
+    if options.virtual_camera is None:
+        return NullSink()
+    source, size = session.source, session.pipeline.size
+    # A clip's frames are shown at its rate; a camera's come at theirs.
+    camera = VirtualCameraSink(options.virtual_camera or None, fps=source.fps, size=size, paced=not source.live)
+    say(f"frames go to {camera.description}")
+    return camera
 
 
 def _count(log: RunLog, sink: Sink, side: SideFiles) -> str:

@@ -24,6 +24,9 @@ _BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 
 Size = tuple[int, int]
 
+# OpenCV 5.0 leaves TIFFs of more than 8 bits undecoded, or their channels in the other order, where it is to give RGB.
+_TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
 
 def foreign_words(suffix: str, data: bytes = b"") -> str:
     """Why a photograph cannot be read, and what to do about it; empty if it is of none of the kinds known for that.
@@ -80,8 +83,13 @@ def decode_picture(data: bytes, flags: int, error: type[WarpArError], label: str
         WarpArError: As ``error``: it is empty, cut off, damaged, of another format or too large.
     """
     check_picture(data, error, label)
+    turns = bool(flags & cv2.IMREAD_COLOR_RGB) and data[:4] in _TIFF_STARTS
+    if turns:
+        flags = flags & ~cv2.IMREAD_COLOR_RGB | cv2.IMREAD_COLOR_BGR
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        if turns and picture is not None:
+            picture = np.ascontiguousarray(picture[..., ::-1])
     except (cv2.error, MemoryError) as problem:
         raise error(f"{label} cannot be decoded: {reason(problem)}") from problem
     if picture is None:

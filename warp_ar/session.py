@@ -16,6 +16,7 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball import BallFit, refine_balls
 from warp_ar.input.exposures import plan_bracket
+from warp_ar.input.plate import check_linear
 from warp_ar.input.sources import Frame, Source, open_source
 from warp_ar.light.captured import Light
 from warp_ar.scene import CapturedLight, Scene, SourceSpec, load_calibration, load_scene
@@ -149,7 +150,14 @@ class Session(Closing):
     def _open(self, target: Target, device: str) -> Pipeline:
         """A pipeline that can be changed; the one before is kept: results that were handed out may still be read."""
         self._target = target
-        self._switcher = PipelineSwitcher(device=device, keep=1, profile=False, synchronous=not self.source.live)
+        source = self.source
+        linear = source.deep != "" and not target.exposures
+        if source.deep == "light":
+            check_linear(str(target.scene.camera.transfer))
+        source.keeps_depth = linear
+        self._switcher = PipelineSwitcher(
+            device=device, keep=1, profile=False, synchronous=not source.live, linear=linear
+        )
         return self._switcher.open(target)
 
     def close(self) -> None:
@@ -212,14 +220,14 @@ class Session(Closing):
         kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
         if self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
-                yield frame, self.pipeline(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return
         # One frame ahead of what is handed out: the next is decoded and its marker found while this one is rendered,
         # and reading a picture does not hold up the next frame. A camera's frames are not held back.
         ready: list[tuple[Frame, Result]] = []
         try:
             for frame in self._frames():
-                result = self.pipeline.submit(frame.image, time_seconds=frame.time, exposure_time=frame.exposure_time)
+                result = self.pipeline.submit(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
                 ready.append((frame, result))
                 if len(ready) > 1:
                     yield ready.pop(0)

@@ -19,6 +19,7 @@ from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
 from warp_ar.input.drift import ExposureDrift
 from warp_ar.input.own_markers import Places
+from warp_ar.input.plate import Plate, decode_deep
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
 from warp_ar.kernels.structs import Probe
@@ -52,13 +53,22 @@ class SeenFrame:
     timings: dict[str, StageTiming]
     places: Places = dataclasses.field(default_factory=dict)
     """Where the markers are that something rides on."""
+    plate: Plate | None = None
+    """The frame at its full depth."""
 
 
 class FrameInputs:
     """Owns the inputs of stages and writes them before a frame is rendered; says which of them changed."""
 
     def __init__(
-        self, scene: Scene, camera: Camera, arrays: Arrays, device: Any, *, follows_gain: bool = False
+        self,
+        scene: Scene,
+        camera: Camera,
+        arrays: Arrays,
+        device: Any,
+        *,
+        follows_gain: bool = False,
+        linear: bool = False,
     ) -> None:
         """Allocate, and add to ``arrays`` what stages read.
 
@@ -68,6 +78,7 @@ class FrameInputs:
             arrays: Of the pipeline, empty.
             device: Warp device, the current one.
             follows_gain: Whether a drift of the camera's exposure and white balance is looked for.
+            linear: Whether some stage reads frames as linear radiance.
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
@@ -80,6 +91,8 @@ class FrameInputs:
         self.block.upload()
         self.frame = wp.zeros(shape, dtype=wp.vec3ub, device=device)
         """The picture that stages read."""
+        self._linear_frame = wp.zeros(shape if linear else (0, 0), dtype=wp.vec3, device=device)
+        self._linear_clip = wp.zeros(2, dtype=wp.vec3, device=device)
         self.transfers = None if device.is_cpu else Transfers(shape, device)
         self.decode = decode_table(camera.transfer)
         """Linear value of each code, (256, 3)."""
@@ -88,6 +101,7 @@ class FrameInputs:
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
         self._saturation_is_known = False
         self._encoded = 0.0, self.saturation.levels.copy()
+        self._bent = 0.0
         self._probes = scene.probes
         self.rects: dict[str, Rect] = dict.fromkeys(RECTS, (0, shape[0], 0, shape[1]))
         # Views of every field, (1, ...): NumPy takes longer to find a field than to write it.
@@ -103,7 +117,8 @@ class FrameInputs:
         """Name the arrays, those that stand for an input and those that all stages share."""
         add, params = self._arrays.add, self._params
         for name in INPUTS:
-            add(name, self.frame if name == "frame" else None)
+            add(name, {"frame": self.frame, "linear_frame": self._linear_frame}.get(name))
+        add("linear_clip", self._linear_clip)
         add("params", self.block.device_array("params"))
         add("light_array", self.block.device_array("lights"))
         add("ray_scene", self.host_scene.ray_scene)
@@ -213,6 +228,8 @@ class FrameInputs:
         self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
+        if self._take_plate(frame):
+            touched.append("linear_frame")
         for name in dict.fromkeys(touched):
             self._arrays.touch(name)
 
@@ -287,6 +304,25 @@ class FrameInputs:
         shines = self.host_scene.has_area_lights or bool(self.block.host("lights")["intensity"].any())
         falls = bool(self.host_scene.light_outline().polygons)
         return Reach(objects=objects, shines=shines, falls=falls, light=light, shadows=shadows, balls=balls)
+
+    def radiance(self, plate: Plate) -> npt.NDArray[np.float32]:
+        """A plate as linear radiance, by what frames have told of the camera's tone curve; an array of its own."""
+        contrast = 0.0 if self._drift is None else self._drift.contrast
+        if contrast == 0.0 or plate.picture.dtype != np.uint16:
+            return plate.radiance(str(self._camera.transfer))
+        if self._bent != contrast:
+            values, codes = camera_table(self._camera.transfer, contrast=contrast)[:256], np.arange(256) * 257.0
+            table = np.stack([np.interp(np.arange(65536.0), codes, values[:, c]) for c in range(3)], -1)
+            self._bent, self._bent_table = contrast, table.astype(np.float32)
+        return decode_deep(plate.picture, self._bent_table)
+
+    def _take_plate(self, frame: SeenFrame) -> bool:
+        """Send the frame's radiance to where stages read it; False if none does."""
+        if frame.plate is None or not self._linear_frame.size:
+            return False
+        self._linear_frame.assign(self.radiance(frame.plate))
+        self._linear_clip.assign(frame.plate.clip_levels(str(self._camera.transfer), self.saturation.levels))
+        return True
 
     def _take_picture(self, frame: SeenFrame) -> bool:
         """Copy the picture; False if it is the one that is there: then nothing that reads it needs to run."""

@@ -13,7 +13,7 @@ from warp_ar.stages.features import Features, find_features
 from warp_ar.stages.request import Request
 
 # What the pipeline itself provides for every frame.
-INPUTS = ("frame", "pose", "lights", "objects", "exposure", "clock", "short_frames", "captured_light")
+INPUTS = ("frame", "linear_frame", "pose", "lights", "objects", "exposure", "clock", "short_frames", "captured_light")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,9 +14,11 @@ import warp as wp
 from warp_ar.device import exclusive
 from warp_ar.errors import UsageError
 from warp_ar.stages.base import Arrays
-from warp_ar.stages.request import LAYERS, Request
+from warp_ar.stages.request import LAYERS, PICTURE_LAYERS, Request
 
-OUTPUTS = ("image", "environment", "pose")
+RADIANCE = "radiance"
+"""Asks for the five layers that the picture is composed of, so that ``Result.radiance`` is there."""
+OUTPUTS = ("image", "environment", "pose", RADIANCE)
 """What results hold beside layers."""
 
 _COMPONENTS = {"objects": 4, "coverage": 8, "motion": 2, "ids": 0, "depth": 0}
@@ -42,6 +44,20 @@ class LayerArrays:
     scale: Any = None
     """(1,) array of the exposure's scale; None: it is 1."""
 
+    def with_plate(self, radiance: npt.NDArray[np.float32], clip: npt.NDArray[np.float32]) -> LayerArrays:
+        """With the plate at its full depth; where that clips too, what was guessed of it stays.
+
+        Args:
+            radiance: (height, width, 3).
+            clip: From which on each channel clips, (3,).
+        """
+        if "plate" not in self.arrays:
+            return self
+        deep = radiance
+        if np.isfinite(clip).any():
+            deep = np.where(radiance >= clip, np.maximum(radiance, _copied(self.arrays["plate"])), radiance)
+        return dataclasses.replace(self, arrays={**self.arrays, "plate": deep})
+
     def to_host(self) -> LayerArrays:
         """Copies of one's own: float32 (height, width[, components]), ``ids`` int32."""
         scale = None if self.scale is None else _copied(self.scale)
@@ -53,6 +69,23 @@ def _copied(array: Any) -> npt.NDArray[Any]:
         return np.array(array)
     with exclusive(array.device):
         return np.array(array.numpy())
+
+
+def expand_outputs(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Outputs with the layers that ``radiance`` is composed of in its place."""
+    wanted = [name for output in outputs for name in (PICTURE_LAYERS if output == RADIANCE else (output,))]
+    return tuple(dict.fromkeys(wanted))
+
+
+def compose_layers(layers: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float32]:
+    """Linear radiance of the picture, (height, width, 3), of its five layers; scaled by the exposure it is encoded."""
+    physical = layers["plate"] * layers["shadow_ratio"] + layers["added_light"] + layers["mirror_ball"]
+    objects = layers["objects"]
+    # A plate in wide primaries may be negative where nothing is laid over it; there it stays as it is.
+    laid = (layers["shadow_ratio"] != 1.0) | (layers["added_light"] != 0.0) | (layers["mirror_ball"] != 0.0)
+    physical = np.where(laid, np.maximum(physical, 0.0), physical)
+    picture: npt.NDArray[np.float32] = (1.0 - objects[..., 3:]) * physical + objects[..., :3]
+    return picture
 
 
 def layer_arrays(request: Request, arrays: Arrays) -> LayerArrays:

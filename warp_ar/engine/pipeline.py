@@ -23,7 +23,7 @@ from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
-from warp_ar.engine.layers import LayerArrays, check_outputs, layer_arrays, neutral_layers
+from warp_ar.engine.layers import LayerArrays, check_outputs, expand_outputs, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
@@ -32,6 +32,7 @@ from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
 from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
+from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
@@ -115,6 +116,7 @@ class Pipeline(Closing):
         emitters: bool = False,
         follows_camera: bool | None = None,
         culling: bool = True,
+        linear: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -123,8 +125,9 @@ class Pipeline(Closing):
             device: ``auto``, ``cpu`` or ``cuda:N``.
             quality: A preset's name or a value of one's own.
             size: Width and height of the frames; None means the scene's. Another must scale the scene's camera exactly.
-            outputs: What results shall hold: ``image``, ``environment``, ``pose``, and layers by the names of
-                ``warp_ar.LAYERS``, such as ``depth``; what none of them needs does not run.
+            outputs: What results shall hold: ``image``, ``environment``, ``pose``, ``radiance`` (the picture before it
+                is encoded in 8 bits), and layers by the names of ``warp_ar.LAYERS``, such as ``depth``; what none of
+                them needs does not run.
             exposures: Exposure times in seconds between which the frames alternate. Frames of one are lit and shown;
                 the others tell what clips in it, and what is too dark.
             shown: Which: seconds; None means the longest.
@@ -137,6 +140,8 @@ class Pipeline(Closing):
                 from frames one after another; None: if the scene says that the camera meters by itself. Light that
                 dims on all surfaces alike is then taken for a drift.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
+            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. The mirror ball is
+                read, and the plate among the layers kept, at that depth; markers and surfaces are seen in 8 bits.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -146,6 +151,9 @@ class Pipeline(Closing):
         for exposure in exposures:
             _check_number("exposures", exposure, above=0.0)
         check_outputs(outputs)
+        outputs = expand_outputs(outputs)
+        if linear and exposures:
+            raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
         self._closed, self._process = False, os.getpid()
         self.device = resolve_device(device)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
@@ -156,7 +164,8 @@ class Pipeline(Closing):
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
-        self.plan = make_plan(Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters))
+        request = Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters, linear)
+        self.plan = make_plan(request)
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
         self._own_markers = OwnMarkers(self.scene, self.camera)
@@ -177,7 +186,14 @@ class Pipeline(Closing):
             if follows_camera is None:
                 follows_camera = scene.source is not None and scene.source.metering == "automatic"
             follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
-            self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows)
+            self.inputs = FrameInputs(
+                self.scene,
+                self.camera,
+                self._arrays,
+                self.device,
+                follows_gain=follows,
+                linear=self.plan.needs("linear_frame"),
+            )
             self._scheduler = Scheduler(
                 self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
             )
@@ -351,7 +367,8 @@ class Pipeline(Closing):
             image: uint8 RGB (height, width, 3) of NumPy or of whatever has ``__dlpack__`` or
                 ``__cuda_array_interface__`` (torch, JAX, CuPy), or a Warp array (height, width) of ``wp.vec3ub``. It
                 lies on the host or on the pipeline's device, where it is read without a copy to the host unless the
-                marker must be found; on a CUDA device it must stay as it is until it has been rendered.
+                marker must be found; on a CUDA device it must stay as it is until it has been rendered. A pipeline of
+                ``linear`` frames takes uint16 codes, linear floats and a `Plate` too.
             time_seconds: When the frame was taken; frames without a time are taken to come 30 times a second.
             pose: ``camera_from_world`` where it is known from elsewhere; the marker is then not looked for.
             exposure_time: Seconds; None means that of the frames that are shown.
@@ -389,14 +406,35 @@ class Pipeline(Closing):
             _check_number("exposure_time", exposure_time, above=0.0)
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
+        plate, image = self._take_depth(image)
         picture = adopt_frame(image, self.size, self.device)
-        result = self._light_frame(picture, time_seconds, pose, exposure_time, ahead=ahead)
+        result = self._light_frame(picture, time_seconds, pose, exposure_time, ahead=ahead, plate=plate)
         if picture is not image and isinstance(picture, wp.array):
             self._borrowed.keep(picture)
         return result
 
+    def _take_depth(self, image: Any) -> tuple[Plate | None, Any]:
+        """What of a frame is more than 8 bits, None where there is no such, and its 8-bit codes."""
+        if not self.plan.request.linear:
+            if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
+                raise UsageError(f"frame is {image.dtype}; expected uint8, or a pipeline made with linear=True")
+            return None, image
+        transfer = str(self.camera.transfer)
+        if isinstance(image, np.ndarray) and image.dtype == np.uint8:
+            return Plate(image.astype(np.uint16) * np.uint16(257)), image
+        plate = image if isinstance(image, Plate) else as_plate(np.asarray(image), self.size)
+        check_plate(plate.picture, self.size)
+        return plate, codes8(plate, transfer) if plate.codes is None else plate.codes
+
     def _light_frame(
-        self, image: Any, time_seconds: float | None, pose: Pose | None, exposure_time: float | None, *, ahead: bool
+        self,
+        image: Any,
+        time_seconds: float | None,
+        pose: Pose | None,
+        exposure_time: float | None,
+        *,
+        ahead: bool,
+        plate: Plate | None = None,
     ) -> Result:
         """Have a frame rendered whose arguments are in order."""
         host_image = image if isinstance(image, np.ndarray) else None
@@ -413,6 +451,7 @@ class Pipeline(Closing):
         if exposure != self.bracket.reference:
             return self._take_short(image, host_image, exposure, now, pose)
         frame, state = self._look(image if host_image is None else host_image, now, pose)
+        frame = dataclasses.replace(frame, plate=plate)
         if handed_over:
             return Result(frame.pose, state, self._hand_over(frame))
         rendered = self._render(self._send(frame))
@@ -511,6 +550,9 @@ class Pipeline(Closing):
         # A lost marker says nothing about where objects are: the frame passes as it came, the last light is kept.
         self._shown = frame.image if frame.lost or "image" not in self._arrays else self._arrays["image"]
         layers = self._layers_of(frame.image if frame.lost else None)
+        if layers is not None and frame.plate is not None:
+            clip = frame.plate.clip_levels(str(self.camera.transfer), self.inputs.saturation.levels)[0]
+            layers = layers.with_plate(self.inputs.radiance(frame.plate), clip)
         return Rendered(self._shown, self._light.environment, timings, (time.perf_counter() - start) * 1e3, layers)
 
     def _layers_of(self, unlit: Any = None) -> LayerArrays | None:

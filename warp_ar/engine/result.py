@@ -14,11 +14,13 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.device import exclusive
-from warp_ar.engine.layers import LayerArrays
+from warp_ar.engine.layers import LayerArrays, compose_layers
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Image, Picture
+from warp_ar.errors import UsageError
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Pose
+from warp_ar.stages.request import PICTURE_LAYERS
 
 TRACK = "track"
 """Name of the host's own stage in reports: the marker's pose."""
@@ -126,6 +128,19 @@ class Result:
         float32 (height, width[, components]); ``ids`` int32. Read them before the next call, as ``image``.
         """
         return self._host_layers.arrays
+
+    @functools.cached_property
+    def radiance(self) -> npt.NDArray[np.float32]:
+        """The lit frame as linear radiance, float32 RGB (height, width, 3), exposure and all, before it is encoded.
+
+        It is composed on the host of the layers, at the depth that the frame came with.
+
+        Raises:
+            UsageError: ``radiance`` is not among the outputs.
+        """
+        if missing := [name for name in PICTURE_LAYERS if name not in self.layers]:
+            raise UsageError(f'radiance needs outputs=("radiance",): {", ".join(missing)} were not asked for')
+        return np.asarray(np.float32(self.exposure_scale) * compose_layers(self.layers))
 
     @property
     def exposure_scale(self) -> float:

@@ -88,7 +88,7 @@ class VideoPart(VideoFile):
             except (av.FFmpegError, OSError) as error:
                 raise SourceError(f"{self._path}: frame {self._first} cannot be gone to: {reason(error)}") from error
             number = self._first
-            for image, stamp in self._pictures(container, start):
+            for image, stamp, _ in self._pictures(container, start):
                 expected = float(ticks[number] * tick)
                 if stamp is None or abs(stamp - expected) > 0.5 * tick:
                     raise SourceError(

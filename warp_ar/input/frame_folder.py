@@ -1,8 +1,10 @@
 """A folder of images as frames.
 
 Pictures of other kinds are brought to 8-bit RGB: grey is repeated, alpha is dropped without blending (a camera's colour
-does not depend on it), 16-bit values v become round(v / 257), so that 65535 is 255. An orientation that an image
-carries is applied. A folder whose frames alternate between exposures says so in its sidecar, ``exposures.json``.
+does not depend on it), 16-bit values v become round(v / 257), so that 65535 is 255. Linear light, of OpenEXRs and of
+TIFFs of floats, is encoded as sRGB, light above 1 as 1; primaries that an OpenEXR names become Rec. 709's. The plate of
+a frame is what it was before. An orientation that an image carries is applied. A folder whose frames alternate between
+exposures says so in its sidecar, ``exposures.json``.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import SourceError
+from warp_ar.exr_file import read_linear_exr
 from warp_ar.files import parse_json, read_text
+from warp_ar.input.plate import Plate, finite_light, srgb8
 from warp_ar.input.source import (
     DEFAULT_FPS,
     Frame,
@@ -35,7 +39,8 @@ from warp_ar.pictures import foreign_words, read_picture
 
 Image = npt.NDArray[np.uint8]
 
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp"})
+LINEAR_SUFFIX = ".exr"
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", LINEAR_SUFFIX})
 """What `FrameFolder` takes for a frame; other files in a folder are ignored."""
 
 SIDECAR = "exposures.json"
@@ -83,22 +88,51 @@ class FrameFolder(RecordedSource):
             self._cycle = self._cycle or told
         shown = [self._exposures[path.name] for path in self._paths if path.name in self._exposures]
         self.exposures = distinct(self._cycle or shown)
-        height, width, _ = read_image(self._paths[0]).shape
+        first, plate = read_frame(self._paths[0])
+        height, width, _ = first.shape
+        self.deep = "" if plate is None else "codes" if plate.picture.dtype == np.uint16 else "light"
         self.size, self.fps, self.length = (width, height), fps, len(self._paths)
         self.description = f"{path} ({self.length} images, {width}x{height})"
 
     def _decode(self) -> Generator[Frame, None, None]:
         for index, path in enumerate(self._paths):
-            image = read_image(path)
+            image, plate = read_frame(path)
             check_size(image, self.size, str(path), index)
-            yield Frame(index, index / self.fps, image, self._exposures.get(path.name))
+            kept = plate if self.keeps_depth else None
+            yield Frame(index, index / self.fps, image, self._exposures.get(path.name), kept)
 
 
 def read_image(path: pathlib.Path) -> Image:
     """8-bit RGB of an image file, as the module's docstring says."""
+    return read_frame(path)[0]
+
+
+def read_frame(path: pathlib.Path) -> tuple[Image, Plate | None]:
+    """8-bit RGB of an image file, as the module's docstring says, and the picture itself where it has more bits."""
     label = f"frame {path}"
-    picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
-    return rgb8(picture, label)
+    if path.suffix.lower() == LINEAR_SUFFIX:
+        light = finite_light(read_linear_exr(path, SourceError, label))
+    else:
+        picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH, SourceError, label)
+        if picture.dtype == np.uint8:
+            return rgb8(picture, label), None
+        if picture.dtype == np.uint16:
+            image = rgb8(picture, label)
+            return image, Plate(_three_channels(picture), codes=image)
+        if picture.dtype not in (np.float32, np.float64):
+            raise SourceError(f"{label} holds {picture.dtype} values; 8 or 16 bits, or floats, are needed")
+        light = finite_light(_three_channels(picture))
+    image = srgb8(light)
+    return image, Plate(light, codes=image)
+
+
+def _three_channels(picture: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(H, W, 3) from grey, RGB or RGBA."""
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    if picture.shape[2] == 1:
+        picture = np.repeat(picture, 3, axis=2)
+    return np.ascontiguousarray(picture[..., :3])
 
 
 def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
@@ -108,11 +142,7 @@ def rgb8(picture: npt.NDArray[Any], name: str) -> Image:
         picture = ((picture.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if picture.dtype != np.uint8:
         raise SourceError(f"{name} holds {picture.dtype} values; 8- or 16-bit whole numbers are needed")
-    if picture.ndim == 2:
-        picture = picture[..., None]
-    if picture.shape[2] == 1:
-        picture = np.repeat(picture, 3, axis=2)
-    return np.ascontiguousarray(picture[..., :3])
+    return _three_channels(picture)
 
 
 def _read_exposures(folder: pathlib.Path) -> dict[str, float] | tuple[float, ...]:

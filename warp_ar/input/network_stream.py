@@ -40,10 +40,15 @@ LONGEST_PAUSE = 2.0
 _PROTOCOLS = "rtsp,rtsps,rtp,srtp,udp,tcp,tls,http,https,httpproxy,crypto,rtmp,rtmps,srt"
 _OPTIONS = {
     "protocol_whitelist": _PROTOCOLS,
-    "rtsp_transport": "tcp",  # lost packets of UDP smear the picture that light is read from
     "fflags": "nobuffer",
     "flags": "low_delay",
     "max_delay": "200000",
+}
+_RTSP = {
+    # Lost packets of UDP smear the picture that light is read from; some cameras know no other way.
+    "rtsp_transport": "tcp+udp",
+    "rtsp_flags": "prefer_tcp",
+    "fpsprobesize": "3",  # the rate is in its description: half a second less until the first picture
 }
 # How long a stream is looked at before its first picture is there.
 _PROBING = {"probesize": "500000", "analyzeduration": "1000000"}
@@ -88,11 +93,12 @@ class NetworkStream(LiveSource):
         """Decode until told to stop, opening the line again as often as it breaks."""
         last, pause = time.monotonic(), FIRST_PAUSE
         while not self._stop.is_set():
-            came = False
+            came, heard = False, time.monotonic()
             try:
                 for image in self._pictures():
                     self._take(image)
                     came, last, pause = True, time.monotonic(), FIRST_PAUSE
+                    heard = last
                     if self._stop.is_set():
                         break
                 self._problem = "the stream ended"
@@ -100,7 +106,9 @@ class NetworkStream(LiveSource):
                 self._end(error)
                 return
             except (av.FFmpegError, OSError, ValueError) as error:
-                self._problem = reason(error)
+                # What FFmpeg calls a wait that was cut short depends on where it was.
+                silent = time.monotonic() - heard > 0.9 * OPEN_SECONDS
+                self._problem = f"no picture came for {OPEN_SECONDS:g} s" if silent else reason(error)
             if self._stop.is_set():
                 break
             first = not self._ready.is_set()
@@ -128,7 +136,10 @@ class NetworkStream(LiveSource):
     def _pictures(self) -> Any:
         """Pictures of one connection, as they come."""
         waits = (OPEN_SECONDS, OPEN_SECONDS)
-        with contextlib.closing(av.open(self._address, options={**_OPTIONS, **_PROBING}, timeout=waits)) as container:
+        rtsp = self._address.lower().startswith("rtsp")
+        with contextlib.closing(
+            av.open(self._address, options={**_OPTIONS, **_PROBING, **(_RTSP if rtsp else {})}, timeout=waits)
+        ) as container:
             if not container.streams.video:
                 raise SourceError(f"{self._name} has no video stream; choose one with pictures")
             stream = container.streams.video[0]
@@ -143,16 +154,22 @@ class NetworkStream(LiveSource):
             if rate > 0.0 and not self._told_fps:
                 self.fps = rate
             stream.thread_type = "SLICE"  # threads per frame hold back as many frames
-            reformatter = VideoReformatter()
-            for packet in container.demux(stream):
+            reformatter, last = VideoReformatter(), time.monotonic()
+            # Packets of sound too: where they alone come, nothing else would end the wait for a picture.
+            for packet in container.demux():
                 if self._stop.is_set():
                     return
+                if time.monotonic() - last > OPEN_SECONDS:
+                    raise TimeoutError
+                if packet.stream_index != stream.index:
+                    continue
                 try:
                     pictures = packet.decode()
                 except av.InvalidDataError:
                     continue  # a damaged packet: the next whole picture mends it
                 for picture in pictures:
                     yield rgb_from_video(reformatter, picture)
+                    last = time.monotonic()
 
     def close(self) -> None:
         """End the reader."""

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from warp_ar.closing import Closing
 from warp_ar.errors import SourceError, UsageError, reason
 from warp_ar.files import kind_of
+from warp_ar.input.plate import Plate
 
 Image = npt.NDArray[np.uint8]
 
@@ -50,6 +51,14 @@ class Frame:
     exposure_time: float | None = None
     """Exposure in seconds, None where the source does not tell."""
 
+    plate: Plate | None = None
+    """The picture at its full depth, where it has more than 8 bits and the source was told to keep them."""
+
+    @property
+    def deepest(self) -> Plate | Image:
+        """The picture at the depth that is known of it: what a pipeline of ``linear`` frames takes."""
+        return self.image if self.plate is None else self.plate
+
 
 class Source(Closing):
     """Where frames come from: a context manager, and iterable."""
@@ -68,6 +77,12 @@ class Source(Closing):
 
     description: str
     """One line for people."""
+
+    deep: str = ""
+    """Its pictures have more than 8 bits: ``codes`` of the camera, or linear ``light``; empty: they have not."""
+
+    keeps_depth: bool = False
+    """Whether frames come with their plates; to be set before they are read."""
 
     exposures: tuple[float, ...] = ()
     """All exposure times of its frames in seconds, longest first; empty where it does not tell."""

@@ -7,24 +7,24 @@ import contextlib
 import math
 import pathlib
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeAlias
 
 import av
 import numpy as np
 import numpy.typing as npt
-from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from av.video.reformatter import Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
+from warp_ar.input.deep_video import HD_HEIGHT, TO_RGB, depth_of, plate_from_video
+from warp_ar.input.plate import Plate, codes8
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
 Image = npt.NDArray[np.uint8]
-
-HD_HEIGHT = 720
-"""Rows from which a video that names no colour matrix is BT.709; below, BT.601: what players do, and encoders
-expect."""
+Taken: TypeAlias = tuple[Image, float | None, Plate | None]
+"""A picture, its time stamp in seconds, and its plate if that is kept."""
 
 # Containers of video alone: FFmpeg also draws text as a picture, and follows play lists to other files and machines.
 _FORMATS = (
@@ -33,18 +33,13 @@ _FORMATS = (
 )
 _OPTIONS = {"format_whitelist": _FORMATS, "protocol_whitelist": "file"}
 
-_HDR = {16: "PQ", 18: "HLG"}
-"""Transfer characteristics of HDR by their numbers in ITU-T H.273: their codes are no light that a camera table has."""
-
-# Nearest-neighbour chroma shifts coloured edges by up to a pixel, and truncated products darken by a level or two.
-_TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-
 
 class VideoFile(RecordedSource):
     """A video file, its first video stream, turned upright as its metadata says.
 
     Colour is converted with the stream's own matrix and range; one that names none is taken as BT.709 from 720 rows up,
-    else BT.601. Frame times are the file's own (a variable rate is kept), counted from the first frame.
+    else BT.601: what players do, and encoders expect. Frame times are the file's own (a variable rate is kept), counted
+    from the first frame.
 
     Args:
         path: The file.
@@ -82,12 +77,7 @@ class VideoFile(RecordedSource):
             self.fps = fps or rate
             self.length = int(stream.frames) or round(seconds * rate) or None
             codec = stream.codec_context.name
-            if (kind := _HDR.get(int(stream.codec_context.color_trc))) is not None:
-                raise SourceError(
-                    f"{self._path} is HDR video ({kind}), whose codes are no measure of light here: record without HDR "
-                    "(iPhone: Settings, Camera, Record Video, HDR Video off; Android: 10-bit HDR off), or convert it "
-                    "to SDR, BT.709"
-                )
+            self.deep = depth_of(stream.codec_context)
             first = next(self._pictures(container), None)
         if first is None:
             raise SourceError(f"{self._path}: frame 0 cannot be decoded: the video stream holds no picture")
@@ -127,7 +117,7 @@ class VideoFile(RecordedSource):
     def _decode(self) -> Generator[Frame, None, None]:
         with self._open() as container:
             first, previous = None, -math.inf
-            for index, (image, stamp) in enumerate(self._pictures(container)):
+            for index, (image, stamp, plate) in enumerate(self._pictures(container)):
                 check_size(image, self.size, str(self._path), index)
                 if self._retimed or stamp is None:
                     seconds = index / self.fps if self._retimed or index == 0 else previous + 1.0 / self.fps
@@ -136,10 +126,12 @@ class VideoFile(RecordedSource):
                     # Time never stands still or runs back, whatever a broken recorder wrote.
                     seconds = stamp - first if stamp - first > previous else previous + 1.0 / self.fps
                 previous = seconds
-                yield Frame(index, seconds, image)
+                yield Frame(index, seconds, image, plate=plate)
 
-    def _pictures(self, container: Any, first: int | None = None) -> Generator[tuple[Image, float | None], None, None]:
-        """Every picture with its time stamp in seconds; whatever precedes damage comes before the error.
+    def _pictures(self, container: Any, first: int | None = None) -> Generator[Taken, None, None]:
+        """Every picture with its time stamp in seconds, and its plate if that is kept.
+
+        Whatever precedes damage comes before the error.
 
         Args:
             container: Of the file.
@@ -150,9 +142,9 @@ class VideoFile(RecordedSource):
         if self._converters == 1:
             reformatter = VideoReformatter()
             for picture in pictures:
-                yield rgb_from_video(reformatter, picture), picture.time
+                yield self._taken(reformatter, picture)
         else:
-            yield from _convert_beside(pictures, self._converters)
+            yield from _convert_beside(pictures, self._converters, self._taken)
 
     def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
         """As ``_pictures``, each as its codec has it."""
@@ -189,17 +181,28 @@ class VideoFile(RecordedSource):
                     count += 1
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
 
+    def _taken(self, reformatter: VideoReformatter, picture: Any) -> Taken:
+        """8-bit RGB of a picture, its time stamp, and its plate if that is kept."""
+        if self.deep != "light":
+            plate = plate_from_video(reformatter, picture) if self.deep and self.keeps_depth else None
+            return rgb_from_video(reformatter, picture), picture.time, plate
+        plate = plate_from_video(reformatter, picture)
+        image = codes8(plate, "srgb") if plate.codes is None else plate.codes
+        return image, picture.time, plate if self.keeps_depth else None
 
-def _convert_beside(pictures: Iterator[Any], threads: int) -> Generator[tuple[Image, float | None], None, None]:
+
+def _convert_beside(
+    pictures: Iterator[Any], threads: int, take: Callable[[VideoReformatter, Any], Taken]
+) -> Generator[Taken, None, None]:
     """Pictures in RGB with their times, in order, converted while the next are decoded; errors keep their place."""
     own = threading.local()
 
-    def convert(picture: Any) -> tuple[Image, float | None]:
+    def convert(picture: Any) -> Taken:
         if not hasattr(own, "reformatter"):
             own.reformatter = VideoReformatter()
-        return rgb_from_video(own.reformatter, picture), picture.time
+        return take(own.reformatter, picture)
 
-    waiting: collections.deque[Future[tuple[Image, float | None]]] = collections.deque()
+    waiting: collections.deque[Future[Taken]] = collections.deque()
     damage: SourceError | None = None
     with ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-convert") as pool:
         try:
@@ -223,6 +226,6 @@ def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:
     matrix = None
     if picture.colorspace not in {int(known) for known in Colorspace}:
         matrix = Colorspace.ITU709 if picture.height >= HD_HEIGHT else Colorspace.ITU601
-    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=_TO_RGB, threads=1)
+    rgb = reformatter.reformat(picture, format="rgb24", src_colorspace=matrix, interpolation=TO_RGB, threads=1)
     # Both count the angle counterclockwise.
     return np.ascontiguousarray(np.rot90(rgb.to_ndarray(), round(picture.rotation / 90)))

@@ -25,7 +25,7 @@ import OpenEXR
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import is_file, limits, too_much, write_whole
-from warp_ar.light.captured import REC_709
+from warp_ar.output.color_spaces import COLOR_SPACES, convert_light, find_color_space
 from warp_ar.output.environment_axes import CUBES, DESCRIPTIONS, check_axes, from_axes, to_axes, to_cube
 from warp_ar.output.folder_sink import FolderSink
 from warp_ar.output.places import check_replaceable
@@ -97,6 +97,7 @@ def write_environment(
     layout: str = "latlong",
     size: int | None = None,
     info: EnvironmentInfo | None = None,
+    color_space: str = "rec709",
 ) -> None:
     """Write an environment as the ending of ``path`` says.
 
@@ -113,10 +114,11 @@ def write_environment(
         layout: ``latlong``, or ``cube``: six faces, one below the other.
         size: Texels along an edge of a cube; None means half the map's rows.
         info: What else is known; HDR holds nothing of it, JSON the white level.
+        color_space: One of ``COLOR_SPACES``; another than ``rec709`` only in OpenEXR.
 
     Raises:
         SinkError: The array is of another kind, or the file cannot be written or may not be replaced.
-        UsageError: The axes, the layout or the size cannot be used.
+        UsageError: The axes, the layout, the size or the colour space cannot be used.
     """
     path = pathlib.Path(path)
     info = EnvironmentInfo() if info is None else info
@@ -124,6 +126,9 @@ def write_environment(
     check_axes(axes, layout)
     check_replaceable(path, overwrite=overwrite)
     suffix = path.suffix.lower()
+    if color_space != "rec709" and suffix in (".hdr", ".json"):
+        raise UsageError(f"{path}: color space {color_space!r} is told in OpenEXR alone; name an .exr")
+    radiance = convert_light(radiance, "rec709", color_space)
     if suffix == ".json":
         from warp_ar.output.environment_harmonics import encode_harmonics  # loads Warp
 
@@ -136,7 +141,7 @@ def write_environment(
         if suffix == ".hdr":
             data = encode_hdr(picture, described)
         else:
-            image = OpenEXR.File(_header(axes, layout, info), {"RGB": np.ascontiguousarray(picture)})
+            image = OpenEXR.File(_header(axes, layout, info, color_space), {"RGB": np.ascontiguousarray(picture)})
             data = functools.partial(write_exr, image=image)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -145,14 +150,14 @@ def write_environment(
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
 
-def _header(axes: str, layout: str, info: EnvironmentInfo) -> dict[str, Any]:
+def _header(axes: str, layout: str, info: EnvironmentInfo, color_space: str) -> dict[str, Any]:
     """Attributes of an OpenEXR."""
     header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "software": PROGRAM,
         "axes": (DESCRIPTIONS if layout == "latlong" else CUBES)[axes],
-        "chromaticities": REC_709,
+        "chromaticities": COLOR_SPACES[color_space],
         "whiteLevel": float(info.white_level),
     }
     if layout == "cube":
@@ -196,6 +201,7 @@ def read_environment(path: str | pathlib.Path) -> npt.NDArray[np.float32]:
         radiance = np.stack([channels[name] for name in "RGB"], axis=-1)
     said = str(header.get("axes", ""))
     axes = next((axes for axes, text in DESCRIPTIONS.items() if text == said), "z-up")
+    radiance = convert_light(radiance, find_color_space(header.get("chromaticities")), "rec709")
     try:
         return from_axes(radiance, axes)
     except UsageError as error:

@@ -1,19 +1,27 @@
-"""Frames as numbered PNGs."""
+"""Frames as numbered PNGs of 8 or 16 bits, or as OpenEXRs of linear radiance."""
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from typing import Any
 
 import cv2
+import numpy as np
 import numpy.typing as npt
+import OpenEXR
 
 from warp_ar.errors import SinkError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import kind_of, write_whole
 from warp_ar.output.places import earlier_frames
-from warp_ar.output.sink import ThreadedSink, make_folder
+from warp_ar.output.sink import ThreadedSink, check_radiance, make_folder
 from warp_ar.output.video_sink import VIDEO_SUFFIXES
-from warp_ar.signature import sign_png
+from warp_ar.signals import REC_709
+from warp_ar.signature import PROGRAM, sign_png
+
+HALF_MAX = 65504.0
+"""Largest number of 16 bits."""
 
 FOLDER_THREADS = 2
 """Threads that compress the frames of a folder."""
@@ -78,7 +86,75 @@ class FolderSink(ThreadedSink):
         ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
         if not ok:
             raise SinkError(f"{path} cannot be encoded as PNG")
-        try:
-            write_whole(path, sign_png(data.tobytes()))
-        except OSError as error:
-            raise SinkError(f"{path} cannot be written: {reason(error)}") from error
+        _write(path, sign_png(data.tobytes()))
+
+
+class DeepPngSink(FolderSink):
+    """A folder of ``NNNN.png`` of 16 bits: linear radiance in the codes of the camera.
+
+    Args:
+        path: The folder.
+        overwrite: Whether numbered frames that this program did not write may go.
+        transfer: The camera's.
+
+    Raises:
+        SinkError: As for `FolderSink`.
+    """
+
+    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False, transfer: str = "srgb") -> None:
+        super().__init__(path, overwrite=overwrite)
+        self._transfer = transfer
+        self.description = f"{self._path} (numbered frames of 16 bits)"
+
+    def _check(self, image: Any) -> None:
+        check_radiance(image)
+
+    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+
+        path = self._path / f"{index:04d}.png"
+        codes = np.rint(65535.0 * encode_codes(self._transfer, image)).astype(np.uint16)
+        ok, data = cv2.imencode(".png", cv2.cvtColor(codes, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
+        if not ok:
+            raise SinkError(f"{path} cannot be encoded as PNG")
+        _write(path, sign_png(data.tobytes()))
+
+
+class RadianceSink(FolderSink):
+    """A folder of ``NNNN.exr``: linear radiance, channels R, G, B of 16-bit floats, Rec. 709's primaries.
+
+    Args:
+        path: The folder.
+        overwrite: Whether numbered frames that this program did not write may go.
+
+    Raises:
+        SinkError: As for `FolderSink`.
+    """
+
+    _suffix = ".exr"
+
+    def __init__(self, path: str | pathlib.Path, *, overwrite: bool = False) -> None:
+        super().__init__(path, overwrite=overwrite)
+        self.description = f"{self._path} (numbered OpenEXRs)"
+
+    def _check(self, image: Any) -> None:
+        check_radiance(image)
+
+    def _store(self, index: int, image: npt.NDArray[Any]) -> None:
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "software": PROGRAM,
+            "chromaticities": REC_709,
+        }
+        half = np.clip(image, -HALF_MAX, HALF_MAX).astype(np.float16)
+        channels = {name: np.ascontiguousarray(half[..., k]) for k, name in enumerate("RGB")}
+        path = self._path / f"{index:04d}.exr"
+        _write(path, functools.partial(write_exr, image=OpenEXR.File(header, channels)))
+
+
+def _write(path: pathlib.Path, data: Any) -> None:
+    try:
+        write_whole(path, data)
+    except (OSError, RuntimeError) as error:
+        raise SinkError(f"{path} cannot be written: {reason(error)}") from error

@@ -1,4 +1,4 @@
-"""A shot as binary glTF 2.0 (``.glb``), with the lights of KHR_lights_punctual.
+"""A shot as binary glTF 2.0 (``.glb``), with KHR_lights_punctual and EXT_lights_image_based.
 
 glTF is y-up: the node ``shot`` turns the marker's world, z up, and everything else stands below it as in the scene. A
 camera of glTF looks at its picture's middle and has square pixels but for its aspect; what it cannot say, and the
@@ -7,7 +7,8 @@ told as candela and lux of camera values: a white surface that faces a light of 
 I / (pi d^2).
 
 References:
-    Khronos Group, "glTF 2.0 Specification", KHR_lights_punctual, KHR_materials_specular.
+    Khronos Group, "glTF 2.0 Specification", KHR_lights_punctual, KHR_materials_specular,
+    EXT_lights_image_based.
 """
 
 from __future__ import annotations
@@ -106,6 +107,8 @@ class _Builder:
             self._add_body(body)
         for index, light in enumerate(shot.scene.lights):
             self._add_light(index, light)
+        if shot.radiance is not None:
+            self._add_environment(shot.radiance)
 
     def encode(self) -> bytes:
         """The file."""
@@ -237,9 +240,8 @@ class _Builder:
             "roughnessFactor": look.roughness,
         }
         if look.texture is not None and textured:
-            image = {"bufferView": self._view(encode_texture(look.texture)), "mimeType": "image/png"}
-            self._tree.setdefault("images", []).append(image)
-            self._tree.setdefault("textures", []).append({"source": len(self._tree["images"]) - 1})
+            image = self._add_image(encode_texture(look.texture))
+            self._tree.setdefault("textures", []).append({"source": image})
             surface["baseColorTexture"] = {"index": len(self._tree["textures"]) - 1}
         material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
         if look.specular is not None:
@@ -252,6 +254,18 @@ class _Builder:
             material["extensions"] = {"KHR_materials_specular": specular}
         self._tree.setdefault("materials", []).append(material)
         return len(self._tree["materials"]) - 1
+
+    def _add_image(self, png: bytes) -> int:
+        self._tree.setdefault("images", []).append({"bufferView": self._view(png), "mimeType": "image/png"})
+        return len(self._tree["images"]) - 1
+
+    def _add_environment(self, radiance: npt.NDArray[np.float32]) -> None:
+        from warp_ar.output.gltf_environment import EXTENSION, image_based_light  # here, for it loads Warp
+
+        self._use(EXTENSION)
+        lights = [image_based_light(radiance, self._add_image)]
+        self._tree.setdefault("extensions", {})[EXTENSION] = {"lights": lights}
+        self._tree["scenes"][0]["extensions"] = {EXTENSION: {"light": 0}}
 
     def _add_light(self, index: int, light: Light) -> None:
         self._use("KHR_lights_punctual")

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import OpenEXR
 
+from warp_ar.engine.layers import compose_layers
 from warp_ar.errors import SinkError, reason
 from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
@@ -77,14 +78,6 @@ class LayerFrame:
         return dataclasses.replace(self, frame=self.frame.copy())
 
 
-def compose_layers(layers: Layers) -> npt.NDArray[np.float32]:
-    """Linear radiance of the picture, (height, width, 3), of its five layers; scaled by the exposure it is encoded."""
-    physical = layers["plate"] * layers["shadow_ratio"] + layers["added_light"] + layers["mirror_ball"]
-    objects = layers["objects"]
-    picture: npt.NDArray[np.float32] = (1.0 - objects[..., 3:]) * np.maximum(physical, 0.0) + objects[..., :3]
-    return picture
-
-
 def write_layers(path: pathlib.Path, frame: LayerFrame) -> None:
     """Write the OpenEXR of one frame.
 
@@ -133,6 +126,9 @@ def _part(name: str, channels: dict[str, Any], frame: LayerFrame, more: Mapping[
     }
     if frame.camera_from_world is not None:
         header["cameraFromWorld"] = frame.camera_from_world.astype(np.float32)
+        # OpenEXR's own attribute maps rows, to a camera that looks along its -z with y up.
+        rows = (np.diag([1.0, -1.0, -1.0, 1.0]) @ frame.camera_from_world).T
+        header["worldToCamera"] = np.ascontiguousarray(rows, np.float32)  # it is written as it lies in memory
     if frame.camera_matrix is not None:
         header["cameraMatrix"] = frame.camera_matrix.astype(np.float32)
     return OpenEXR.Part(header, channels, name)

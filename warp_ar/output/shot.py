@@ -88,6 +88,8 @@ class Shot:
     """The frames, relative to the file's folder: a video, or a folder of pictures."""
     environment: Path | None = None
     """Latlong OpenEXR in the axes ``y-up``."""
+    radiance: npt.NDArray[np.float32] | None = None
+    """The same, (height, 2 height, 3), z-up, for files that hold it themselves."""
 
     @property
     def camera(self) -> Camera:

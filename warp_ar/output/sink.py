@@ -60,11 +60,12 @@ class Sink(Closing):
     """What is lost by its first frame, in words; empty where that is nothing."""
 
     @abstractmethod
-    def write(self, image: Image) -> None:
+    def write(self, image: npt.NDArray[Any]) -> None:
         """Take the next frame; the array may be reused at once.
 
         Args:
-            image: Encoded colour, uint8 RGB, (height, width, 3).
+            image: Encoded colour, uint8 RGB, (height, width, 3); linear radiance, float32, where the sink's coding has
+                more than 8 bits.
 
         Raises:
             SinkError: The image is of another size or kind than can be written, or an earlier frame could not be
@@ -190,7 +191,7 @@ class NullSink(Sink):
     def __init__(self) -> None:
         self.count = 0
 
-    def write(self, image: Image) -> None:
+    def write(self, image: npt.NDArray[Any]) -> None:
         """Count the frame."""
         check_image(image)
         self.count += 1
@@ -207,7 +208,7 @@ class TeeSink(Sink):
         self.description = " and ".join(sink.description for sink in sinks) or NullSink.description
         self.replaced = "; ".join(sink.replaced for sink in sinks if sink.replaced)
 
-    def write(self, image: Image) -> None:
+    def write(self, image: npt.NDArray[Any]) -> None:
         """Give the frame to every sink, in order."""
         for sink in self._sinks:
             sink.write(image)
@@ -223,6 +224,12 @@ def check_image(image: npt.NDArray[Any]) -> None:
     """Raise SinkError if an array is no frame."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
         raise SinkError(f"a frame is uint8 RGB (height, width, 3), not {image.dtype} {image.shape}")
+
+
+def check_radiance(image: npt.NDArray[Any]) -> None:
+    """Raise SinkError if an array is no frame of linear radiance."""
+    if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        raise SinkError(f"a frame of radiance is float32 RGB (height, width, 3), not {image.dtype} {image.shape}")
 
 
 def make_folder(path: pathlib.Path) -> None:

@@ -1,4 +1,4 @@
-"""Frames as H.264 video.
+"""Frames as video: H.264 in 8 bits, H.265 in 10 bits and HDR, or any other encoder of FFmpeg.
 
 A video is a whole file at any moment: it grows in fragments of half a second, so that a process that is killed leaves
 all but about its last second; `close` turns MP4 and MOV into the ordinary form that every player can seek in.
@@ -15,28 +15,42 @@ from typing import Any
 import av
 import av.filter
 import cv2
+import numpy as np
 import numpy.typing as npt
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, UsageError, reason
+from warp_ar.output.encoders import Encoding, find_encoding
 from warp_ar.output.places import check_replaceable
-from warp_ar.output.sink import ThreadedSink, make_folder
+from warp_ar.output.sink import ThreadedSink, check_image, check_radiance, make_folder
 from warp_ar.output.whole_fragments import WholeFragments
+from warp_ar.signals import REC_709, REC_2020, converted, hlg_of_light, pq_of_light
 from warp_ar.signature import PROGRAM
 
 _FORMATS = {".mp4": "mp4", ".mkv": "matroska", ".mov": "mov"}
 VIDEO_SUFFIXES = tuple(_FORMATS)
 """What `VideoSink` writes."""
 
-CRF = 18
-"""Quality of video: x264's constant rate factor at which a loss is hardly seen."""
-
 FRAGMENT_SECONDS = 0.5
 """Longest time between key frames, and so between the fragments that reach the disk."""
 
 
+_TAGS = {
+    "8bit": (Colorspace.ITU709, ColorPrimaries.BT709, ColorTrc.BT709),
+    "10bit": (Colorspace.ITU709, ColorPrimaries.BT709, ColorTrc.BT709),
+    "pq": (Colorspace.BT2020, ColorPrimaries.BT2020, ColorTrc.SMPTE2084),
+    "hlg": (Colorspace.BT2020, ColorPrimaries.BT2020, ColorTrc.ARIB_STD_B67),
+}
+"""Matrix, primaries and transfer that a stream is tagged with."""
+_FULL_CHROMA = "yuv444p10le"
+_WORDS = {"libx264": "H.264", "libx265": "H.265"}
+
+
 class VideoSink(ThreadedSink):
-    """H.264 in MP4, MOV or Matroska: yuv420p, BT.709, limited range, tagged as such.
+    """Video in MP4, MOV or Matroska: 4:2:0, limited range, tagged as what it is.
+
+    8-bit codes become BT.709. Frames of linear radiance, which the codings of 10 bits take, become the camera's codes
+    in BT.709, or HDR in BT.2020: reference white is 1, PQ's 203 cd/m² and 75 % of HLG's signal.
 
     Chroma at half resolution needs even sizes: an odd one is padded by repeating the last row or column, and the
     description says so. A file that exists is replaced when the first frames are on the disk; if none come, or none
@@ -47,20 +61,34 @@ class VideoSink(ThreadedSink):
         fps: Frames per second.
         size: (width, height) of the frames in pixels, if known.
         overwrite: Whether a file that this program did not write may be replaced.
+        encoding: How it is encoded; None: H.264 in 8 bits.
+        transfer: The camera's, by which 10-bit codes are encoded.
 
     Raises:
-        SinkError: The file cannot be written, may not be replaced, or has another ending.
+        SinkError: The file cannot be written, may not be replaced, or has another ending; the encoder does not work.
         UsageError: ``fps`` is not a positive number.
     """
 
     def __init__(
-        self, path: str | pathlib.Path, *, fps: float, size: tuple[int, int] | None = None, overwrite: bool = False
+        self,
+        path: str | pathlib.Path,
+        *,
+        fps: float,
+        size: tuple[int, int] | None = None,
+        overwrite: bool = False,
+        encoding: Encoding | None = None,
+        transfer: str = "srgb",
     ) -> None:
         self._path = pathlib.Path(path)
         if not (math.isfinite(fps) and fps > 0):
             raise UsageError(f"fps is {fps}; it must be a positive number of frames per second")
         if self._path.suffix.lower() not in VIDEO_SUFFIXES:
             raise SinkError(f"{self._path} must end in {', '.join(VIDEO_SUFFIXES)} to be a video")
+        self._encoding = find_encoding() if encoding is None else encoding
+        self._transfer = transfer
+        self._words = _WORDS.get(self._encoding.encoder, self._encoding.encoder)
+        if self._encoding.coding != "8bit":
+            self._words += f", {self._encoding.coding}"
         self.replaced = check_replaceable(self._path, overwrite=overwrite)
         make_folder(self._path.parent)
         self._fps = fps
@@ -70,7 +98,7 @@ class VideoSink(ThreadedSink):
         self._file: WholeFragments | None = None
         self._stream: Any = None
         self._converter: Any = None
-        self.description = f"{self._path} (H.264, {fps:g} fps)"
+        self.description = f"{self._path} ({self._words}, {fps:g} fps)"
         super().__init__(1)
         if size is not None:
             self._shape = (size[1], size[0], 3)
@@ -79,9 +107,15 @@ class VideoSink(ThreadedSink):
     def _describe(self) -> None:
         assert self._shape is not None
         height, width = self._shape[:2]
-        self.description = f"{self._path} (H.264, {width}x{height}, {self._fps:g} fps)"
+        self.description = f"{self._path} ({self._words}, {width}x{height}, {self._fps:g} fps)"
         if height % 2 or width % 2:
-            self.description += f", padded to {width + width % 2}x{height + height % 2}: H.264 needs even sizes"
+            self.description += f", padded to {width + width % 2}x{height + height % 2}: 4:2:0 needs even sizes"
+
+    def _check(self, image: Any) -> None:
+        if self._encoding.coding == "8bit":
+            check_image(image)
+        else:
+            check_radiance(image)
 
     def write(self, image: npt.NDArray[Any]) -> None:
         """Take the next frame; the first one settles the size."""
@@ -98,9 +132,11 @@ class VideoSink(ThreadedSink):
         options = {**fragments, "flush_packets": "1"}
         self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
         self._container.metadata["comment"] = PROGRAM
-        self._stream = add_h264(self._container, self._rate, width, height, {"g": str(group)})
+        self._stream = add_stream(self._container, self._rate, width, height, self._encoding, {"g": str(group)})
+        if movie and self._encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
+            self._stream.codec_context.codec_tag = "hvc1"  # Apple's players know no other
         self._container.start_encoding()
-        self._converter = rgb_to_yuv(width, height, 1 / self._rate)
+        self._converter = rgb_to_yuv(width, height, 1 / self._rate, self._encoding.coding, self._encoding.pixel_format)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
@@ -109,7 +145,10 @@ class VideoSink(ThreadedSink):
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            if self._encoding.coding == "8bit":
+                picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            else:
+                picture = yuv_picture(self._signal(image), self._encoding.coding)
             picture.pts, picture.time_base = index, 1 / self._rate
             self._converter.push(picture)
             picture = self._converter.pull()
@@ -118,6 +157,15 @@ class VideoSink(ThreadedSink):
         except (av.FFmpegError, OSError) as error:
             self._broken = True
             raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
+
+    def _signal(self, radiance: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """R'G'B' from 0 to 1 of linear radiance, as the coding means it."""
+        from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+
+        if self._encoding.coding == "10bit":
+            return np.asarray(encode_codes(self._transfer, radiance))
+        curve = pq_of_light if self._encoding.coding == "pq" else hlg_of_light
+        return curve(converted(radiance, REC_709, REC_2020))
 
     def _check_file(self) -> None:
         if self._file is not None and self._file.error is not None:
@@ -153,22 +201,30 @@ def _count_frames(path: pathlib.Path) -> int:
         return 0
 
 
-def add_h264(container: Any, rate: fractions.Fraction, width: int, height: int, options: Mapping[str, str]) -> Any:
-    """A stream of H.264 in a new container, of colours as they are commonly understood.
+def add_stream(
+    container: Any, rate: fractions.Fraction, width: int, height: int, encoding: Encoding, options: Mapping[str, str]
+) -> Any:
+    """A stream of video in a new container, tagged as what it is.
 
     Args:
         container: PyAV's.
         rate: Frames per second.
         width: Even.
         height: Even.
-        options: Of x264, besides speed and quality.
+        encoding: How it is encoded.
+        options: Of the encoder; those of ``encoding`` go before them.
     """
-    stream = container.add_stream("libx264", rate=rate, options={"preset": "veryfast", "crf": str(CRF), **options})
-    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream = container.add_stream(encoding.encoder, rate=rate, options={**options, **encoding.options})
+    stream.width, stream.height, stream.pix_fmt = width, height, encoding.pixel_format
     context = stream.codec_context
-    context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
-    context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+    context.color_range = ColorRange.MPEG
+    context.colorspace, context.color_primaries, context.color_trc = _TAGS[encoding.coding]
     return stream
+
+
+def add_h264(container: Any, rate: fractions.Fraction, width: int, height: int, options: Mapping[str, str]) -> Any:
+    """A stream of H.264 in a new container, of colours as they are commonly understood; as `add_stream`."""
+    return add_stream(container, rate, width, height, find_encoding(), options)
 
 
 def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -179,22 +235,45 @@ def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return image
 
 
-def rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:
-    """Filter from rgb24 to yuv420p as an H.264 stream means it unless it says otherwise.
+def rgb_to_yuv(
+    width: int, height: int, time_base: fractions.Fraction, coding: str = "8bit", pixel_format: str = "yuv420p"
+) -> Any:
+    """Filter from rgb24, or from Y'CbCr of 16 bits without subsampling, to what an encoder takes.
 
-    BT.709, limited range, and chroma sited at the left one of each pair of columns: the plain converter puts it between
-    the two, which players show shifted by half a pixel.
+    8-bit RGB becomes BT.709, limited range; that of more bits has its matrix already. Chroma is sited at the left one
+    of each pair of columns, as streams mean it unless they say otherwise: the plain converter puts it between the two,
+    which players show shifted by half a pixel.
     """
     graph = av.filter.Graph()
     graph.threads = 1
+    flags = "flags=bilinear+accurate_rnd+full_chroma_inp"
+    if coding == "8bit":
+        source, scale = "rgb24", f"out_color_matrix=bt709:out_range=tv:out_chroma_loc=left:{flags}"
+    else:
+        source, scale = _FULL_CHROMA, f"in_range=tv:out_range=tv:out_chroma_loc=left:{flags}"
     nodes = (
-        graph.add_buffer(width=width, height=height, format="rgb24", time_base=time_base),
-        graph.add(
-            "scale",
-            "out_color_matrix=bt709:out_range=tv:out_chroma_loc=left:flags=bilinear+accurate_rnd+full_chroma_inp",
-        ),
-        graph.add("format", "yuv420p"),
+        graph.add_buffer(width=width, height=height, format=source, time_base=time_base),
+        graph.add("scale", scale),
+        graph.add("format", pixel_format),
         graph.add("buffersink"),
     )
     graph.link_nodes(*nodes).configure()
     return graph
+
+
+def yuv_picture(signal: npt.NDArray[np.float64], coding: str) -> av.VideoFrame:
+    """Y'CbCr of 10 bits, limited range, without subsampling, of R'G'B' from 0 to 1, (height, width, 3).
+
+    BT.709 for ``10bit``, BT.2020 with non-constant luminance for HDR (BT.709-6 and BT.2020-2, tables of quantisation).
+    """
+    kr, kb = (0.2126, 0.0722) if coding == "10bit" else (0.2627, 0.0593)
+    red, green, blue = (signal[..., channel] for channel in range(3))
+    luma = kr * red + (1.0 - kr - kb) * green + kb * blue
+    cb, cr = 0.5 * (blue - luma) / (1.0 - kb), 0.5 * (red - luma) / (1.0 - kr)
+    values = (876.0 * luma + 64.0, 896.0 * cb + 512.0, 896.0 * cr + 512.0)
+    picture = av.VideoFrame(signal.shape[1], signal.shape[0], _FULL_CHROMA)
+    for plane, value in zip(picture.planes, values, strict=True):
+        rows = np.zeros((plane.height, plane.line_size // 2), np.uint16)
+        rows[:, : plane.width] = np.rint(np.clip(value, 4.0, 1019.0)).astype(np.uint16)
+        plane.update(rows.tobytes())
+    return picture

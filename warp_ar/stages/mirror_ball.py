@@ -59,7 +59,7 @@ def mirrored_relighting(features: Features) -> RelightConfig:
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
     """What objects and, if ``lit``, the receiver are lit by."""
-    reads = {"pose", "frame"}
+    reads = {"pose", "frame"} | ({"linear_frame"} if features.request.linear else set())
     if "virtual" in features.layers:
         reads |= {"objects", *distant_light_reads(features)}
         reads |= {"lights"} if shade_config(features).lights else set()
@@ -155,7 +155,9 @@ class MirrorBall(Stage):
             arrays["shadow_ratio"] if config.ratio else None,
         )
 
+        linear = arrays["linear_frame"] if "linear_frame" in reads else None
+
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], linear_frame=linear, rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]

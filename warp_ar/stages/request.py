@@ -62,6 +62,8 @@ class Request:
     """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
     emitters: bool = False
     """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
+    linear: bool = False
+    """Whether frames come as linear radiance too, of more than 8 bits."""
 
     @property
     def resources(self) -> tuple[str, ...]:

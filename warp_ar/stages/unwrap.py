@@ -56,7 +56,8 @@ class Unwrap(Stage):
         if not features.observed:
             return LeftOut(unobserved(features))
         texture = ("sphere_map",) if cls.method_for(features) == "sphere_map" else ()
-        return Wiring(("frame", "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
+        frame = "linear_frame" if features.request.linear and not texture else "frame"
+        return Wiring((frame, "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, and where its texels' corners are seen."""
@@ -80,6 +81,7 @@ class Unwrap(Stage):
         config = config.general() if shares_kernels(device) else config
         method = self.method
         height = self.request.quality.environment_height
+        linear = "linear_frame" in self.wiring.reads
 
         def project(rows: Rows | None) -> None:
             unwrap.project_corners(
@@ -94,8 +96,8 @@ class Unwrap(Stage):
 
         def gather(rows: Rows | None) -> None:
             unwrap.gather_probe(
-                arrays["frame"],
-                arrays["decode"],
+                arrays["linear_frame" if linear else "frame"],
+                arrays["linear_clip" if linear else "decode"],
                 arrays["probes"],
                 arrays["unwrap_corners"],
                 arrays["probe_radiance"],

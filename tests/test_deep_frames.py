@@ -1,0 +1,399 @@
+"""Frames of more than 8 bits: what sources read, what a pipeline makes of them, what sinks write.
+
+What is expected of a video is computed here from the numbers of its planes, by ITU-R's forms in float64.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import pathlib
+import shutil
+import subprocess
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+import warp_ar
+from warp_ar.errors import SinkError, SourceError, UsageError
+from warp_ar.input.plate import Plate, deep_table, srgb8
+from warp_ar.input.sources import open_source
+from warp_ar.kernels.color import decode_codes, encode_codes
+from warp_ar.output.encoders import describe_encoders, encoder_names, find_encoding, parse_options
+from warp_ar.output.sinks import open_sink
+from warp_ar.session import Session
+from warp_ar.signals import REC_709, REC_2020, hlg_of_light, light_of_hlg, light_of_pq, pq_of_light, rgb_from_rgb
+
+SIZE = (64, 48)
+STEP16 = 1.0 / 65535.0
+HALF_STEP16 = 0.51 * STEP16  # a signal is rounded to one of 65536 steps
+STEP10 = 1.0 / 876.0  # of luma in 10 bits of limited range
+HALF = 2.0**-11  # rounding to 16-bit floats, relative
+FLOAT32 = 2e-6  # of a matrix and a table in float32, relative to the largest part
+TAGS = {"sdr": (1, 1, 1), "pq": (9, 9, 16), "hlg": (9, 9, 18), "p3": (1, 12, 1)}
+LUMA = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
+
+
+def planes_of(bits: int) -> list[np.ndarray]:
+    """Y, Cb, Cr in limited range: a ramp of greys, and patches of colour."""
+    unit = 2 ** (bits - 8)
+    y, cb, cr = (np.full((SIZE[1], SIZE[0]), v * unit, np.uint16) for v in (16, 128, 128))
+    y[:24] = np.rint(np.linspace(16 * unit, 235 * unit, SIZE[0]))
+    for k, (a, b, c) in enumerate(((120, 100, 150), (60, 140, 120), (180, 120, 135), (90, 128, 160))):
+        at = (slice(24, 48), slice(16 * k, 16 * k + 16))
+        y[at], cb[at], cr[at] = a * unit + k, b * unit + 1, c * unit - 1
+    return [y, cb, cr]
+
+
+def write_yuv(path: pathlib.Path, planes: list[np.ndarray], bits: int, tags: tuple[int, int, int]) -> pathlib.Path:
+    """One picture without loss (FFV1, 4:4:4), tagged with matrix, primaries and transfer."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, f"yuv444p{bits}le"
+        context = stream.codec_context
+        context.colorspace, context.color_primaries, context.color_trc = tags
+        context.color_range = 1
+        picture = av.VideoFrame(*SIZE, stream.pix_fmt)
+        for plane, values in zip(picture.planes, planes, strict=True):
+            rows = np.zeros((plane.height, plane.line_size // 2), np.uint16)
+            rows[:, : SIZE[0]] = values
+            plane.update(rows.tobytes())
+        picture.colorspace, picture.color_primaries, picture.color_trc = tags
+        picture.color_range = 1
+        container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return path
+
+
+def signal_of(planes: list[np.ndarray], bits: int, matrix: int) -> np.ndarray:
+    """R'G'B' in float64 by BT.709-6 and BT.2020-2."""
+    unit, (kr, kb) = 2.0 ** (bits - 8), LUMA[matrix]
+    y = (planes[0].astype(float) - 16 * unit) / (219 * unit)
+    cb, cr = ((plane.astype(float) - 128 * unit) / (224 * unit) for plane in planes[1:])
+    red, blue = y + 2 * (1 - kr) * cr, y + 2 * (1 - kb) * cb
+    return np.clip(np.stack([red, (y - kr * red - kb * blue) / (1 - kr - kb), blue], -1), 0.0, 1.0)
+
+
+def read_one(path: pathlib.Path) -> Any:
+    with open_source(path) as source:
+        source.keeps_depth = True
+        return source.deep, next(iter(source))
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_a_standard_video_keeps_its_codes(tmp_path: pathlib.Path, bits: int) -> None:
+    planes = planes_of(bits)
+    deep, frame = read_one(write_yuv(tmp_path / "a.mkv", planes, bits, TAGS["sdr"]))
+    assert deep == "codes"
+    assert frame.plate.picture.dtype == np.uint16
+    expected = signal_of(planes, bits, 1)
+    np.testing.assert_allclose(frame.plate.picture * STEP16, expected, atol=HALF_STEP16 + FLOAT32)
+    # Neighbouring steps of the ramp stay apart, which 8 bits would not keep.
+    assert len(np.unique(frame.plate.picture[0, :, 1])) == SIZE[0]
+    assert np.abs(frame.image / 255.0 - expected).max() < 1.6 / 255.0
+
+
+@pytest.mark.parametrize(("kind", "curve"), [("pq", light_of_pq), ("hlg", light_of_hlg)])
+def test_hdr_video_becomes_light(tmp_path: pathlib.Path, kind: str, curve: Any) -> None:
+    planes = planes_of(10)
+    deep, frame = read_one(write_yuv(tmp_path / "a.mkv", planes, 10, TAGS[kind]))
+    assert deep == "light"
+    signal = signal_of(planes, 10, 9)
+    light = curve(signal) @ rgb_from_rgb(REC_2020, REC_709).T
+    # The table has 65536 steps of the signal: half a step on the curve, mixed by the matrix (largest row sum 2.3).
+    slope = 2.4 * (curve(np.minimum(signal + HALF_STEP16, 1.0)) - curve(np.maximum(signal - HALF_STEP16, 0.0)))
+    bound = slope.max(-1, keepdims=True) + 1e-5 * (1.0 + light.max(-1, keepdims=True))
+    assert (np.abs(frame.plate.picture - light) <= bound).all()
+    assert frame.plate.picture.max() > 3.0, "highlights are above reference white"
+    np.testing.assert_array_equal(frame.image, srgb8(frame.plate.picture))
+    assert math.isinf(frame.plate.clip) if kind == "pq" else 3.5 < frame.plate.clip < 3.8
+
+
+def test_wide_primaries_are_converted(tmp_path: pathlib.Path) -> None:
+    planes = planes_of(10)
+    deep, frame = read_one(write_yuv(tmp_path / "a.mkv", planes, 10, TAGS["p3"]))
+    assert deep == "light"
+    p3 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+    light = decode_codes("srgb", signal_of(planes, 10, 1).reshape(-1))[:, 0].reshape(SIZE[1], SIZE[0], 3)
+    np.testing.assert_allclose(frame.plate.picture, light @ rgb_from_rgb(p3, REC_709).T, atol=6e-5)
+
+
+def write_exr_picture(path: pathlib.Path, pixels: np.ndarray, **header: Any) -> None:
+    channels = {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate("RGB")}
+    kinds = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File({**kinds, **header}, channels).write(str(path))
+
+
+def light(seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.0, 4.0, (SIZE[1], SIZE[0], 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_openexr_is_light(tmp_path: pathlib.Path, kind: type) -> None:
+    pixels = light().astype(kind)
+    pixels[0, 0], pixels[0, 1], pixels[0, 2] = np.nan, np.inf, -0.5
+    for number in range(3):
+        write_exr_picture(tmp_path / f"{number}.exr", pixels)
+    with open_source(tmp_path) as source:
+        source.keeps_depth = True
+        assert (source.deep, source.length, source.size) == ("light", 3, SIZE)
+        for frame in source:
+            np.testing.assert_array_equal(frame.plate.picture[1:], pixels[1:].astype(np.float32))
+            np.testing.assert_array_equal(frame.plate.picture[0, :3, 0], np.float32([0.0, 65504.0, -0.5]))
+            np.testing.assert_array_equal(frame.image, srgb8(frame.plate.picture))
+    with open_source(tmp_path) as source:
+        assert next(iter(source)).plate is None, "nobody asked for it"
+
+
+def test_an_openexr_says_its_primaries_and_window(tmp_path: pathlib.Path) -> None:
+    pixels = light()
+    write_exr_picture(tmp_path / "a.exr", pixels, chromaticities=REC_2020)
+    _, frame = read_one(tmp_path / "a.exr")
+    np.testing.assert_allclose(frame.plate.picture, pixels @ rgb_from_rgb(REC_2020, REC_709).T, atol=4e-5)
+    # What lies beyond the display window is left away, what the file does not hold is black.
+    window = (np.array([-2, 5], np.int32), np.array([SIZE[0] - 3, SIZE[1] + 4], np.int32))
+    display = (np.array([0, 0], np.int32), np.array([SIZE[0] - 1, SIZE[1] - 1], np.int32))
+    write_exr_picture(tmp_path / "b.exr", pixels, dataWindow=window, displayWindow=display)
+    _, frame = read_one(tmp_path / "b.exr")
+    np.testing.assert_array_equal(frame.plate.picture[5:, : SIZE[0] - 2], pixels[: SIZE[1] - 5, 2:])
+    assert not frame.plate.picture[:5].any()
+    assert not frame.plate.picture[:, SIZE[0] - 2 :].any()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_pictures_of_16_bits_keep_their_codes(tmp_path: pathlib.Path, suffix: str) -> None:
+    codes = np.random.default_rng(2).integers(0, 65536, (SIZE[1], SIZE[0], 3), np.uint16)
+    (tmp_path / f"a{suffix}").write_bytes(cv2.imencode(suffix, codes[..., ::-1])[1].tobytes())
+    deep, frame = read_one(tmp_path / f"a{suffix}")
+    assert deep == "codes"
+    np.testing.assert_array_equal(frame.plate.picture, codes)
+
+
+def test_tiffs_of_floats_are_light(tmp_path: pathlib.Path) -> None:
+    pixels = light()
+    (tmp_path / "a.tif").write_bytes(cv2.imencode(".tif", pixels[..., ::-1])[1].tobytes())
+    deep, frame = read_one(tmp_path / "a.tif")
+    assert deep == "light"
+    np.testing.assert_array_equal(frame.plate.picture, pixels)
+
+
+def test_an_openexr_without_colour_is_refused(tmp_path: pathlib.Path) -> None:
+    part = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(part, {"Z": np.zeros((4, 4), np.float32)}).write(str(tmp_path / "a.exr"))
+    with pytest.raises(SourceError, match=r"a\.exr has channels Z; R, G and B, or Y, are needed"):
+        open_source(tmp_path / "a.exr")
+    (tmp_path / "b.exr").write_bytes(b"no picture")
+    with pytest.raises(SourceError, match=r"b\.exr cannot be read as OpenEXR"):
+        open_source(tmp_path / "b.exr")
+
+
+@pytest.mark.parametrize("transfer", ["srgb", "linear", "gamma:2.2"])
+def test_codes_of_any_depth_have_their_inverse(transfer: str) -> None:
+    codes = np.linspace(0.0, 1.0, 513)
+    np.testing.assert_allclose(encode_codes(transfer, decode_codes(transfer, codes)[:, 0]), codes, atol=1e-7)
+    np.testing.assert_array_equal(
+        deep_table(transfer)[::257], decode_codes(transfer, np.arange(256) / 255.0).astype(np.float32)
+    )
+
+
+def test_a_measured_response_is_read_between_its_codes(tmp_path: pathlib.Path) -> None:
+    values = (np.arange(256) / 255.0) ** 1.8
+    path = tmp_path / "response.txt"
+    path.write_text("\n".join(f"{v} {v} {v}" for v in values))
+    between = decode_codes(str(path), np.array([100.5 / 255.0]))[0]
+    np.testing.assert_allclose(between, 0.5 * (values[100] + values[101]), rtol=1e-12)
+    codes = np.linspace(0.0, 1.0, 99)
+    np.testing.assert_allclose(
+        encode_codes(str(path), decode_codes(str(path), codes)), codes[:, None] * np.ones(3), atol=1e-9
+    )
+
+
+@pytest.fixture(scope="module")
+def first() -> Any:
+    """The first frame of the bundled desk at a third of its size."""
+    with Session("desk", device="cpu") as session:
+        frame = next(iter(session.source)).image
+    return cv2.resize(frame, (160, 120), interpolation=cv2.INTER_AREA)
+
+
+OUTPUTS = ("image", "radiance", "environment")
+
+
+def lit(frame: Any, pose: Any = None, **more: Any) -> Any:
+    with warp_ar.Pipeline(
+        "desk", device="cpu", quality="medium", size=(160, 120), outputs=OUTPUTS, synchronous=True, **more
+    ) as pipeline:
+        result = pipeline(frame, pose=pose)
+        return result.image, result.radiance, result.environment, result.layers
+
+
+def test_8_bits_through_a_deep_pipeline_are_the_same_to_the_bit(first: np.ndarray) -> None:
+    plain, deep, wide = lit(first), lit(first, linear=True), lit(first.astype(np.uint16) * 257, linear=True)
+    for a, b, c in zip(plain[:3], deep[:3], wide[:3], strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+
+
+def test_light_above_white_lights_as_it_is(first: np.ndarray) -> None:
+    """Five times the light makes five times the environment, where 8 bits cut and guess all above white."""
+    radiance = decode_codes("srgb", first.reshape(-1) / 255.0)[:, 0].reshape(first.shape).astype(np.float32)
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
+        pose = pipeline(first).pose
+    assert pose is not None
+    _, _, once, _ = lit(radiance, linear=True, pose=pose)
+    _, picture, five, layers = lit(5.0 * radiance, linear=True, pose=pose)
+    _, _, cut, _ = lit(srgb8(5.0 * radiance), pose=pose)
+    # What the ball does not show is filled by what 8 bits show; it is less than half of the map.
+    assert np.median(five / np.maximum(once, 1e-6)) == pytest.approx(5.0, rel=0.01)
+    assert five.max() > 4.9 * once.max()
+    assert np.abs(cut - 5.0 * once).mean() > 2.0 * np.abs(five - 5.0 * once).mean()
+    laid = (layers["shadow_ratio"] != 1.0) | (layers["added_light"] != 0.0) | (layers["mirror_ball"] != 0.0)
+    untouched = (layers["objects"] == 0.0).all(-1) & ~laid.any(-1)
+    assert untouched.sum() > 1000
+    np.testing.assert_array_equal(picture[untouched], (5.0 * radiance)[untouched])
+
+
+def test_what_a_ball_shows_of_an_object_hides_light_above_white(first: np.ndarray) -> None:
+    """Where a virtual object stands before what the ball shows, none of the light behind it is left in the picture."""
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
+        pose = pipeline(first).pose
+    _, dim, _, few = lit(np.full((120, 160, 3), 0.25, np.float32), linear=True, pose=pose)
+    _, bright, _, many = lit(np.full((120, 160, 3), 4.0, np.float32), linear=True, pose=pose)
+    ball = (few["mirror_ball"] != 0.0).any(-1) & (few["objects"][..., 3] == 0.0)
+    assert ball.sum() > 20
+    # Radiance and all that it lights grow alike; were the plate taken for 1, three of its four parts would stay.
+    assert (np.abs(bright[ball]) < 16.5 * np.abs(dim[ball]) + 0.05).all()
+    assert many["mirror_ball"].min() < -1.5
+
+
+def test_what_no_deep_frame_is_gets_one_line(first: np.ndarray) -> None:
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120)) as pipeline:
+        with pytest.raises(UsageError, match="frame is float32; expected uint8, or a pipeline made with linear=True"):
+            pipeline(first.astype(np.float32))
+        with pytest.raises(UsageError, match=r'radiance needs outputs=\("radiance",\)'):
+            _ = pipeline(first).radiance
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), linear=True) as pipeline:
+        with pytest.raises(UsageError, match=r"frame is int64 \(120, 160, 3\); expected"):
+            pipeline(first.astype(np.int64))
+        with pytest.raises(UsageError, match=r"frame is float32 \(2, 2, 3\); expected"):
+            pipeline(Plate(np.zeros((2, 2, 3), np.float32)))
+    with pytest.raises(UsageError, match="linear frames of several exposures"):
+        warp_ar.Pipeline("desk", device="cpu", linear=True, exposures=(0.01, 0.001))
+
+
+def probe(path: pathlib.Path) -> dict[str, str]:
+    """What ffprobe says of the video stream, where it is there; else PyAV."""
+    if shutil.which("ffprobe"):
+        keys = "codec_name,pix_fmt,color_range,color_space,color_transfer,color_primaries"
+        command = ["ffprobe", "-v", "error", "-select_streams", "v", "-show_entries", f"stream={keys}", "-of", "json"]
+        said = subprocess.run([*command, str(path)], capture_output=True, check=True, timeout=60).stdout
+        return dict(json.loads(said)["streams"][0])
+    names = {1: "bt709", 9: "bt2020", 16: "smpte2084", 18: "arib-std-b67"}
+    with av.open(str(path)) as container:
+        context = container.streams.video[0].codec_context
+        space = "bt2020nc" if context.colorspace == 9 else names[context.colorspace]
+        return {
+            "codec_name": context.name,
+            "pix_fmt": context.pix_fmt,
+            "color_range": "tv" if context.color_range == 1 else "?",
+            "color_space": space,
+            "color_transfer": names[context.color_trc],
+            "color_primaries": names[context.color_primaries],
+        }
+
+
+def ramp() -> np.ndarray:
+    """Smooth linear light, some of it above white."""
+    grey = np.linspace(0.0, 1.0, SIZE[0], dtype=np.float32) ** 2.2
+    return np.repeat(np.tile(grey, (SIZE[1], 1))[..., None], 3, 2) * np.float32([1.0, 0.8, 0.6])
+
+
+@pytest.mark.parametrize(
+    ("coding", "transfer", "primaries", "peak", "signal"),
+    [
+        ("10bit", "bt709", "bt709", 1.0, lambda x: encode_codes("srgb", x)),
+        ("pq", "smpte2084", "bt2020", 20.0, pq_of_light),
+        ("hlg", "arib-std-b67", "bt2020", 3.7, hlg_of_light),
+    ],
+)
+def test_video_of_10_bits_comes_back(
+    tmp_path: pathlib.Path, coding: str, transfer: str, primaries: str, peak: float, signal: Any
+) -> None:
+    path, picture = tmp_path / "a.mp4", peak * ramp()
+    with open_sink(path, fps=25, coding=coding, encoder_options={"crf": "1"}) as sink:
+        for _ in range(3):
+            sink.write(picture)
+    said = probe(path)
+    assert (said["codec_name"], said["pix_fmt"], said["color_range"]) == ("hevc", "yuv420p10le", "tv")
+    assert (said["color_transfer"], said["color_primaries"]) == (transfer, primaries)
+    _, frame = read_one(path)
+    got = frame.plate.radiance("srgb")
+    # In the signal, whose steps the coding is uniform in: two of 10 bits in the mean, more where chroma is halved.
+    wide = REC_709 if coding == "10bit" else REC_2020
+    into = rgb_from_rgb(REC_709, wide).T
+    errors = np.abs(signal(np.maximum(got @ into, 0.0)) - signal(picture @ into))
+    assert errors.mean() < 2.0 * STEP10
+    assert np.median(errors) < 1.5 * STEP10
+    with (
+        pytest.raises(SinkError, match="a frame of radiance is float32 RGB"),
+        open_sink(path, fps=25, coding=coding) as sink,
+    ):
+        sink.write(np.zeros((48, 64, 3), np.uint8))
+
+
+def test_folders_of_16_bits_and_openexr_come_back(tmp_path: pathlib.Path) -> None:
+    picture = ramp()
+    with open_sink(tmp_path / "png", fps=25, coding="16bit") as sink:
+        sink.write(picture)
+    with open_sink(tmp_path / "exr", fps=25, coding="exr") as sink:
+        sink.write(8.0 * picture - 0.25)
+    _, frame = read_one(tmp_path / "png" / "0000.png")
+    np.testing.assert_allclose(
+        encode_codes("srgb", frame.plate.radiance("srgb")), encode_codes("srgb", picture), atol=HALF_STEP16 + 1e-7
+    )
+    _, frame = read_one(tmp_path / "exr" / "0000.exr")
+    np.testing.assert_allclose(frame.plate.picture, 8.0 * picture - 0.25, rtol=HALF, atol=1e-7)
+
+
+def test_wrong_codings_and_encoders_get_one_line(tmp_path: pathlib.Path) -> None:
+    for path, more, line in (
+        ("a.mp4", {"coding": "16bit"}, r"coding '16bit': .*a\.mp4 is a video, which holds 8bit, 10bit, pq, hlg"),
+        ("a", {"coding": "pq"}, r"coding 'pq': .*a is a folder, which holds 8bit, 16bit, exr"),
+        ("a", {"coding": "9bit"}, r"coding '9bit': expected 8bit, 10bit"),
+        ("a", {"encoder": "libx264"}, r"encoder libx264: .* is a folder; name a video"),
+        ("a.mp4", {"encoder": "libx265x"}, r"there is no encoder 'libx265x'; did you mean libx265\?"),
+        ("a.mp4", {"encoder": "aac"}, r"aac encodes audio; choose an encoder of video"),
+        ("a.mp4", {"encoder": "mpeg4", "coding": "10bit"}, r"mpeg4 takes no pictures of 10 bits, only yuv420p"),
+        ("a.mp4", {"encoder_options": {"crff": "1"}}, r"--encoder-option crff: libx264 has no such option"),
+        ("a.mp4", {"encoder_options": {"crf": "many"}}, r"libx264 does not work here \(.+\); choose another"),
+    ):
+        with pytest.raises((UsageError, SinkError), match=line):
+            open_sink(tmp_path / path, fps=25, **more)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UsageError, match=r"--encoder-option 'crf': expected KEY=VALUE"):
+        parse_options(["crf"])
+    assert parse_options(["crf=3", "x265-params=a=1:b=2"]) == {"crf": "3", "x265-params": "a=1:b=2"}
+
+
+def test_options_reach_the_encoder(tmp_path: pathlib.Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
+    sizes = []
+    for crf in ("10", "45"):
+        path = tmp_path / f"{crf}.mkv"
+        with open_sink(path, fps=25, encoder="libx264", encoder_options={"crf": crf}) as sink:
+            for _ in range(4):
+                sink.write(noise)
+        sizes.append(path.stat().st_size)
+    assert sizes[0] > 2 * sizes[1]
+
+
+def test_encoders_are_listed() -> None:
+    lines = describe_encoders()
+    assert any(line.startswith("libx265") and "8 and 10 bits" in line for line in lines)
+    assert {line.split()[0] for line in lines} <= set(encoder_names())
+    assert find_encoding("10bit").pixel_format == "yuv420p10le"
+    assert find_encoding("10bit", "prores_ks").pixel_format == "yuv422p10le"

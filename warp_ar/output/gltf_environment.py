@@ -1,0 +1,105 @@
+"""An environment within a glTF: EXT_lights_image_based, which Babylon.js and others read.
+
+Six faces of a cube for each of a few roughnesses, evenly from 0 to 1, and nine harmonics of irradiance. A face's PNG
+is RGBD: radiance is (R, G, B)^2.2 / D, all four from 0 to 1, as Babylon.js decodes it; the extension names no transfer.
+Its faces are OpenGL's, mirrored left to right, as the extension asks. Harmonics have the signs that Babylon.js takes
+off, those of Condon and Shortley: minus in y, x, yz and xz.
+
+Radiance of roughness r in direction n, seen along n, is the mean over directions l, weighted by D(h) (n . l) with GGX
+of alpha = r^2 and h between n and l: the half vector's density D(h) (n . h) turns into D(h) / 4 over l, for n is also
+the direction of view ([Kar13]).
+
+References:
+    Khronos Group, EXT_lights_image_based. [Kar13] Karis 2013, Real Shading in Unreal Engine 4.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from warp_ar.kernels.irradiance import cosine_lobe
+from warp_ar.light.captured import latlong_directions, texel_solid_angles
+from warp_ar.output.environment_axes import cube_directions, to_cube, world_from_marker
+from warp_ar.output.environment_harmonics import project_radiance
+
+Array = npt.NDArray[np.float64]
+
+EXTENSION: Final = "EXT_lights_image_based"
+LARGEST: Final = 64
+"""Texels along an edge of the sharpest cube."""
+SMALLEST: Final = 16
+"""Of the roughest."""
+GAMMA: Final = 2.2
+
+_FILTERED_ROWS = 32
+"""Rows of the map that rough cubes are filtered from."""
+_DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)
+_SIGNS = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+
+
+def irradiance_coefficients(radiance: npt.NDArray[np.float32]) -> Array:
+    """Harmonics of irradiance in glTF's world, y up, (9, 3)."""
+    lobe = np.array([cosine_lobe(degree) for degree in _DEGREES])
+    return np.asarray(project_radiance(radiance, "y-up") * (lobe * _SIGNS)[:, None])
+
+
+def specular_cubes(radiance: npt.NDArray[np.float32]) -> list[npt.NDArray[np.float32]]:
+    """Radiance by roughness: cubes (6, size, size, 3), from ``LARGEST`` to ``SMALLEST``, roughness 0 to 1.
+
+    Args:
+        radiance: Latlong (height, 2 height, 3), z-up.
+    """
+    levels = round(math.log2(LARGEST / SMALLEST)) + 1
+    sharp = to_cube(radiance, "opengl", LARGEST).reshape(6, LARGEST, LARGEST, 3)
+    rough = [_filtered(radiance, LARGEST >> k, (k / (levels - 1)) ** 2) for k in range(1, levels)]
+    return [np.ascontiguousarray(cube[:, :, ::-1]) for cube in (sharp, *rough)]
+
+
+def _filtered(radiance: npt.NDArray[np.float32], size: int, alpha: float) -> npt.NDArray[np.float32]:
+    """A cube of OpenGL's faces as GGX of ``alpha`` sees the environment."""
+    rows = min(_FILTERED_ROWS, len(radiance))
+    source = cv2.resize(radiance, (2 * rows, rows), interpolation=cv2.INTER_AREA).reshape(-1, 3).astype(np.float64)
+    toward = latlong_directions(rows).reshape(-1, 3)
+    area = np.broadcast_to(texel_solid_angles(rows), (rows, 2 * rows)).reshape(-1)
+    normals = cube_directions("opengl", size).reshape(-1, 3) @ world_from_marker("opengl")
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    faces = np.empty((len(normals), 3))
+    for start in range(0, len(normals), 1024):  # a few megabytes of weights at once
+        part = slice(start, start + 1024)
+        cos_theta = np.clip(normals[part] @ toward.T, 0.0, 1.0)
+        cos_half = 0.5 * (1.0 + cos_theta)  # its square: h halves the angle between n and l
+        weights = area * cos_theta / (1.0 + (alpha * alpha - 1.0) * cos_half) ** 2
+        faces[part] = weights @ source / weights.sum(1, keepdims=True)
+    return faces.reshape(6, size, size, 3).astype(np.float32)
+
+
+def encode_rgbd(radiance: npt.NDArray[np.float32]) -> bytes:
+    """PNG of a face, (size, size, 3), as RGBD."""
+    most = np.maximum(radiance.max(-1, keepdims=True), 1e-6)
+    divisor = np.clip(np.floor(255.0 / np.maximum(most, 1.0)), 1.0, 255.0) / 255.0
+    color = np.clip(radiance * divisor, 0.0, 1.0) ** (1.0 / GAMMA)
+    codes = np.rint(255.0 * np.concatenate([color[..., ::-1], divisor], -1)).astype(np.uint8)
+    done, data = cv2.imencode(".png", codes)
+    assert done
+    return bytes(data)
+
+
+def image_based_light(radiance: npt.NDArray[np.float32], add_image: Any) -> dict[str, Any]:
+    """The extension's entry of one light.
+
+    Args:
+        radiance: Latlong (height, 2 height, 3), z-up.
+        add_image: Takes a PNG, gives its index among the file's images.
+    """
+    return {
+        "name": "environment",
+        "intensity": 1.0,
+        "irradianceCoefficients": irradiance_coefficients(radiance).tolist(),
+        "specularImageSize": LARGEST,
+        "specularImages": [[add_image(encode_rgbd(face)) for face in cube] for cube in specular_cubes(radiance)],
+    }

@@ -1,0 +1,111 @@
+"""What the numbers of a video's signal mean as light: transfer functions of HDR, and primaries.
+
+All functions here are closed forms in float64. Light is relative to reference white, which is 1: the signal level of
+diffuse white that HDR programmes are graded by. Of HLG it is 75 % of the signal, taken back to the light of the scene
+by the inverse of the camera's curve; of PQ, which says what a display shows, it is 203 cd/m².
+
+References:
+    ITU-R BT.2100-2, tables 4 (PQ) and 5 (HLG). ITU-R BT.2408-7, table 1 (reference white). ITU-R BT.709-6, BT.2020-2,
+    SMPTE EG 432-1 (primaries); SMPTE RP 177 (matrices of primaries).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Chromaticities = tuple[float, float, float, float, float, float, float, float]
+
+REC_709: Final[Chromaticities] = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""x and y of red, green, blue and white."""
+REC_2020: Final[Chromaticities] = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+P3_D65: Final[Chromaticities] = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+
+PQ_PEAK: Final = 10000.0
+"""cd/m² of the largest PQ signal."""
+PQ_WHITE: Final = 203.0
+"""cd/m² of reference white."""
+HLG_WHITE_SIGNAL: Final = 0.75
+"""HLG signal of reference white."""
+
+_M1, _M2 = 2610.0 / 16384.0, 2523.0 / 4096.0 * 128.0
+_C1, _C2, _C3 = 3424.0 / 4096.0, 2413.0 / 4096.0 * 32.0, 2392.0 / 4096.0 * 32.0
+_A, _B, _C = 0.17883277, 0.28466892, 0.55991073
+
+
+def light_of_pq(signal: npt.ArrayLike) -> Array:
+    """Light of a PQ signal from 0 to 1, over reference white (BT.2100's EOTF over 203 cd/m²)."""
+    root = np.clip(np.asarray(signal, np.float64), 0.0, 1.0) ** (1.0 / _M2)
+    share = np.maximum(root - _C1, 0.0) / (_C2 - _C3 * root)
+    return np.asarray(PQ_PEAK / PQ_WHITE * share ** (1.0 / _M1))
+
+
+def pq_of_light(light: npt.ArrayLike) -> Array:
+    """PQ signal of light over reference white; the inverse of `light_of_pq`."""
+    power = np.clip(np.asarray(light, np.float64) * (PQ_WHITE / PQ_PEAK), 0.0, 1.0) ** _M1
+    return np.asarray(((_C1 + _C2 * power) / (1.0 + _C3 * power)) ** _M2)
+
+
+def _scene_of_hlg(signal: npt.ArrayLike) -> Array:
+    """The scene's light from 0 to 1 of an HLG signal from 0 to 1: the inverse of BT.2100's OETF."""
+    s = np.clip(np.asarray(signal, np.float64), 0.0, 1.0)
+    return np.where(s <= 0.5, s * s / 3.0, (np.exp((np.maximum(s, 0.5) - _C) / _A) + _B) / 12.0)
+
+
+HLG_WHITE: Final = float(_scene_of_hlg(HLG_WHITE_SIGNAL))
+"""The scene's light, of 1 at the largest signal, that HLG's reference white stands for: 0.265."""
+
+
+def light_of_hlg(signal: npt.ArrayLike) -> Array:
+    """The scene's light of an HLG signal from 0 to 1, over reference white."""
+    return _scene_of_hlg(signal) / HLG_WHITE
+
+
+def hlg_of_light(light: npt.ArrayLike) -> Array:
+    """HLG signal of the scene's light over reference white; the inverse of `light_of_hlg`."""
+    e = np.clip(np.asarray(light, np.float64) * HLG_WHITE, 0.0, 1.0)
+    above = _A * np.log(np.maximum(12.0 * e - _B, 1e-12)) + _C
+    return np.where(e <= 1.0 / 12.0, np.sqrt(3.0 * e), above)
+
+
+def light_of_srgb(signal: npt.ArrayLike) -> Array:
+    """Linear value of an sRGB signal (IEC 61966-2-1)."""
+    s = np.maximum(np.asarray(signal, np.float64), 0.0)
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_of_light(light: npt.ArrayLike) -> Array:
+    """SRGB signal from 0 to 1 of a linear value; below and above are cut."""
+    x = np.clip(np.asarray(light, np.float64), 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
+
+
+def xyz_from_rgb(chromaticities: Chromaticities) -> Array:
+    """Matrix from linear RGB to CIE XYZ whose white has Y = 1 (RP 177)."""
+    x, y = np.asarray(chromaticities, np.float64).reshape(4, 2).T
+    xyz = np.stack([x / y, np.ones(4), (1.0 - x - y) / y])
+    return np.asarray(xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3]))
+
+
+def rgb_from_rgb(source: Chromaticities, target: Chromaticities) -> Array:
+    """Matrix from linear RGB of one set of primaries to another; white stays white.
+
+    Args:
+        source: Of what is converted.
+        target: Of the result. Its white is the source's: no adaptation is made where they differ.
+
+    Returns:
+        (3, 3), to be multiplied with columns.
+    """
+    return np.asarray(np.linalg.solve(xyz_from_rgb(target), xyz_from_rgb(source)))
+
+
+def converted(picture: npt.NDArray[Any], source: Chromaticities, target: Chromaticities) -> npt.NDArray[np.float32]:
+    """A linear picture, (..., 3), in other primaries, float32; colours outside them have negative parts."""
+    if np.allclose(source, target, atol=5e-4):
+        return np.ascontiguousarray(picture, np.float32)
+    matrix = rgb_from_rgb(source, target).astype(np.float32)
+    return np.ascontiguousarray(picture @ matrix.T, np.float32)
