@@ -23,6 +23,7 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.launch import Rows
+from warp_ar.kernels.path_guides import make_guides
 from warp_ar.kernels.path_sampling import make_sky
 from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.light.captured import Light
@@ -161,6 +162,7 @@ class PathTracer:
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
         local.probes = wp.array(balls, dtype=structs.Probe, device=device)
         local.sky = make_sky(radiance, device, emitters)
+        local.guides = make_guides(objects, local.rays.materials.numpy(), balls, device)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
         integrate_dfg(local.dfg)
         rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
