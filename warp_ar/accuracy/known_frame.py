@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.path_tracer import Image, PathTracer
+from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input.sources import Source, open_source
@@ -36,10 +36,25 @@ class KnownFrame:
     milliseconds: float
     """That its stages took."""
 
-    def tracer(self, *, device: str = "auto", size: tuple[int, int] | None = None, seed: int = 0) -> PathTracer:
+    def tracer(
+        self,
+        *,
+        device: str = "auto",
+        size: tuple[int, int] | None = None,
+        seed: int = 0,
+        light_samples: int = LIGHT_SAMPLES,
+    ) -> PathTracer:
         """A path tracer of this frame; arguments as those of ``PathTracer``."""
         return PathTracer(
-            self.scene, self.light, self.image, self.pose, device=device, size=size, seconds=self.seconds, seed=seed
+            self.scene,
+            self.light,
+            self.image,
+            self.pose,
+            device=device,
+            size=size,
+            seconds=self.seconds,
+            seed=seed,
+            light_samples=light_samples,
         )
 
 

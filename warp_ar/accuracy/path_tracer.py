@@ -101,6 +101,7 @@ class PathTracer:
         seconds: float = 0.0,
         seed: int = 0,
         reflectances: tuple[tuple[float, float, float], ...] | None = None,
+        light_samples: int = LIGHT_SAMPLES,
     ) -> None:
         """Put everything on the device.
 
@@ -117,6 +118,7 @@ class PathTracer:
             seconds: Since the first frame: where what is animated stands.
             seed: Of the random numbers, 0 or more.
             reflectances: RGB of each proxy, without a frame; 0.5 where left out.
+            light_samples: Per pixel, by which the reflectance of proxies is found; more than FIRST_LIGHT_SAMPLES.
 
         Raises:
             UsageError: The frame, the light, the seed or the reflectances do not fit.
@@ -128,7 +130,10 @@ class PathTracer:
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.device = resolve_device(device)
         self.seed, self.samples = seed, 0
+        self.light_samples = light_samples
         self._seconds = 0.0
+        self._parts: Iterator[bool] | None = None
+        self._compiled = False
         self._prepared = frame is None
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._trace = trace_config(scene)
@@ -219,11 +224,15 @@ class PathTracer:
         with translating(self.device), wp.ScopedDevice(self.device):
             path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
         done = 0
-        for count in (FIRST_LIGHT_SAMPLES, LIGHT_SAMPLES - FIRST_LIGHT_SAMPLES):
+        for count in self._light_counts():
             self._add(path_tracer.IRRADIANCE, 0, count, done)
             done += count
             with translating(self.device), wp.ScopedDevice(self.device):
                 self._map_reflectance()
+
+    def _light_counts(self) -> tuple[int, int]:
+        """Samples of the two rounds in which reflectance is found."""
+        return FIRST_LIGHT_SAMPLES, self.light_samples - FIRST_LIGHT_SAMPLES
 
     def _map_reflectance(self) -> None:
         """Reflectance by the light that the moments hold, which then begin anew."""
@@ -247,11 +256,76 @@ class PathTracer:
         self.prepare()
         start = time.perf_counter()
         asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        self._add(asked, self.samples, count, LIGHT_SAMPLES + self.samples)
+        self._add(asked, self.samples, count, self.light_samples + self.samples)
         with exclusive(self.device):
             wp.synchronize_device(self.device)
         self.samples += count
         self._seconds += time.perf_counter() - start
+
+    def sample_for(self, seconds: float) -> bool:
+        """Add samples for about so long, in parts of a few rows; not to be mixed with ``sample``.
+
+        Between two passes over the picture, and after any number of them, it is what ``sample`` gives.
+
+        Returns:
+            Whether a pass over the whole picture has ended.
+        """
+        start, ended = time.perf_counter(), False
+        self._parts = self._parts or self._all_parts()
+        while True:
+            ended |= next(self._parts)
+            spent = time.perf_counter() - start
+            if spent >= seconds:
+                self._seconds += spent
+                return ended
+
+    def _all_parts(self) -> Iterator[bool]:
+        """All work in parts; True after the last one of a pass that added a sample to every pixel."""
+        if not self._prepared:
+            with translating(self.device), wp.ScopedDevice(self.device):
+                path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
+            first = 0
+            for count in self._light_counts():
+                for k in range(count):
+                    for _ in self._pass(path_tracer.IRRADIANCE, k, first + k):
+                        yield False
+                first += count
+                with translating(self.device), wp.ScopedDevice(self.device):
+                    self._map_reflectance()
+            self._prepared = True
+        asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
+        while True:
+            for _ in self._pass(asked, self.samples, self.light_samples + self.samples):
+                yield False
+            self.samples += 1
+            yield True
+
+    def _pass(self, asked: int, done: int, number: int) -> Iterator[None]:
+        """Add one sample to every pixel: on CPU a band of rows for each core at a time, on CUDA all at once."""
+
+        def trace(rows: Rows | None) -> None:
+            path_tracer.trace_paths(
+                self._trace, self._params, self._local, self._moments,
+                asked=asked, seed=self.seed, first=number, done=done, count=1, rows=rows,
+            )  # fmt: skip
+
+        if not self.device.is_cpu:
+            with exclusive(self.device), wp.ScopedDevice(self.device):
+                trace(None)
+                wp.synchronize_device(self.device)
+            yield
+            return
+        height, cores = self.camera.height, usable_cores()
+        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+        if not self._compiled:
+            with translating(self.device):
+                trace(bands.pop(0))
+            self._compiled = True
+            yield
+        for start in range(0, len(bands), cores):
+            with ThreadPoolExecutor(cores, "warp_ar-paths") as pool:
+                list(pool.map(trace, bands[start : start + cores]))
+            yield
 
     def picture(self) -> TracedPicture:
         """What the samples so far give.
@@ -268,6 +342,12 @@ class PathTracer:
             radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
+
+    def shown(self) -> npt.NDArray[np.int32]:
+        """Index of the proxy that the frame shows in the middle of every pixel, -1 for none, (H, W)."""
+        self.prepare()
+        with exclusive(self.device):
+            return np.array(self._local.shown.numpy())
 
     def rays(self) -> int:
         """Rays that were traced for the samples so far."""

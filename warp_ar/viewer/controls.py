@@ -14,6 +14,7 @@ from warp_ar.input.sources import QueueSource, Source, open_source
 from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
+from warp_ar.viewer.convergence import CONVERGING
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.history import History
 
@@ -160,8 +161,9 @@ class Controls:
         Raises:
             UsageError: There is no such choice.
         """
-        if other not in ("", CAMERA, *PRESETS):
-            raise UsageError(f"compare with {other!r}; expected {CAMERA} or a preset: {', '.join(PRESETS)}")
+        choices = (CAMERA, *CONVERGING, *PRESETS)
+        if other not in ("", *choices):
+            raise UsageError(f"compare with {other!r}; expected one of {', '.join(choices)}")
         with self.changed:
             self.compare = other
             self._touch()
