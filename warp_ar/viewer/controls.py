@@ -14,12 +14,15 @@ from warp_ar.input.sources import QueueSource, Source, open_source
 from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
-from warp_ar.viewer.convergence import CONVERGING
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.history import History
 
 CAMERA: Final = "camera"
 """What a picture is compared with when it is not another preset."""
+TRACED: Final = "traced"
+DIFFERENCE: Final = "difference"
+CONVERGING: Final = (TRACED, DIFFERENCE)
+"""What a held picture is compared with: the reference, or how far from it the picture is, in colours."""
 
 Notify = Callable[[dict[str, Any]], None]
 """Takes a message for all viewers, on any thread."""

@@ -14,16 +14,12 @@ import cv2
 import numpy as np
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_of
-from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
+from warp_ar.accuracy.path_tracer import Image, PathTracer, TracedPicture
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.errors import WarpArError
-from warp_ar.viewer.browser_camera import Image
+from warp_ar.viewer.controls import TRACED
 
-TRACED: Final = "traced"
-DIFFERENCE: Final = "difference"
-CONVERGING: Final = (TRACED, DIFFERENCE)
-"""What a picture is compared with: the reference, or how far from it the picture is, in colours."""
 FULL_SCALE: Final = 0.2
 """Difference, of full scale, that has the last colour."""
 SLICE_SECONDS: Final = 0.04
@@ -32,6 +28,8 @@ SHOWN_SECONDS: Final = 0.3
 """Between two pictures at least."""
 LIGHT_SAMPLES: Final = 8
 """Per pixel, by which the reflectance of proxies is found; fewer than offline, for somebody waits."""
+LEAST_SAMPLES: Final = 16
+"""Per pixel, before which an error is not believed."""
 MOST_SAMPLES: Final = 4096
 """Per pixel, after which a picture rests."""
 LEAST_ERROR: Final = 0.002
@@ -103,8 +101,9 @@ class Convergence:
         if key != self._key or self._made is None:
             return False
         picture = self._picture
-        done = picture is not None and (picture.samples >= MOST_SAMPLES or picture.relative_error <= LEAST_ERROR)
-        return not done
+        if picture is None or picture.samples < LEAST_SAMPLES:
+            return True
+        return picture.samples < MOST_SAMPLES and picture.relative_error > LEAST_ERROR
 
     def step(self) -> bool:
         """Add a slice of samples; whether there is a new picture to show."""

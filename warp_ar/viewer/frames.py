@@ -23,8 +23,8 @@ from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Notify
-from warp_ar.viewer.convergence import CONVERGING, Convergence
+from warp_ar.viewer.controls import CONVERGING, Controls, Notify
+from warp_ar.viewer.convergence import Convergence
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.intrinsics import guessed_camera
 from warp_ar.viewer.light_record import LightState
