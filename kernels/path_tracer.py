@@ -757,6 +757,7 @@ def finish_picture_kernel(
     encode_table: wp.array[wp.vec3],
     moments: Moments,
     count: wp.float32,
+    exposure: wp.float32,
     # Out:
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
@@ -795,7 +796,7 @@ def finish_picture_kernel(
         if count > 1.0:
             error[c] = wp.sqrt(wp.max(variance[c], 0.0) / (count * (count - 1.0)))
     error_out[i, j] = error
-    image_out[i, j] = encode(encode_table, radiance_out[i, j])
+    image_out[i, j] = encode(encode_table, exposure * radiance_out[i, j])
 
 
 # --- Launchers --------------------------------------------------------------------------------------------------------
@@ -870,6 +871,8 @@ def finish_picture(
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
     image_out: wp.array2d[wp.vec3ub],
+    *,
+    exposure: float = 1.0,
 ) -> None:
     """Write what the moments of ``count`` samples say.
 
@@ -881,7 +884,8 @@ def finish_picture(
         radiance_out: (H, W) linear radiance in camera values, not clipped.
         error_out: (H, W) its standard error, per channel.
         image_out: (H, W) encoded.
+        exposure: Factor on the radiance that is encoded.
     """
     outputs = [radiance_out, error_out, image_out]
-    inputs = [scene.radiance, encode_table, moments, float(count)]
+    inputs = [scene.radiance, encode_table, moments, float(count), exposure]
     launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)

@@ -13,7 +13,7 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input.sources import Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
-from warp_ar.scene import Pose, Scene
+from warp_ar.scene import Exposure, Pose, Scene
 from warp_ar.stages.quality import Quality
 
 
@@ -130,9 +130,17 @@ def light_up_to(
             milliseconds = sum(timing.milliseconds for timing in result.stages.values())
             light, seconds = light_of(pipeline), frame.time - first
             return KnownFrame(
-                pipeline.scene, frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
+                exposed_scene(pipeline), frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
             )
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
+
+
+def exposed_scene(pipeline: Pipeline) -> Scene:
+    """A pipeline's scene with the exposure that its last frame had, where it chooses that itself."""
+    scale = pipeline.arrays.get("expose_scale")
+    if scale is None:
+        return pipeline.scene
+    return dataclasses.replace(pipeline.scene, exposure=Exposure(float(scale.numpy()[0])))
 
 
 def light_of(pipeline: Pipeline) -> Light:

@@ -59,7 +59,7 @@ class TracedPicture:
     error: FloatImage
     """Standard error of ``radiance``, (H, W, 3)."""
     image: Image
-    """The picture as the camera would have encoded it, (H, W, 3) RGB."""
+    """The picture as the camera would have encoded it at the scene's exposure, (H, W, 3) RGB."""
     samples: int
     """Per pixel."""
     seconds: float
@@ -131,6 +131,8 @@ class PathTracer:
         self.device = resolve_device(device)
         self.seed, self.samples = seed, 0
         self.light_samples = light_samples
+        scale = scene.exposure.scale
+        self.exposure = scale if isinstance(scale, float) else 1.0
         self._seconds = 0.0
         self._parts: Iterator[bool] | None = None
         self._compiled = False
@@ -337,8 +339,9 @@ class PathTracer:
             raise UsageError("no samples yet: call sample() first")
         with exclusive(self.device):
             path_tracer.finish_picture(
-                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image
-            )
+                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image,
+                exposure=self.exposure,
+            )  # fmt: skip
             radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from warp_ar.accuracy.known_frame import KnownFrame, light_of
+from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
 from warp_ar.accuracy.path_tracer import Image
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import UsageError
@@ -30,7 +30,7 @@ class TracedFrames:
         """Complain about what cannot be traced.
 
         Raises:
-            UsageError: The number of samples, the error or the scene does not fit.
+            UsageError: The number of samples or the error does not fit, or the pipeline keeps to a budget.
         """
         if self.samples < 1:
             raise UsageError(f"--samples {self.samples}: expected 1 or more")
@@ -38,10 +38,6 @@ class TracedFrames:
             raise UsageError(f"--error {self.error:g}: expected a number above 0, such as 0.05")
         if not isinstance(self.pipeline, Pipeline):
             raise UsageError("--samples with --quality auto: name a preset, whose light is used")
-        if self.pipeline.scene.exposure.scale != 1.0:
-            raise UsageError(
-                f"--samples with [exposure] scale = {self.pipeline.scene.exposure.scale!s}: the reference knows 1 only"
-            )
 
     def __call__(self, frame: Any, result: Any) -> Image:
         """The picture of a frame; the pipeline's own where the marker is lost or the exposure is not that shown."""
@@ -49,7 +45,7 @@ class TracedFrames:
         if result.pose is None or not result.shown:
             return result.image  # type: ignore[no-any-return]
         known = KnownFrame(
-            self.pipeline.scene,
+            exposed_scene(self.pipeline),
             frame.image,
             result.image,
             result.pose,

@@ -13,7 +13,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from warp_ar.accuracy.known_frame import KnownFrame, light_of
+from warp_ar.accuracy.known_frame import KnownFrame, exposed_scene, light_of
 from warp_ar.accuracy.path_tracer import Image, PathTracer, TracedPicture
 from warp_ar.device import exclusive
 from warp_ar.engine.pipeline import Pipeline, Result
@@ -79,8 +79,8 @@ class Convergence:
             return
         self.drop()
         with exclusive(pipeline.device):
-            light = light_of(pipeline)
-        known = KnownFrame(pipeline.scene, frame.copy(), result.image, result.pose, light, seconds, 0.0)
+            light, scene = light_of(pipeline), exposed_scene(pipeline)
+        known = KnownFrame(scene, frame.copy(), result.image, result.pose, light, seconds, 0.0)
         self._key, self._lit = key, result.image
 
         def make() -> PathTracer:
