@@ -20,18 +20,18 @@ def frame_and_layers(device: str, height: int, width: int, rows: int) -> tuple[A
     rng = np.random.default_rng(0)
     frame = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     virtual = np.zeros((height, width, 4), np.float32)
-    added, mirrored = np.zeros((2, height, width, 3), np.float32)
+    added, mirror_ball = np.zeros((2, height, width, 3), np.float32)
     ratio = np.ones((height, width, 3), np.float32)
     virtual[:rows, : width // 2] = 0.3
     added[:rows] = rng.random((rows, width, 3)) * 0.3
     ratio[:rows] = rng.random((rows, width, 3))
-    mirrored[:rows, : width // 8] = 0.1
+    mirror_ball[:rows, : width // 8] = 0.1
     params = np.zeros(1, np.dtype(FrameParams.numpy_dtype()))
     for name in ("object", "light", "shadow", "ball"):
         params[f"{name}_rect"] = (0, rows, 0, width)
     params["exposure_scale"] = 0.5
-    arrays = {"virtual": (virtual, wp.vec4), "physical_added": (added, wp.vec3), "shadow_ratio": (ratio, wp.vec3)}
-    arrays["mirrored"] = (mirrored, wp.vec3)
+    arrays = {"virtual": (virtual, wp.vec4), "added_light": (added, wp.vec3), "shadow_ratio": (ratio, wp.vec3)}
+    arrays["mirror_ball"] = (mirror_ball, wp.vec3)
     given = {name: wp.array(values, dtype=dtype, device=device) for name, (values, dtype) in arrays.items()}
     return (
         wp.array(params, dtype=FrameParams, device=device),
@@ -43,7 +43,7 @@ def frame_and_layers(device: str, height: int, width: int, rows: int) -> tuple[A
 
 
 def main(device: str) -> None:
-    config = composite.CompositeConfig(virtual=True, added=True, ratio=True, mirrored=True)
+    config = composite.CompositeConfig(virtual=True, added=True, ratio=True, mirror_ball=True)
     for height, width in SIZES:
         for name, share in CASES:
             rows = round(share * height)

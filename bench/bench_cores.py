@@ -3,36 +3,121 @@
 Each run is a process of its own that may use so many cores, as ``taskset`` would have it. ``WARP_AR_BENCH`` may name a
 height of frames (480 or 1080) and how often all counts are run in turn, as in ``1080,3``; 480 and 2 are usual. Settled
 frames are measured: the clip goes round, as a stream's does.
+
+A second table has where the time of a frame goes at each count: the thread that looks for the marker; the thread that
+renders, in Python and in the native threads' work; and each stage, by the time of all threads. ``whole`` is what a
+stage does in passes that cannot be split. ``path`` is the longest chain of stages that wait for each other if there
+were cores without end, each pass then taking its time as a whole or that of the shortest piece that is worth taking:
+no count of cores brings a frame below it.
 """
 
 from __future__ import annotations
 
+import collections
 import json
 import os
 import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from bench.bench_frame import SIZES, clip
 from bench.common import commit
+from warp_ar.engine.crew import Crew
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.kernels import bands
 
 WARM_UP = 12
 FRAMES = 60
 _LABELS = {"480": "480p", "1080": "1080p"}
 
 
+class Watch:
+    """Where the time of a pipeline's frames goes, in milliseconds."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        """Measure what a pipeline does from now on."""
+        self.parts: dict[str, list[float]] = collections.defaultdict(list)
+        self.stages: dict[str, list[float]] = collections.defaultdict(list)
+        pipeline.warm_up()
+        self._time(pipeline, "_look", "track")
+        self._time(pipeline, "_render", "render")
+        crew = pipeline._scheduler.crew
+        if crew is not None:
+            self._follow(crew)
+
+    def _time(self, owner: Any, name: str, part: str) -> None:
+        function = getattr(owner, name)
+
+        def timed(*arguments: Any) -> Any:
+            begin = time.perf_counter()
+            try:
+                return function(*arguments)
+            finally:
+                self.parts[part].append((time.perf_counter() - begin) * 1e3)
+
+        setattr(owner, name, timed)
+
+    def _follow(self, crew: Crew) -> None:
+        run: Callable[[], Any] = crew.run
+
+        def followed() -> Any:
+            begin = time.perf_counter()
+            times = run()
+            self.parts["native"].append((time.perf_counter() - begin) * 1e3)
+            for name, nanoseconds in times.items():
+                self.stages[name].append(nanoseconds * 1e-6)
+            unsplit, path = least_times(crew)
+            self.parts["whole"].append(unsplit)
+            self.parts["path"].append(path)
+            return times
+
+        crew.run = followed  # type: ignore[method-assign]
+
+    def forget(self) -> None:
+        """Leave out the frames so far."""
+        self.parts.clear()
+        self.stages.clear()
+
+    def means(self) -> dict[str, dict[str, float]]:
+        """Means over frames."""
+        parts = {name: statistics.mean(values) for name, values in self.parts.items()}
+        parts["python"] = parts["render"] - parts.get("native", 0.0)
+        return {"parts": parts, "stages": {name: statistics.mean(values) for name, values in self.stages.items()}}
+
+
+def least_times(crew: Crew) -> tuple[float, float]:
+    """Milliseconds of a crew's last frame in passes that cannot be split, and of its path with cores without end."""
+    table, stages = crew._passes, crew._stages
+    spent = table[:, bands.PASS.index("time")] * 1e-6
+    whole = table[:, bands.PASS.index("whole")] == 1
+    least = np.where(whole, spent, np.minimum(spent, bands.WORTH * 1e-6))
+    first, last, reader, readers_end = (
+        stages[:, bands.STAGE.index(name)] for name in ("first_pass", "last_pass", "first_reader", "last_reader")
+    )
+    begun = np.zeros(len(stages))
+    for stage in range(len(stages)):  # in an order in which they may run
+        done = begun[stage] + least[first[stage] : last[stage]].sum()
+        for other in crew._readers[reader[stage] : readers_end[stage]]:
+            begun[other] = max(begun[other], done)
+    ends = [begun[stage] + least[first[stage] : last[stage]].sum() for stage in range(len(stages))]
+    return float(spent[whole].sum()), float(max(ends))
+
+
 def run_frames(size: str) -> dict[str, Any]:
-    """Medians over settled frames of ``desk`` at ``medium``: by the clock, tracking included, and of all threads."""
+    """Of settled frames of ``desk`` at ``medium``: by the clock, tracking included, of all threads, and its parts."""
     frames = clip("desk", SIZES[size])
     wall, spent = [], []
     with Pipeline(frames.scene, device="cpu") as pipeline:
+        watch = Watch(pipeline)
         before = None
         for index in range(WARM_UP + FRAMES):
+            if index == WARM_UP:
+                watch.forget()
             begin, busy = time.perf_counter(), time.process_time()
             result = pipeline.submit(frames.images[index % len(frames.images)], time_seconds=index / 24.0)
             if before is not None:
@@ -41,7 +126,34 @@ def run_frames(size: str) -> dict[str, Any]:
             if index >= WARM_UP:
                 wall.append((time.perf_counter() - begin) * 1e3)
                 spent.append((time.process_time() - busy) * 1e3)
-    return {"ms": statistics.median(wall), "processor_ms": statistics.mean(spent)}
+    return {"ms": statistics.median(wall), "processor_ms": statistics.mean(spent), **watch.means()}
+
+
+def print_parts(runs: dict[int, list[dict[str, Any]]]) -> None:
+    """The second table: a line for each part of a frame, a column for each count of cores."""
+
+    def means(kind: str, name: str) -> list[float]:
+        return [float(np.mean([run[kind].get(name, 0.0) for run in found])) for found in runs.values()]
+
+    print(f"\n{'ms of a frame on cores':<28}" + "".join(f"{count:>9}" for count in runs))
+    words = {
+        "track": "look for the marker",
+        "render": "render",
+        "python": "  of it Python",
+        "native": "  of it native threads",
+        "whole": "  whole passes, all threads",
+        "path": "  path, cores without end",
+    }
+    for name, label in words.items():
+        print(f"{label:<28}" + "".join(f"{value:>9.2f}" for value in means("parts", name)))
+    names = dict.fromkeys(name for found in runs.values() for run in found for name in run["stages"])
+    table = {name: means("stages", name) for name in names}
+    for name, values in sorted(table.items(), key=lambda item: -max(item[1])):
+        if max(values) >= 0.01:
+            print(f"  {name:<26}" + "".join(f"{value:>9.2f}" for value in values))
+    parts = {name: dict(zip(map(str, runs), means("parts", name), strict=True)) for name in words}
+    stages = {name: dict(zip(map(str, runs), values, strict=True)) for name, values in table.items()}
+    print(json.dumps({"case": "cores parts", "parts": parts, "stages": stages, "commit": commit()}), flush=True)
 
 
 def main(device: str) -> None:
@@ -69,6 +181,7 @@ def main(device: str) -> None:
         print(f"{count:>5} {ms:>8.1f} {1e3 / ms:>7.1f} {base / ms:>10.2f} {busy:>12.1f}   {turned}")
         record = {"case": f"cores {size} {count}", "median_ms": round(ms, 3), "processor_ms": round(busy, 3)}
         print(json.dumps({**record, "fps": round(1e3 / ms, 1), "runs": len(found), "commit": commit()}), flush=True)
+    print_parts(runs)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What every method costs: the times of the cost table, on ``desk`` at its own size, all else on ``medium``.
 
 ``python -m bench costs --device cpu > bench/results/cpu_costs.jsonl``, then ``python -m bench.write_cost_tables`` puts
-these lines and the errors of ``warp_ar/accuracy/cost_table.json`` into ``docs/accuracy.md`` and the README.
+these lines and the errors of ``warp_ar/accuracy/cost_table.json`` into ``docs/accuracy.md``.
 
 Rows: ``method SETTING METHOD``, the stages that a setting turns, at each of its methods; ``preset SCENE NAME``, whole
 frames of the presets in turn. On CUDA a frame is the sum of its stages, each alone: stages that run side by side take

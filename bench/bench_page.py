@@ -8,8 +8,9 @@ Parts, which ``WARP_AR_BENCH`` picks, separated by commas:
 - ``memory``: resident memory after each preset has run once, and its growth over ``WARP_AR_BENCH_CHANGES`` changes of
   quality (default 1000), each waited for until its frames are lit;
 - ``visits``: the same over pages that are opened and closed for ``WARP_AR_BENCH_SECONDS`` (default 3600), as a chart
-  where ``WARP_AR_BENCH_PLOT`` names an SVG. A visit loads the page and what it names, looks at some frames and goes:
-  with a word, or cut off; every third by two viewers at once, every fifth turns the quality.
+  where ``WARP_AR_BENCH_PLOT`` names an SVG, ``WARP_AR_BENCH_PAUSE`` seconds (default 0) between two. A visit loads the
+  page and what it names, looks at some frames and goes: with a word, or cut off; every third by two viewers at once,
+  every fifth turns the quality.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from warp_ar.accuracy.charts import lines, stand_alone
 
 PARTS = ("start", "memory", "visits")
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "3600"))
+PAUSE = float(os.environ.get("WARP_AR_BENCH_PAUSE", "0"))
 VISIT_FRAMES = 12
 SETTLED_VISITS = 20
 """Visits before memory counts: every quality has run, and every part of the page has been sent."""
@@ -217,6 +219,7 @@ async def visits(url: str, pid: int) -> dict[str, Any]:
         await visit(url, number)
         number += 1
         taken.append((time.monotonic() - begun, number, resident_mb(pid), open_files(pid), threads_of(pid)))
+        await asyncio.sleep(PAUSE)
     settled = taken[min(SETTLED_VISITS, len(taken) - 1) :]
     shown = settled[:: -(-len(settled) // SAMPLES)]
     if plot := os.environ.get("WARP_AR_BENCH_PLOT"):

@@ -2,8 +2,8 @@
 
 Each is a process of its own. Cases: ``cold``, with empty caches; ``seen``, the same scene again; ``new``, scenes whose
 combination of shapes, materials, lights and textures the caches have not met, each once; ``quality``, the first scene
-at another preset. ``WARP_AR_BENCH`` may name cases, separated by commas. Beside the clock there is the time that all
-threads were busy, which other programs hardly disturb.
+at another preset; ``high``, another scene at that preset. ``WARP_AR_BENCH`` may name cases, separated by commas. Beside
+the clock there is the time that all threads were busy, which other programs hardly disturb.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from bench.common import report
 from warp_ar.scene import bundled_scenes
 
-CASES = ("cold", "seen", "new", "quality")
+CASES = ("cold", "seen", "new", "quality", "high")
 _BOX = '[[proxy]]\nshape = "box"\nat = [0.0, 0.21, 0.0446]\nsize = [0.2, 0.075, 0.09]\n'
 _TABLE = '[[proxy]]\nshape = "plane"\nat = [0.0, 0.0, -0.0004]\nsize = [1.6, 1.2]\n'
 _SPHERE = '[[object]]\nshape = "sphere"\nradius = 0.03\nat = [0.12, 0.05, 0.03]\n[object.material]\nmodel = "{model}"\n'
@@ -44,10 +44,16 @@ def write_scene(parts: str, folder: Path, name: str) -> Path:
     return path
 
 
+def cache_variables(caches: Path) -> dict[str, str]:
+    """What has a process keep kernels, meshes and checks in a folder."""
+    return {"WARP_CACHE_PATH": str(caches / "kernels"), "XDG_CACHE_HOME": str(caches)}
+
+
 def start(scene: str, device: str, caches: Path, target: Path, quality: str = "medium") -> tuple[float, float]:
     """Milliseconds until the first picture is written, and of all threads."""
     command = [sys.executable, "-m", "warp_ar.live", scene, "--headless", "--frames", "1", "--device", device]
-    environment = {**os.environ, "WARP_CACHE_PATH": str(caches / "kernels"), "XDG_CACHE_HOME": str(caches)}
+    environment = {**os.environ, **cache_variables(caches)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed package has its bytecode
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([*command, "--quality", quality, "--output", str(target)], env=environment, check=True)
     spent, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -67,6 +73,8 @@ def main(device: str) -> None:
                 runs[f"new, {label}"] = (str(write_scene(parts, root, f"new_{number}")), "medium")
         if "quality" in wanted:
             runs["new quality high"] = ("desk", "high")
+        if "high" in wanted:
+            runs["new scene high"] = ("torus", "high")
         for number, (label, (scene, quality)) in enumerate(runs.items()):
             wall, busy = start(scene, device, root / "caches", root / f"out_{number}", quality)
             load = round(os.getloadavg()[0], 1)

@@ -28,7 +28,7 @@ from aiohttp import web
 from bench.common import report
 from warp_ar.input.sources import open_source
 from warp_ar.scene import load_scene
-from warp_ar.viewer.server import encode_jpeg
+from warp_ar.viewer.encoding import encode_jpeg
 
 SECONDS = float(os.environ.get("WARP_AR_BENCH_SECONDS", "10"))
 WARM_SECONDS = 3.0

@@ -1,4 +1,4 @@
-"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/accuracy.md`` and the README.
+"""``python -m bench.write_cost_tables``: the measured cost table into ``docs/accuracy.md``.
 
 It reads ``bench/results/*_costs.jsonl``, which ``python -m bench costs`` prints, and the errors of
 ``warp_ar/accuracy/cost_table.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
@@ -167,7 +167,6 @@ def main() -> None:
     replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
     replace(page, "methods", method_table(cpu, cuda, listed))
     replace(page, "rule", rule_table(cpu))
-    replace(ROOT / "README.md", "extract", preset_table(cpu, cuda, presets, ["desk"]))
 
 
 if __name__ == "__main__":

@@ -55,13 +55,23 @@ def _options(parser: argparse.ArgumentParser) -> list[str]:
     for action in parser._actions:
         if isinstance(action, argparse._HelpAction | argparse._SubParsersAction):
             continue
-        metavar = (
-            action.metavar if isinstance(action.metavar, str) else (action.dest.upper() if action.nargs != 0 else "")
-        )
-        name = f"{action.option_strings[-1]} {metavar}".strip() if action.option_strings else metavar
+        values = values_of(action)
+        name = f"{action.option_strings[-1]} {values}".strip() if action.option_strings else values
         text = (action.help or "").replace("|", "\\|")
         rows.append(f"| `{name.replace('|', ' or ')}` | {text} |")
     return [*rows, ""] if len(rows) > 2 else []
+
+
+def values_of(action: argparse.Action) -> str:
+    """What stands behind an option, or for an argument."""
+    if action.nargs == 0:
+        return ""
+    if isinstance(action.metavar, tuple):
+        return " ".join(action.metavar)
+    name = action.metavar or ("|".join(map(str, action.choices)) if action.choices else action.dest.upper())
+    if isinstance(action.nargs, int):
+        return " ".join([name] * action.nargs)
+    return f"{name} ..." if action.nargs == "+" else name
 
 
 def paper_figures() -> str:

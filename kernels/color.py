@@ -28,6 +28,7 @@ import warp as wp
 
 from warp_ar.errors import SceneError
 from warp_ar.files import is_file, read_text
+from warp_ar.srgb import decode_srgb
 
 wp.set_module_options({"enable_backward": False})
 
@@ -202,11 +203,11 @@ def encode_table(transfer: str | pathlib.Path, contrast: float = 0.0) -> np.ndar
 
 
 def _formula(name: str, encoded: np.ndarray) -> np.ndarray:
-    """Linear value of encoded values in 0..1 for the transfers that have a formula (sRGB: IEC 61966-2-1)."""
+    """Linear value of encoded values in 0..1 for the transfers that have a formula."""
     if name == "linear":
         return encoded
     if name == "srgb":
-        return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        return decode_srgb(encoded)
     return encoded ** _gamma(name)
 
 

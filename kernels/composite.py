@@ -1,6 +1,6 @@
 """The picture: the camera's frame, what virtual light adds to it, and the virtual objects over it.
 
-    radiance = (1 - alpha) (frame * shadow_ratio + physical_added + mirrored) + virtual
+    radiance = (1 - alpha) (frame * shadow_ratio + added_light + mirror_ball) + virtual
 
 in linear light; ``virtual`` is premultiplied by its coverage alpha. A pixel that none of these layers changes keeps
 the frame's code bit for bit, whatever the transfer. Layers count only inside their rectangle of ``FrameParams``: what
@@ -42,7 +42,7 @@ class CompositeConfig:
     """Virtual light on the receiver."""
     ratio: bool = False
     """Shadows of the environment, a factor on the frame."""
-    mirrored: bool = False
+    mirror_ball: bool = False
     """What mirror balls show of what is virtual, a change of the frame."""
 
     def general(self) -> CompositeConfig:
@@ -57,7 +57,7 @@ class Layers:
     objects: wp.array2d[wp.vec4]  # ``virtual``, which C++ keeps for itself: premultiplied linear radiance and coverage
     added: wp.array2d[wp.vec3]  # linear radiance
     ratio: wp.array2d[wp.vec3]  # factor on the frame's linear radiance
-    mirrored: wp.array2d[wp.vec3]  # change of linear radiance
+    mirror_ball: wp.array2d[wp.vec3]  # change of linear radiance
 
 
 @wp.struct
@@ -67,7 +67,7 @@ class LayersAt:
     objects: wp.vec4
     added: wp.vec3
     ratio: wp.vec3
-    mirrored: wp.vec3
+    mirror_ball: wp.vec3
 
 
 @functools.cache
@@ -91,9 +91,9 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
         if wp.static(config.ratio):
             if layers.ratio.shape[0] > 0 and inside_rect(row, col, params[0].shadow_rect):
                 at.ratio = layers.ratio[row, col]
-        if wp.static(config.mirrored):
-            if layers.mirrored.shape[0] > 0 and inside_rect(row, col, params[0].ball_rect):
-                at.mirrored = layers.mirrored[row, col]
+        if wp.static(config.mirror_ball):
+            if layers.mirror_ball.shape[0] > 0 and inside_rect(row, col, params[0].ball_rect):
+                at.mirror_ball = layers.mirror_ball[row, col]
         return at
 
     return read_layers
@@ -103,14 +103,14 @@ def make_read_layers(config: CompositeConfig) -> wp.Function:
 def is_changed(at: LayersAt) -> wp.bool:
     """Whether layers touch a pixel; NaN does."""
     neutral = at.objects == wp.vec4(0.0, 0.0, 0.0, 0.0) and at.added == wp.vec3(0.0, 0.0, 0.0)
-    neutral = neutral and at.ratio == wp.vec3(1.0, 1.0, 1.0) and at.mirrored == wp.vec3(0.0, 0.0, 0.0)
+    neutral = neutral and at.ratio == wp.vec3(1.0, 1.0, 1.0) and at.mirror_ball == wp.vec3(0.0, 0.0, 0.0)
     return not neutral
 
 
 @wp.func
 def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     """All layers over the frame's radiance; no more is taken from it than there is."""
-    physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirrored, wp.vec3(0.0, 0.0, 0.0))
+    physical = wp.max(wp.cw_mul(radiance, at.ratio) + at.added + at.mirror_ball, wp.vec3(0.0, 0.0, 0.0))
     return (1.0 - at.objects[3]) * physical + wp.vec3(at.objects[0], at.objects[1], at.objects[2])
 
 
@@ -142,7 +142,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     const Layer objects = reach(layers.objects, params.object_rect, 1);
     const Layer added = reach(layers.added, params.light_rect, 2);
     const Layer ratio = reach(layers.ratio, params.shadow_rect, 4);
-    const Layer mirrored = reach(layers.mirrored, params.ball_rect, 8);
+    const Layer mirror_ball = reach(layers.mirror_ball, params.ball_rect, 8);
 
     auto overlaps = [](const Layer& layer, int j) { return j < layer.stop && j + N > layer.start; };
     auto take = [&](float* into, const Layer& layer, int j, float neutral) {
@@ -172,7 +172,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     };
 
     int start = width, stop = 0;
-    const Layer* all[4] = {&objects, &added, &ratio, &mirrored};
+    const Layer* all[4] = {&objects, &added, &ratio, &mirror_ball};
     for (const Layer* layer : all)
         if (layer->stop > layer->start) {
             start = layer->start < start ? layer->start : start;
@@ -183,7 +183,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
     memcpy(out + 3 * stop, codes + 3 * stop, 3 * (width - stop));
     for (int j = start; j < stop; j += N) {
         const int count = width - j < N ? width - j : N;
-        const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirrored, j)};
+        const bool any[4] = {overlaps(objects, j), overlaps(added, j), overlaps(ratio, j), overlaps(mirror_ball, j)};
         float covered[3 * N] = {}, alpha[3 * N] = {}, a[3 * N] = {}, m[3 * N] = {}, r[3 * N];
         unsigned changed[3 * N];
         unsigned touched = 0, whole = 1;
@@ -204,7 +204,7 @@ def compose(radiance: wp.vec3, at: LayersAt) -> wp.vec3:
             }
             if (any[1]) take(a, added, j, 0.0f);
             if (any[2]) take(r, ratio, j, 1.0f);
-            if (any[3]) take(m, mirrored, j, 0.0f);
+            if (any[3]) take(m, mirror_ball, j, 0.0f);
             for (int i = 0; i < 3 * N; ++i) {
                 changed[i] = (covered[i] != 0.0f) | (alpha[i] != 0.0f) | (a[i] != 0.0f);
                 changed[i] |= (r[i] != 1.0f) | (m[i] != 0.0f);
@@ -340,13 +340,13 @@ def make_composite_kernel(config: CompositeConfig, warps: bool) -> wp.Kernel:
 
 def make_layers(
     virtual: wp.array | None = None,
-    physical_added: wp.array | None = None,
+    added_light: wp.array | None = None,
     shadow_ratio: wp.array | None = None,
-    mirrored: wp.array | None = None,
+    mirror_ball: wp.array | None = None,
 ) -> Layers:
     """Layers as kernels read them; None leaves one empty."""
     layers = Layers()
-    given = {"objects": virtual, "added": physical_added, "ratio": shadow_ratio, "mirrored": mirrored}
+    given = {"objects": virtual, "added": added_light, "ratio": shadow_ratio, "mirror_ball": mirror_ball}
     for name, array in given.items():
         if array is not None:
             setattr(layers, name, array)
@@ -379,7 +379,7 @@ def composite(
     height, width = frame.shape
     tables = [decode_table, encode_table]
     if frame.device.is_cpu:
-        kept = config.virtual + 2 * config.added + 4 * config.ratio + 8 * config.mirrored
+        kept = config.virtual + 2 * config.added + 4 * config.ratio + 8 * config.mirror_ball
         inputs = [params, frame, *tables, layers, kept, ENCODE_KEYS]
         launch_rows(composite_rows_kernel, (height,), inputs, [image_out], rows=rows, device=frame.device)
         return

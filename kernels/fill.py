@@ -19,7 +19,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.kernels.guards import smooth_ramp, usable_confidence
-from warp_ar.kernels.latlong import PI, wrap_texel
+from warp_ar.kernels.latlong import PI, beside_in_row
 from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, wait_for_block
 
 wp.set_module_options({"enable_backward": False})
@@ -44,21 +44,10 @@ def band_solid_angle(start: wp.float32, stop: wp.float32, height: wp.int32) -> w
 def sample_level_row(
     levels: wp.array[wp.vec4], offset: wp.int32, height: wp.int32, width: wp.int32, row: wp.int32, x: wp.float32
 ) -> wp.vec3:
-    """Linear sample along one row of a level, across the seam and the poles; see ``latlong.sample_row``."""
-    r = row
-    at = x
-    if r < 0:
-        r = -1 - r
-        at += 0.5 * wp.float32(width)
-    elif r >= height:
-        r = 2 * height - 1 - r
-        at += 0.5 * wp.float32(width)
-    left = wp.floor(at)
-    first = wrap_texel(r, wp.int32(left), height, width)
-    second = wrap_texel(r, wp.int32(left) + 1, height, width)
+    """Linear sample along one row of a level, across the seam and the poles; see ``latlong.beside_in_row``."""
+    first, second, t = beside_in_row(row, x, height, width)
     a = levels[offset + first[0] * width + first[1]]
     b = levels[offset + second[0] * width + second[1]]
-    t = at - left
     return wp.vec3(a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
 
 

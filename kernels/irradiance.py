@@ -154,15 +154,22 @@ def make_sh_tables(height: int, width: int, order: int, device: wp.DeviceLike) -
 
 
 @wp.func
+def sum_sh2(coefficients: wp.array[wp.vec3], d: wp.vec3) -> wp.vec3:
+    """The first nine harmonics in a unit direction, weighted by their coefficients."""
+    x = d[0]
+    y = d[1]
+    z = d[2]
+    total = coefficients[0] * 0.28209479
+    total += (coefficients[1] * y + coefficients[2] * z + coefficients[3] * x) * 0.48860251
+    total += (coefficients[4] * (x * y) + coefficients[5] * (y * z) + coefficients[7] * (x * z)) * 1.09254843
+    total += coefficients[6] * (0.31539157 * (3.0 * z * z - 1.0)) + coefficients[8] * (0.54627422 * (x * x - y * y))
+    return total
+
+
+@wp.func
 def sh_irradiance(irradiance_sh: wp.array[wp.vec3], normal: wp.vec3) -> wp.vec3:
     """Irradiance on a surface with unit ``normal`` from nine coefficients; never negative."""
-    x = normal[0]
-    y = normal[1]
-    z = normal[2]
-    total = irradiance_sh[0] * 0.28209479
-    total += (irradiance_sh[1] * y + irradiance_sh[2] * z + irradiance_sh[3] * x) * 0.48860251
-    total += (irradiance_sh[4] * (x * y) + irradiance_sh[5] * (y * z) + irradiance_sh[7] * (x * z)) * 1.09254843
-    total += irradiance_sh[6] * (0.31539157 * (3.0 * z * z - 1.0)) + irradiance_sh[8] * (0.54627422 * (x * x - y * y))
+    total = sum_sh2(irradiance_sh, normal)
     return wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))
 
 
@@ -323,13 +330,7 @@ def evaluate_sh4_kernel(
     i, j = wp.tid()
     i += row_start
     d = texel_direction(i, j, irradiance_map_out.shape[0], irradiance_map_out.shape[1])
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    total = coefficients[0] * 0.28209479
-    total += (coefficients[1] * y + coefficients[2] * z + coefficients[3] * x) * 0.48860251
-    total += (coefficients[4] * (x * y) + coefficients[5] * (y * z) + coefficients[7] * (x * z)) * 1.09254843
-    total += coefficients[6] * (0.31539157 * (3.0 * z * z - 1.0)) + coefficients[8] * (0.54627422 * (x * x - y * y))
+    total = sum_sh2(coefficients, d)
     for k in range(9):
         total += coefficients[16 + k] * sh4_basis(k, d)
     irradiance_map_out[i, j] = wp.vec3(wp.max(total[0], 0.0), wp.max(total[1], 0.0), wp.max(total[2], 0.0))

@@ -66,10 +66,11 @@ def wrap_texel(row: wp.int32, column: wp.int32, height: wp.int32, width: wp.int3
 
 
 @wp.func
-def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> wp.vec3:
-    """Linear sample along one row, at x in texel centres; a row beyond a pole is the one within, half a turn away."""
-    height = radiance.shape[0]
-    width = radiance.shape[1]
+def beside_in_row(row: wp.int32, x: wp.float32, height: wp.int32, width: wp.int32):
+    """Both texels beside x, in texel centres, along a row, and how far from the first to the second x lies.
+
+    A row beyond a pole is the one within, half a turn away.
+    """
     r = row
     at = x
     if r < 0:
@@ -81,8 +82,15 @@ def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> w
     left = wp.floor(at)
     first = wrap_texel(r, wp.int32(left), height, width)
     second = wrap_texel(r, wp.int32(left) + 1, height, width)
+    return first, second, at - left
+
+
+@wp.func
+def sample_row(radiance: wp.array2d[wp.vec3], row: wp.int32, x: wp.float32) -> wp.vec3:
+    """Linear sample along one row, at x in texel centres; see ``beside_in_row``."""
+    first, second, t = beside_in_row(row, x, radiance.shape[0], radiance.shape[1])
     a = radiance[first[0], first[1]]
-    return a + (at - left) * (radiance[second[0], second[1]] - a)
+    return a + t * (radiance[second[0], second[1]] - a)
 
 
 @wp.func

@@ -8,17 +8,17 @@ densities, and so are both ways to reach the disk of a virtual light. A path end
 that its weight makes up for. Nothing is clamped: the mean over paths has no error but noise.
 
 **The frame.** The camera has seen the physical surfaces, so a path that meets a proxy where the frame shows it knows
-the radiance L0 that it has without anything virtual. What the virtual things change there is [Deb98]
+the radiance L0 that it has without anything virtual. What virtual content (objects and lights) changes there is [Deb98]
 
     L = L0 + (L_with - L_without),    both by the same random numbers.
 
 A path is therefore in one of two states. While *whole* it carries radiance; where it meets such a point it takes L0 and
-goes on as a *difference*. A difference adds nothing as long as what it meets would be there without the virtual things
+goes on as a *difference*. A difference adds nothing as long as what it meets would be there without virtual content
 as well: it takes away light of the environment that virtual objects hide, adds that of virtual lights, and where it
 meets a virtual object it becomes whole, less the radiance that the same ray brings without objects. Of a pixel that
 nothing virtual reaches, every path gives exactly 0.
 
-**Reflectance** of a proxy's point is pi L0 / E, E its irradiance without virtual things, gathered by the same paths:
+**Reflectance** of a proxy's point is pi L0 / E, E its irradiance without virtual content, gathered by the same paths:
 light that arrives from the environment, and L0 of what else they meet. In a pixel that shows a proxy E and the
 difference come from the same directions, so that much of their noise cancels in the ratio: with the means over samples
 of the difference g and of e = E / pi, for a white surface both, of a pixel whose frame is L0,
@@ -73,8 +73,13 @@ from warp_ar.kernels.path_sampling import (
 )
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.relight import reflectance_of
+<<<<<<< HEAD
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import MIN_FACING
+=======
+from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, uniform_from_bits
+from warp_ar.kernels.shade import face_viewer
+>>>>>>> main
 from warp_ar.kernels.shadow import has_penumbra, sample_light
 from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, ROUNDING, Hit, TraceConfig, intersect_sphere, make_trace, offset_origin
@@ -105,7 +110,7 @@ FIRST_LIGHT = wp.constant(3)
 """Streams of random numbers at a vertex; each virtual light has its own, as far as they go."""
 
 WHOLE, DIFFERENCE, IRRADIANCE = 0, 1, 2
-"""What is asked of pixels: radiance of the scene; what virtual things change in the frame; or only what makes
+"""What is asked of pixels: radiance of the scene; what virtual content changes in the frame; or only what makes
 reflectance known."""
 
 
@@ -166,8 +171,20 @@ class Seen:
 class Carried:
     """What a path brings to the camera."""
 
-    radiance: wp.vec3  # or the difference that virtual things make
-    light: wp.vec3  # what a white first surface would send without virtual things
+    radiance: wp.vec3  # or the difference that virtual content makes
+    light: wp.vec3  # what a white first surface would send without virtual content
+    rays: wp.int32  # that were traced for it
+
+
+@wp.struct
+class SkyLight:
+    """Light of the environment from one direction, as a surface reflects it."""
+
+    reaches: wp.bool  # whether nothing physical is in the way
+    radiance: wp.vec3
+    origin: wp.vec3  # of the ray to it
+    direction: wp.vec3
+    distance: wp.float32
     rays: wp.int32  # that were traced for it
 
 
@@ -175,14 +192,7 @@ class Carried:
 def from_viewer(vertex: Vertex, wo: wp.vec3) -> Vertex:
     """A vertex whose normals are on the viewer's side, the one for shading at least a little."""
     result = vertex
-    normal = vertex.hit.normal
-    geometric = vertex.hit.geometric_normal
-    if wp.dot(geometric, wo) < 0.0:
-        normal = -normal
-        geometric = -geometric
-    facing = wp.dot(normal, wo)
-    if facing < MIN_FACING:
-        normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
+    normal, geometric = face_viewer(vertex.hit.normal, vertex.hit.geometric_normal, wo)
     result.hit.normal = normal
     result.hit.geometric_normal = geometric
     return result
@@ -356,14 +366,65 @@ def survival(weight: wp.vec3, vertices: wp.int32) -> wp.float32:
     return wp.min(wp.max(weight), MOST_SURVIVAL)
 
 
+@wp.func
+def light_along(sky: Sky, origin: wp.vec3, direction: wp.vec3, vertex: Vertex, density: wp.float32) -> wp.vec3:
+    """The environment's light on a ray to ``vertex`` that was drawn with ``density``: its share beside ``draw_sky``."""
+    light = near_radiance(sky, origin, direction, vertex.hit.t, density)
+    if vertex.kind == NOTHING:
+        light += sky_radiance(sky, direction, density)
+    return light
+
+
+@functools.cache
+def make_sky_light(trace: TraceConfig) -> wp.Function:
+    """``sky_light(scene, hit, surface, wo, guided, changes_only, key, k) -> SkyLight``: reflected, of one direction.
+
+    The direction is drawn by the environment's light; its share is that which balances with going on by ``draw_next``
+    if ``guided``, else by ``draw_reflected``.
+    """
+    hidden_by_physical = make_hidden_by_physical(trace)
+
+    @wp.func(module="unique")
+    def sky_light(
+        scene: LocalScene,
+        hit: Hit,
+        surface: Surface,
+        wo: wp.vec3,
+        guided: wp.bool,
+        changes_only: wp.bool,
+        key: PathKey,
+        k: wp.int32,
+    ) -> SkyLight:
+        light = SkyLight()
+        u = random_triple(key, k, SKY)
+        sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
+        reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
+        if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
+            light.origin = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
+            light.direction = sky.direction
+            light.distance = sky.distance
+            light.rays = 1
+            if not hidden_by_physical(scene, light.origin, sky.direction, sky.distance):
+                other = float(0.0)
+                if guided:
+                    other = next_density(scene, hit, surface, wo, sky.direction, changes_only)
+                else:
+                    other = surface_density(surface, hit.normal, wo, sky.direction)
+                light.reaches = True
+                light.radiance = balance(sky.density, other) / sky.density * wp.cw_mul(reflected, sky.radiance)
+        return light
+
+    return sky_light
+
+
 @functools.cache
 def make_physical_radiance(trace: TraceConfig) -> wp.Function:
-    """``physical_radiance(params, scene, origin, direction, density, key, first) -> Carried``: without virtual things.
+    """``physical_radiance(params, scene, origin, direction, density, key, first) -> Carried``: without virtual content.
 
     What a ray brings that was drawn with ``density`` at vertex ``first`` of a path; of the environment the share that
     balances with drawing it by its light.
     """
-    find_vertex, hidden_by_physical = make_find_vertex(trace), make_hidden_by_physical(trace)
+    find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
     see_in_frame, look_up_material = make_see_in_frame(trace), make_look_up_material()
 
     @wp.func(module="unique")
@@ -385,10 +446,7 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
         while k < MOST_VERTICES:
             vertex = find_vertex(scene, at, toward, False)
             carried.rays += 1
-            light = near_radiance(scene.sky, at, toward, vertex.hit.t, drawn_with)
-            if vertex.kind == NOTHING:
-                light += sky_radiance(scene.sky, toward, drawn_with)
-            carried.radiance += wp.cw_mul(weight, light)
+            carried.radiance += wp.cw_mul(weight, light_along(scene.sky, at, toward, vertex, drawn_with))
             if vertex.kind == NOTHING:
                 return carried
             wo = -toward
@@ -404,16 +462,9 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
             hit = vertex.hit
             surface = look_up_material(scene, vertex, wo, reflectance)
             if vertex.kind == PROXY:
-                u = random_triple(key, k, SKY)
-                sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
-                reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
-                if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
-                    start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
-                    carried.rays += 1
-                    if not hidden_by_physical(scene, start, sky.direction, sky.distance):
-                        other = surface_density(surface, hit.normal, wo, sky.direction)
-                        share = balance(sky.density, other) / sky.density
-                        carried.radiance += share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
+                lit = sky_light(scene, hit, surface, wo, False, False, key, k)
+                carried.rays += lit.rays
+                carried.radiance += wp.cw_mul(weight, lit.radiance)
             u = random_triple(key, k, SCATTER)
             pick = random_triple(key, k, PICK)
             drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], wp.vec2(u[0], u[1]))
@@ -480,11 +531,11 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
 def make_follow_path(trace: TraceConfig) -> wp.Function:
     """``follow_path(params, scene, first, direction, difference, white, only_light, key) -> Carried``.
 
-    What leaves the vertex ``first`` against a unit ``direction``: all radiance, or the difference that virtual things
-    make. ``white``: the first surface is one, and what it sends without virtual things is found too; ``only_light``:
+    What leaves the vertex ``first`` against a unit ``direction``: all radiance, or the difference that virtual content
+    makes. ``white``: the first surface is one, and what it sends without virtual content is found too; ``only_light``:
     nothing else is.
     """
-    find_vertex, hidden_by_physical = make_find_vertex(trace), make_hidden_by_physical(trace)
+    find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
     see_in_frame, look_up_material = make_see_in_frame(trace), make_look_up_material()
     physical_radiance, virtual_light = make_physical_radiance(trace), make_virtual_light(trace)
     occluded_by_objects = make_trace(trace).occluded_by_objects
@@ -524,24 +575,18 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
             if not only_light:
                 carried.radiance += wp.cw_mul(weight, surface.emission)
             if surface.model != wp.static(int(MIRROR)):
-                u = random_triple(key, k, SKY)
-                sky = draw_sky(scene.sky, hit.point, wp.vec2(u[0], u[1]), u[2])
-                reflected = reflect_direct(surface, hit.normal, wo, sky.direction)
-                if wp.max(reflected) > 0.0 and wp.dot(hit.geometric_normal, sky.direction) > 0.0:
-                    start = offset_origin(hit.point, hit.geometric_normal, sky.direction, hit.error)
-                    carried.rays += 1
-                    if not hidden_by_physical(scene, start, sky.direction, sky.distance):
-                        other = next_density(scene, hit, surface, wo, sky.direction, changes_only)
-                        share = balance(sky.density, other) / sky.density
-                        light = share * wp.cw_mul(weight, wp.cw_mul(reflected, sky.radiance))
-                        if is_white:
-                            carried.light += light
-                        if not only_light:
-                            if occluded_by_objects(scene.rays, start, sky.direction, sky.distance):
-                                if changes_only:
-                                    carried.radiance -= light
-                            elif not changes_only:
-                                carried.radiance += light
+                arriving = sky_light(scene, hit, surface, wo, True, changes_only, key, k)
+                carried.rays += arriving.rays
+                if arriving.reaches:
+                    light = wp.cw_mul(weight, arriving.radiance)
+                    if is_white:
+                        carried.light += light
+                    if not only_light:
+                        if occluded_by_objects(scene.rays, arriving.origin, arriving.direction, arriving.distance):
+                            if changes_only:
+                                carried.radiance -= light
+                        elif not changes_only:
+                            carried.radiance += light
                 if not only_light:
                     lit = virtual_light(scene, hit, surface, wo, changes_only, key, k)
                     carried.radiance += wp.cw_mul(weight, lit.radiance)
@@ -575,9 +620,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                 carried.radiance -= wp.cw_mul(weight, physical.radiance)
                 changes_only = False
             if not changes_only:
-                light = near_radiance(scene.sky, origin, drawn.direction, vertex.hit.t, drawn.density)
-                if vertex.kind == NOTHING:
-                    light += sky_radiance(scene.sky, drawn.direction, drawn.density)
+                light = light_along(scene.sky, origin, drawn.direction, vertex, drawn.density)
                 carried.radiance += wp.cw_mul(weight, light)
             if vertex.kind == NOTHING:
                 return carried

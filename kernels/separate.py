@@ -75,7 +75,7 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
         if out.added_light.shape[0] > 0:
             out.added_light[i, j] = at.added
         if out.mirror_ball.shape[0] > 0:
-            out.mirror_ball[i, j] = at.mirrored
+            out.mirror_ball[i, j] = at.mirror_ball
 
     return separate_layers_kernel
 

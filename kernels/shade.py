@@ -89,6 +89,20 @@ class NearPoint:
     reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
+@wp.func
+def face_viewer(normal: wp.vec3, geometric_normal: wp.vec3, wo: wp.vec3):
+    """Both normals of a surface on the viewer's side, the one for shading at least a little."""
+    shading = normal
+    geometric = geometric_normal
+    if wp.dot(geometric, wo) < 0.0:
+        shading = -shading
+        geometric = -geometric
+    facing = wp.dot(shading, wo)
+    if facing < MIN_FACING:
+        shading = wp.normalize(shading + (MIN_FACING - facing) * wo)
+    return shading, geometric
+
+
 @functools.cache
 def make_shade_hit(config: ShadeConfig) -> wp.Function:
     """``shade_hit``: radiance that leaves a hit against the ray's ``direction`` (not unit).
@@ -116,14 +130,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         spread: wp.float32,
     ) -> wp.vec3:
         wo = -wp.normalize(direction)
-        normal = hit.normal
-        geometric = hit.geometric_normal
-        if wp.dot(geometric, wo) < 0.0:
-            normal = -normal
-            geometric = -geometric
-        facing = wp.dot(normal, wo)
-        if facing < MIN_FACING:
-            normal = wp.normalize(normal + (MIN_FACING - facing) * wo)
+        normal, geometric = face_viewer(hit.normal, hit.geometric_normal, wo)
         cos_o = wp.dot(normal, wo)
         surface = surface_at(scene, distant.dfg, hit, cos_o, spread)
 

@@ -7,7 +7,7 @@ import pytest
 from tests.photo_files import write_photo
 from tests.photo_room import GAIN, environment, exposed, project, write_bracket
 from warp_ar.capture import main
-from warp_ar.command_line import EXIT_DONE, EXIT_USAGE
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
 from warp_ar.light.captured import Light, latlong_directions, texel_solid_angles
 from warp_ar.live import main as live
 from warp_ar.photo_capture import capture_light
@@ -42,7 +42,7 @@ def bracket(tmp_path_factory):
 def test_a_bracket_becomes_light_and_a_picture(bracket, tmp_path, capsys):
     x, y = project([0.0, 0.0, 0.0])
     arguments = ["--contact", str(x), str(y), "--ball-radius", "0.04", "--shown", str(bracket[1]), "--device", "cpu"]
-    outputs = ["--output", str(tmp_path / "light.exr"), "--scene", str(tmp_path / "photo.toml")]
+    outputs = ["--output", str(tmp_path / "light.exr"), "--scene", str(tmp_path / "new" / "photo.toml")]
     assert main([*map(str, bracket), *arguments, *outputs]) == EXIT_DONE
     said = capsys.readouterr()
     assert "light in camera values of photo_b.jpg" in said.out
@@ -55,10 +55,10 @@ def test_a_bracket_becomes_light_and_a_picture(bracket, tmp_path, capsys):
     assert all(emitter.high is not None for emitter in light.emitters)
     assert 0.7 < light.confidence.mean() < 1.0
 
-    scene = load_scene(tmp_path / "photo.toml")
+    scene = load_scene(tmp_path / "new" / "photo.toml")
     assert scene.captured.file == tmp_path / "light.exr"
     shown = ["--headless", "--device", "cpu", "--output", str(tmp_path / "out")]
-    assert live([str(tmp_path / "photo.toml"), *shown]) == EXIT_DONE
+    assert live([str(tmp_path / "new" / "photo.toml"), *shown]) == EXIT_DONE
     picture = cv2.imread(str(tmp_path / "out" / "0000.png"))[..., ::-1]
     # The virtual mirror ball stands three radii to the right of the real one and shows nearly the same environment.
     real, virtual = (project([dx, 0.0, 0.04]) for dx in (0.0, 0.12))
@@ -108,4 +108,15 @@ def test_bad_usage_is_one_line(bracket, tmp_path, capsys, arguments, message):
     assert main([str(bracket[0]), *arguments, "--output", str(tmp_path / "light.exr")]) == EXIT_USAGE
     said = capsys.readouterr().err
     assert message in said
+    assert said.count("\n") == 1
+
+
+def test_a_place_that_cannot_be_written_is_told_before_anything_is_computed(bracket, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("warp_ar.capture.capture_light", None)
+    (tmp_path / "file").write_text("mine")
+    light, scene = tmp_path / "light.exr", tmp_path / "file" / "photo.toml"
+    arguments = ["--contact", "10", "20", "--output", str(light), "--scene", str(scene)]
+    assert main([str(bracket[0]), *arguments]) == EXIT_FAILED
+    said = capsys.readouterr().err
+    assert "is a file, not a folder to write to" in said
     assert said.count("\n") == 1

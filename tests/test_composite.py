@@ -48,23 +48,23 @@ def make_layers(seed=0):
     virtual = np.concatenate([rng.random((H, W, 3)) * alpha, alpha], -1).astype(np.float32)
     added = (rng.random((H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
     ratio = rng.random((H, W, 3)).astype(np.float32)
-    mirrored = (rng.uniform(-1.0, 1.0, (H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
-    return frame, virtual, added, ratio, mirrored
+    mirror_ball = (rng.uniform(-1.0, 1.0, (H, W, 3)) * rng.choice([0.0, 1.0], (H, W, 1))).astype(np.float32)
+    return frame, virtual, added, ratio, mirror_ball
 
 
-def make_arrays(virtual=None, added=None, ratio=None, mirrored=None):
+def make_arrays(virtual=None, added=None, ratio=None, mirror_ball=None):
     """Layers of what ``make_layers`` draws, or of part of it."""
     dtypes = (wp.vec4, wp.vec3, wp.vec3, wp.vec3)
     return composite.make_layers(
         *(
             None if values is None else wp.array(values, dtype=dtype)
-            for values, dtype in zip((virtual, added, ratio, mirrored), dtypes, strict=True)
+            for values, dtype in zip((virtual, added, ratio, mirror_ball), dtypes, strict=True)
         )
     )
 
 
 def run(
-    config, frame, virtual=None, added=None, ratio=None, mirrored=None, params=None, transfer="srgb", bands=(None,)
+    config, frame, virtual=None, added=None, ratio=None, mirror_ball=None, params=None, transfer="srgb", bands=(None,)
 ):
     out = wp.full(frame.shape[:2], wp.vec3ub(7, 7, 7), dtype=wp.vec3ub)
     for rows in bands:
@@ -73,7 +73,7 @@ def run(
             params or make_params(),
             wp.array(frame, dtype=wp.vec3ub),
             *tables(transfer),
-            make_arrays(virtual, added, ratio, mirrored),
+            make_arrays(virtual, added, ratio, mirror_ball),
             out,
             rows=rows,
         )
@@ -102,28 +102,28 @@ def test_what_nothing_touches_stays_bit_for_bit(device, config, transfer):
 
 @pytest.mark.parametrize("config", CONFIGS, ids=str)
 def test_matches_twin(device, config):
-    frame, virtual, added, ratio, mirrored = make_layers(1)
+    frame, virtual, added, ratio, mirror_ball = make_layers(1)
     linear = reference.compose(
         reference_color.decode(color.decode_table("srgb"), frame),
         virtual if config.virtual else None,
         added if config.added else None,
         ratio if config.ratio else None,
-        mirrored if config.mirrored else None,
+        mirror_ball if config.mirror_ball else None,
     )
-    assert_codes(run(config, frame, virtual, added, ratio, mirrored), linear)
+    assert_codes(run(config, frame, virtual, added, ratio, mirror_ball), linear)
 
 
 def test_layers_count_only_inside_their_rectangles(device):
-    frame, virtual, added, ratio, mirrored = make_layers(2)
+    frame, virtual, added, ratio, mirror_ball = make_layers(2)
     rects = (3, 15, 5, 21), (10, 24, 0, 33), (7, 20, 11, 39), (1, 12, 15, 38)
-    got = run(CONFIGS[15], frame, virtual, added, ratio, mirrored, make_params(*rects))
+    got = run(CONFIGS[15], frame, virtual, added, ratio, mirror_ball, make_params(*rects))
     inside_object, inside_light, inside_shadow, inside_ball = (reference.within(rect, (H, W)) for rect in rects)
     linear = reference.compose(
         reference_color.decode(color.decode_table("srgb"), frame),
         virtual * inside_object[..., None],
         added * inside_light[..., None],
         np.where(inside_shadow[..., None], ratio, 1.0),
-        mirrored * inside_ball[..., None],
+        mirror_ball * inside_ball[..., None],
     )
     assert_codes(got, linear)
     outside = ~(inside_object | inside_light | inside_shadow | inside_ball)
@@ -140,16 +140,16 @@ def test_bands_give_the_same_picture(device):
 
 
 def test_light_does_not_reach_through_an_object(device):
-    frame, _, added, _, mirrored = make_layers(4)
+    frame, _, added, _, mirror_ball = make_layers(4)
     virtual = np.zeros((H, W, 4), np.float32)
     virtual[..., 3] = 1.0
-    np.testing.assert_array_equal(run(CONFIGS[14], frame, virtual, 1e6 * added, mirrored=1e6 * mirrored), 0)
+    np.testing.assert_array_equal(run(CONFIGS[14], frame, virtual, 1e6 * added, mirror_ball=1e6 * mirror_ball), 0)
 
 
 def test_extremes_stay_in_range(device):
     frame = np.zeros((1, 5, 3), np.uint8)
     added = np.repeat(np.float32([np.nan, np.inf, -np.inf, 1e30, -1.0])[None, :, None], 3, axis=2)
-    for got in (run(CONFIGS[2], frame, added=added), run(CONFIGS[8], frame, mirrored=added)):
+    for got in (run(CONFIGS[2], frame, added=added), run(CONFIGS[8], frame, mirror_ball=added)):
         np.testing.assert_array_equal(got[0, :, 0], [0, 255, 0, 255, 0])
 
 
@@ -158,4 +158,4 @@ def test_no_more_is_taken_from_a_ball_than_it_shows(device):
     frame, virtual, *_ = make_layers(5)
     virtual[..., 3] = 0.25
     gone = np.full((H, W, 3), -5.0, np.float32)
-    assert_codes(run(CONFIGS[12], frame, virtual, mirrored=gone), virtual[..., :3].astype(float))
+    assert_codes(run(CONFIGS[12], frame, virtual, mirror_ball=gone), virtual[..., :3].astype(float))

@@ -290,6 +290,12 @@ def test_costs_are_measured_and_order_the_findings():
     assert "FLIP" in findings[0].cost
 
 
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """What a test finds is not what an earlier one has kept."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+
+
 def lives_line(scene, monkeypatch, source=None):
     """What ``live`` says first, and the names of all that its quick half finds, the worst first."""
     said, names = [], []

@@ -100,3 +100,42 @@ def test_usd_without_its_library_is_named(clip: pathlib.Path, tmp_path: pathlib.
     monkeypatch.setitem(__import__("sys").modules, "pxr", None)
     assert run(clip, "--output", tmp_path / "shot.usda") == 2
     assert 'USD files need usd-core; install it with pip install "warp-ar[exchange]"' in message(capsys)
+
+
+def test_every_usd_is_known_again(clip: pathlib.Path, tmp_path: pathlib.Path, capsys) -> None:
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    for name in ("shot.usdc", "shot.usd"):
+        for _ in range(2):
+            assert run(clip, "--output", tmp_path / name, "--frames", 1, "--no-environment") == 0
+        assert f"{name} is replaced: this program wrote it before" in capsys.readouterr().err
+    (tmp_path / "other.usdc").write_bytes(b"PXR-USDC and then nothing that it should have")
+    assert run(clip, "--output", tmp_path / "other.usdc", "--frames", 1, "--no-environment") == 1
+    assert "this program did not write it" in message(capsys)
+
+
+BOX = """
+[[object]]
+shape = "box"
+size = [0.02, 0.02, 0.02]
+material = { model = "lambert", base_color = "%s" }
+"""
+
+
+def test_pictures_of_others_beside_a_usd_stay(tmp_path: pathlib.Path, clip: pathlib.Path, capsys) -> None:
+    """A texture goes beside the file: not over somebody's picture, and not over the one that it is made from."""
+    import cv2
+
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    own, written = tmp_path / "wood.png", tmp_path / "shot_object_1_box.png"
+    for path in (own, written):
+        cv2.imwrite(str(path), np.full((8, 8, 3), 90, np.uint8))
+    before, text = written.read_bytes(), clip.read_text()
+    options = (clip, "--output", tmp_path / "shot.usda", "--frames", 1, "--no-environment")
+    for name, words in (("shot_object_1_box", "is the same as"), ("wood", "this program did not write it")):
+        clip.write_text(text + BOX % f"{name}.png")
+        assert run(*options) != 0
+        assert words in message(capsys)
+        assert written.read_bytes() == before
+    for more in (("--overwrite",), ()):  # its own the second time
+        assert run(*options, *more) == 0
+        assert written.read_bytes() != before

@@ -15,7 +15,15 @@ SCALES = [0.0, 0.01, 0.25, 0.5, 0.9, np.nextafter(np.float32(1), np.float32(0)),
 
 
 def run(
-    frame, scale, method="box", layers=CONFIGS[0], virtual=None, added=None, ratio=None, mirrored=None, transfer="srgb"
+    frame,
+    scale,
+    method="box",
+    layers=CONFIGS[0],
+    virtual=None,
+    added=None,
+    ratio=None,
+    mirror_ball=None,
+    transfer="srgb",
 ):
     frame_array = wp.array(frame, dtype=wp.vec3ub)
     shape = frame.shape[:2]
@@ -27,7 +35,7 @@ def run(
     summed_area.sum_area(frame_array, table)
     expose.read_scale(params, scale_array)
     expose.expose_codes(decode, encode, scale_array, codes)
-    over = make_arrays(virtual, added, ratio, mirrored)
+    over = make_arrays(virtual, added, ratio, mirror_ball)
     config = expose.ExposeConfig(method, layers)
     expose.expose(
         config,
@@ -196,16 +204,16 @@ def test_impossible_scale_is_black(device, scale):
     np.testing.assert_array_equal(run(disc(), scale), 0)
 
 
-def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None, mirrored=None):
+def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=None, mirror_ball=None):
     frame = np.zeros((*added.shape[:2], 3), np.uint8) if frame is None else frame
     height, width = frame.shape[:2]
     params = make_params(*4 * [(0, height, 0, width)], time_step=time_step)
     levels = wp.zeros((-(-height // expose.AUTO_STRIDE), expose.LEVELS), wp.int32)
     scale = wp.array([start], dtype=wp.float32)
     frame, decode = wp.array(frame, dtype=wp.vec3ub), tables()[0]
-    layers = expose.CompositeConfig(virtual is not None, True, mirrored=mirrored is not None)
+    layers = expose.CompositeConfig(virtual is not None, True, mirror_ball=mirror_ball is not None)
     for _ in range(frames):
-        over = make_arrays(virtual, added, None, mirrored)
+        over = make_arrays(virtual, added, None, mirror_ball)
         expose.count_levels(layers, params, frame, decode, over, levels)
         expose.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
@@ -243,8 +251,8 @@ def test_auto_ignores_what_darkening_cannot_help(device):
 def test_auto_sees_the_desk_as_it_is_composed(device):
     """What a ball beside the lit desk shows is no reason to darken it; what is taken from lit pixels counts."""
     bright = np.where(spot(1.0) > 0, 0.0, 50.0).astype(np.float32)
-    assert auto(spot(0.9), mirrored=bright) == 1.0
-    assert auto(spot(4.0), mirrored=-3.5 * (spot(1.0) > 0).astype(np.float32)) == 1.0
+    assert auto(spot(0.9), mirror_ball=bright) == 1.0
+    assert auto(spot(4.0), mirror_ball=-3.5 * (spot(1.0) > 0).astype(np.float32)) == 1.0
 
 
 def test_auto_allows_a_few_glints(device):

@@ -10,7 +10,14 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from tests.test_sinks import file_limit
+from warp_ar.accuracy.path_tracer import TracedPicture
+from warp_ar.errors import SinkError
 from warp_ar.exr_file import check_whole_exr, write_exr
+from warp_ar.light.captured import Light
+from warp_ar.output.environment_file import write_environment
+from warp_ar.output.stmap import write_stmap
+from warp_ar.reference import write_picture
 
 HEADER = {"type": OpenEXR.scanlineimage, "software": "a test"}
 
@@ -63,3 +70,27 @@ def test_the_system_says_why_a_file_lacks_its_end(tmp_path: pathlib.Path) -> Non
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert caught.value.errno == errno.EFBIG
+
+
+RADIANCE = np.random.default_rng(1).uniform(0.0, 4.0, (4, 8, 3)).astype(np.float32)
+WRITERS = {
+    "stmap": lambda path: write_stmap(path, RADIANCE[..., :2]),
+    "environment": lambda path: write_environment(path, RADIANCE, overwrite=False),
+    "captured": lambda path: Light(RADIANCE, RADIANCE[..., 0]).save(path),
+    "reference": lambda path: write_picture(
+        path, TracedPicture(RADIANCE, RADIANCE, np.zeros((1, 1, 3), np.uint8), 8, 0.0, 0.0)
+    ),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_does_not_fit_is_not_there(tmp_path: pathlib.Path, name: str) -> None:
+    """Whole or absent, and told, wherever the space ends: OpenEXR itself looks at none of a buffer's last bytes."""
+    WRITERS[name](tmp_path / "whole.exr")
+    size = (tmp_path / "whole.exr").stat().st_size
+    (tmp_path / "whole.exr").unlink()
+    for limit in (0, 100, size // 2, size - 100, size - 1):
+        with file_limit(limit), pytest.raises(SinkError, match=r"a\.exr cannot be written"):
+            WRITERS[name](tmp_path / "a.exr")
+        assert not list(tmp_path.iterdir())

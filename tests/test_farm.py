@@ -17,10 +17,12 @@ import time
 import av
 import pytest
 
-from tests.farm_rig import write_recording
+from tests.farm_rig import TICK, write_recording
 from warp_ar.farm.cli import main
 from warp_ar.farm.status import read_status
 
+TICKS = [0, 25, 40, 75, 100, 101, 150, 175, 230, 250, 275, 300]
+"""Of a recording of variable rate."""
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PATIENCE = 580.0
 """Seconds after which a run that should have ended has hung."""
@@ -66,7 +68,7 @@ size = [0.03, 0.03, 0.03]
 def folder(tmp_path_factory):
     """Recordings, one of them cut off, and job files."""
     tmp_path = tmp_path_factory.mktemp("farm")
-    write_recording(tmp_path / "good.mp4", 12, sound=True)
+    write_recording(tmp_path / "good.mp4", 12, sound=True, ticks=TICKS)
     data = (tmp_path / "good.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[: len(data) // 2])
     (tmp_path / "jobs.toml").write_text(RECORDINGS)
@@ -116,7 +118,9 @@ def test_a_corrupt_clip_fails_alone_and_the_exit_code_says_so(folder, finished, 
     assert "cut/survey: " in out
     assert str(folder / "cut.mp4") in out
     with av.open(str(run / "good.mp4")) as container:
-        assert len([packet for packet in container.demux(video=0) if packet.size]) == 12
+        assert [packet.pts * packet.time_base / TICK for packet in container.demux(video=0) if packet.size] == TICKS
+        assert container.metadata["title"] == "A desk"
+        assert container.streams.audio[0].metadata["language"] == "deu"
         assert len(container.streams.audio) == 1
     assert not (run / "cut.mp4").exists()
     assert list((run / "parts").iterdir()) == [], "what was joined is not kept twice"
@@ -214,6 +218,8 @@ def test_a_plan_runs_nothing_but_a_few_frames(folder, capsys):
         (["resume", "nowhere"], "nowhere holds no run (run.json is missing); begin one with: farm run"),
         (["status", "nowhere"], "nowhere holds no run"),
         (["run", "jobs.toml", "--output", "."], ". is not empty"),
+        (["run", "jobs.toml", "--output", "good.mp4"], "--output good.mp4 is a file; name a new folder"),
+        (["run", "jobs.toml", "--output", "new", "--device", "tpu"], "device 'tpu' is not here"),
         (["run", "jobs.toml"], "the following arguments are required: --output"),
     ],
 )
@@ -223,6 +229,7 @@ def test_wrong_usage_is_told_in_one_line(folder, monkeypatch, capsys, arguments,
     err = capsys.readouterr().err
     assert told in err
     assert err.count("\n") == 1
+    assert not (folder / "new").exists()
 
 
 def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.farm_rig import make_jobs
-from warp_ar.farm.draws import NoPlace, _overlap, desk_of, draw_variation, local_points
+from warp_ar.farm.draws import NoPlace, _overlap, draw_variation, local_points, receiver_of
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
@@ -70,14 +70,14 @@ def test_numbers_of_objects_and_lights_are_as_asked(drawn):
 
 
 def test_every_object_rests_on_the_desk(dataset, drawn):
-    height = desk_of(load_scene("desk"), dataset).height
+    height = receiver_of(load_scene("desk"), dataset).height
     assert height == -0.0004
     for item in (item for variation in drawn for item in variation.scene.objects):
         assert points_of(item)[:, 2].min() == pytest.approx(height, abs=ROUNDED)
 
 
 def test_objects_are_apart_from_each_other_and_from_the_desk(dataset, drawn):
-    taken = desk_of(load_scene("desk"), dataset).taken
+    taken = receiver_of(load_scene("desk"), dataset).taken
     assert len(taken) == 3, "the tin, the ball and the marker's card"
     for variation in drawn:
         outlines = [hull(points_of(item)) for item in variation.scene.objects]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import fractions
 
+import av
 import cv2
 import numpy as np
 import pytest
+from av.video.reformatter import VideoReformatter
 
 from tests.farm_rig import CLIPS, TICK, desk_frames, write_recording
 from warp_ar.errors import SourceError
 from warp_ar.farm.frames import index_frames, open_part, shown_ticks
+from warp_ar.input.video_file import rgb_from_video
 
 UNEVEN = [7, 30, 41, 100, 101, 150, 203, 260, 261, 300, 390, 391]
 """Time stamps of a variable rate, the first not 0."""
@@ -71,3 +74,25 @@ def test_pictures_that_alternate_between_exposures_are_refused(tmp_path):
     (tmp_path / "exposures.json").write_text("[0.01, 0.001]")
     with pytest.raises(SourceError, match="alternate between exposures, which a farm does not light"):
         index_frames(tmp_path, None)
+
+
+def test_where_no_gpu_decodes_the_processor_does(tmp_path):
+    write_recording(tmp_path / "a.mp4", 8)
+    index = index_frames(tmp_path / "a.mp4", None)
+
+    def pictures(gpu):
+        with open_part(tmp_path / "a.mp4", index, 2, 6, None, gpu) as source:
+            return [(frame.index, frame.image.tobytes()) for frame in source]
+
+    assert pictures(999) == pictures(None)
+
+
+def test_pictures_as_a_decoding_unit_gives_them_become_the_same_colours(tmp_path):
+    """Units give NV12: luma as in planes, chroma of both kinds in one."""
+    write_recording(tmp_path / "a.mp4", 2)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        for picture in container.decode(video=0):
+            other = VideoReformatter().reformat(picture, format="nv12")
+            assert (other.colorspace, other.color_range) == (picture.colorspace, picture.color_range)
+            expected = rgb_from_video(VideoReformatter(), picture)
+            np.testing.assert_array_equal(rgb_from_video(VideoReformatter(), other), expected)

@@ -66,8 +66,8 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
         ("schema = 1\n[[clip]]\nframes = [5, 2]\n", "clip[0].frames = [5, 2]: expected two whole numbers"),
         ('schema = 1\n[[clip]]\nname = "a/b"\n', 'clip[0].name = "a/b": expected letters'),
         ('schema = 1\n[[clip]]\nlight = "no.exr"\n', 'clip[0].light = "no.exr": there is no file'),
-        ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected "paper", "low"'),
-        ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected "follow"'),
+        ('schema = 1\n[run]\nquality = "best"\n[[clip]]\n', 'run.quality = "best": expected one of "paper", "low"'),
+        ('schema = 1\n[run]\nlight = "sun"\n[[clip]]\n', 'run.light = "sun": expected one of "follow"'),
         ("schema = 1\n[run]\nsegment_frames = 0\n[[clip]]\n", "run.segment_frames = 0: expected a whole number from 1"),
         ("schema = 1\n[[clip]]\n[dataset]\n", "dataset.object is missing: expected at least one"),
         (f"schema = 1\n[[clip]]\n[dataset]\nvariations = 0\n{BALL}", "dataset.variations = 0: expected a whole number"),
@@ -93,10 +93,16 @@ def test_paths_are_relative_to_the_job_file_and_survive_a_resume(tmp_path):
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "sphere"\nradius = 0.1\nfile = "a.ply"\n',
             'not used with shape = "sphere"; its own keys are radius',
         ),
+        (
+            f"schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = [1] }}\n",
+            "material.model = [1]: expected one of",
+        ),
+        ("schema = 1\nn = " + "9" * 5000, "not valid TOML"),
+        (".".join("a" * 500) + " = 1\n", "a key of more than 16 parts"),
         (f"schema = 1\n[[clip]]\n[dataset]\n{BALL}weight = 0\n", "every weight is 0"),
         (
             f'schema = 1\n[[clip]]\n[dataset]\n{BALL}material = {{ model = "wood" }}\n',
-            'model = "wood": expected "lambert"',
+            'model = "wood": expected one of "lambert"',
         ),
         (
             'schema = 1\n[[clip]]\n[dataset]\n[[dataset.object]]\nshape = "torus"\n'
@@ -136,3 +142,46 @@ def test_a_scene_of_a_camera_is_no_clip(tmp_path):
     )
     with pytest.raises(JobsError, match="names no recording; give the clip a path"):
         read(tmp_path, 'schema = 1\n[[clip]]\nscene = "scene.toml"\n')
+
+
+SCENE = """
+schema = 1
+[camera]
+field_of_view = 60
+[source]
+path = "a.mp4"
+{source}
+[marker]
+size = 0.08
+[probe]
+center = [-0.12, 0.03, 0.035]
+radius = 0.035
+{rest}
+"""
+AUTOMATIC = SCENE.format(source='metering = "automatic"', rest="")
+ADAPTING = SCENE.format(source="", rest='[exposure]\nscale = "auto"')
+
+
+@pytest.mark.parametrize(
+    ("scene", "run", "told"),
+    [
+        (AUTOMATIC, "", 'says source.metering = "automatic", and its drift is told from all frames before; expected'),
+        (AUTOMATIC, 'light = "preroll"\nsegment_frames = 4', 'expected run.light = "preroll" without segment_frames'),
+        (AUTOMATIC, 'light = "preroll"', None),
+        (ADAPTING, "segment_frames = 4", 'says exposure.scale = "auto", which adapts from frame to frame; expected no'),
+        (ADAPTING, "", None),
+        (ADAPTING, 'light = "preroll"\nsegment_frames = 4', None),
+    ],
+)
+def test_exposures_that_depend_on_frames_before_are_refused_where_a_job_does_not_see_those(tmp_path, scene, run, told):
+    (tmp_path / "a.mp4").write_bytes(b"0")
+    (tmp_path / "scene.toml").write_text(scene)
+    text = f'schema = 1\n[run]\n{run}\n[[clip]]\nscene = "scene.toml"\n'
+    if told is None:
+        assert read(tmp_path, text).clips[0].name == "scene"
+        return
+    with pytest.raises(JobsError) as caught:
+        read(tmp_path, text)
+    assert told in str(caught.value)
+    assert "clip scene: " in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -28,7 +28,7 @@ def plan_of(preset: str = "medium", **changes: object) -> Plan:
 
 def test_a_scene_of_everything_calls_for_everything() -> None:
     found = features_of()
-    assert found.layers == ("virtual", "physical_added", "shadow_ratio", "mirrored")
+    assert found.layers == ("virtual", "added_light", "shadow_ratio", "mirror_ball")
     assert found.environment
     assert found.recovered
     assert found.emitters
@@ -54,7 +54,7 @@ def test_without_a_ball_nothing_is_known_of_the_environment() -> None:
     assert not (found.bounced)
     assert found.relight_method == "flat"
     assert (found.distant.diffuse, found.distant.specular) == ("none", False)
-    assert found.layers == ("virtual", "physical_added")
+    assert found.layers == ("virtual", "added_light")
 
 
 EXPOSURES = [

@@ -1,4 +1,4 @@
-"""Who may import whom: the rooms of the package, and stages, which know nothing of each other."""
+"""Who may import whom: the layers of the package, and stages, which know nothing of each other."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def test_the_contracts_name_every_room_and_let_no_stage_through() -> None:
     linter = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
     layers, independence = linter["contracts"]
     named = {name.strip() for layer in layers["layers"] for name in layer.split("|")}
-    rooms = {f"warp_ar.{path.parent.name}" for path in (ROOT / "warp_ar").glob("*/__init__.py")}
+    folders = {f"warp_ar.{path.parent.name}" for path in (ROOT / "warp_ar").glob("*/__init__.py")}
     files = {f"warp_ar.{path.stem}" for path in (ROOT / "warp_ar").glob("*.py")} - {"warp_ar.__init__"}
-    assert (rooms | files) - named <= {"warp_ar.scenes"}, "data, which imports nothing of the package"
+    assert (folders | files) - named <= {"warp_ar.scenes"}, "data, which imports nothing of the package"
     excused = {line.split(" -> ")[1] for line in independence["ignore_imports"]}
     assert not excused & MODULES
     assert independence["modules"] == ["warp_ar.stages.*"]

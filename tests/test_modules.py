@@ -132,3 +132,96 @@ def test_no_kernel_is_translated_to_tell_whether_it_is_cached(monkeypatch, quali
         pipeline.warm_up()
     assert found
     assert [kernel.key for kernel in found if kernel.adj.has_unresolved_static_expressions] == []
+
+
+AHEAD = """
+import pathlib
+import warp as wp
+from warp_ar.device import resolve_device, usable_cores
+from warp_ar.engine import modules
+
+device = resolve_device("cpu")
+
+@wp.kernel(module="unique", enable_backward=False)
+def one_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 1
+
+def headers():
+    found = list(pathlib.Path(wp.config.kernel_cache_dir).glob("headers_*/*.pch"))
+    return [(path.name, path.stat().st_mtime_ns, path.stat().st_ino) for path in found]
+
+print(len(headers()))
+modules.parse_headers_ahead()
+modules.parse_headers_ahead()  # one is under way
+(thread,) = modules._AHEAD
+thread.join()
+kept = headers()
+print(len(kept))
+modules.load_modules([one_kernel], device)
+print(headers() == kept, len(modules._AHEAD))
+modules.parse_headers_ahead()  # they are there
+print(len(modules._AHEAD))
+"""
+
+
+def test_headers_are_parsed_once_ahead_of_the_kernels(tmp_path: Path) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache"), "TMPDIR": str(temporary)}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[1])
+    script = tmp_path / "script.py"
+    script.write_text(AHEAD)
+    command = [sys.executable, "-X", "dev", "-W", "error::ResourceWarning", str(script)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-4:] == ["0", "1", "True 0", "0"]
+    assert "ResourceWarning" not in run.stderr, run.stderr
+    assert list(temporary.iterdir()) == []
+
+
+NAMES = """
+import sys
+import warp as wp
+from warp_ar.engine import modules
+
+calls = 0
+find = wp._src.codegen.Adjoint.get_references
+
+def counted(adj):
+    global calls
+    calls += 1
+    return find(adj)
+
+wp._src.codegen.Adjoint.get_references = counted
+if sys.argv[1] == "once":
+    modules.remember_references()
+    modules.remember_references()  # again changes nothing
+
+from warp_ar.engine import scheduler
+from warp_ar.engine.pipeline import Pipeline
+
+def named(kernels, device, progress=None):
+    for kernel in kernels:
+        print(kernel.module.get_module_identifier(1))
+    print(calls)
+    sys.exit()
+
+scheduler.load_modules = named
+Pipeline("desk", device="cpu").warm_up()
+"""
+
+
+def test_remembered_references_name_the_same_kernels(tmp_path: Path) -> None:
+    """What is compiled and cached has the same names, found with half the looking at most."""
+    script = tmp_path / "script.py"
+    script.write_text(NAMES)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+
+    def run(how: str) -> tuple[list[str], int]:
+        command = [sys.executable, str(script), how]
+        lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+        return lines[:-1], int(lines[-1])
+
+    (usual, often), (remembered, once) = run("often"), run("once")
+    assert len(usual) > 20
+    assert remembered == usual
+    assert once < 0.5 * often

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from bench.bench_never_worse import NO_WORSE, evaluate, summarise
 from bench.random_tables import make_setup
@@ -11,8 +12,12 @@ from bench.table_world import FINE, Block, Bulb, World, latlong_directions
 
 SEEDS = (3, 4, 5, 8, 9, 10)
 """Cards that are true, grey and absent, wrong responses, clutter and lamps."""
-HELD = 0.9
-"""Share of the intervals' numbers that hold the truth: 0.95 over many set-ups; the numbers of one fail together."""
+LEVEL = 0.95
+"""Share of the intervals' numbers that are to hold the truth."""
+UNLUCKY = 0.05
+"""Chance that sound intervals miss the test's bound, over the choice of set-ups, which are the same in every run."""
+DIRECTIONS = 6
+"""Along the axes, in which irradiance is bounded."""
 FURNACE = 0.03
 """2,048 directions for a cosine, a coarse bounce."""
 
@@ -55,4 +60,6 @@ def test_recovered_light_is_no_worse_than_captured():
     summary = summarise(outcomes)
     # And is worth its while: nothing at all would be no worse either.
     assert summary["error_recovered"] < 0.95 * summary["error_clipped"]
-    assert summary["interval_holds"] >= HELD
+    # Channels of a direction hold or fail together: what is drawn is directions.
+    draws = DIRECTIONS * len(SEEDS)
+    assert summary["interval_holds"] >= binom.ppf(UNLUCKY, draws, LEVEL) / draws

@@ -819,10 +819,10 @@ def test_nothing_of_an_earlier_frame_is_read(device, method, rect):
                     values["normal"] = (0, 0, -1)
                 rig.arrays[f"relight_{name}"].assign(values)
             rig.arrays["relight_count"].fill_((old + 1) * rig.arrays["relight_patches"].shape[1])
-            rig.poke("physical_added", 0.0)
+            rig.poke("added_light", 0.0)
             for step in rig.stage("relight")[1]:
                 step.launch(step.extent())
-            found.append(rig.get("physical_added"))
+            found.append(rig.get("added_light"))
         np.testing.assert_array_equal(found[0], found[1])
 
 

@@ -82,3 +82,14 @@ def test_files_of_others_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([*QUICK, "--output", str(path)]) != EXIT_DONE
     assert path.read_bytes() == b"mine"
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_told_before_paths_are_followed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("warp_ar.reference.light_up_to", None)
+    (tmp_path / "file").write_text("mine")
+    assert main([*QUICK, "--output", str(tmp_path / "file" / "torus.exr")]) == EXIT_FAILED
+    said = capsys.readouterr().err
+    assert "is a file, not a folder to write to" in said
+    assert said.count("\n") == 1

@@ -62,17 +62,19 @@ from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import edits, protocol
+from warp_ar.viewer.address import Address, own_address
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.edits import Wanted
+from warp_ar.viewer.encoding import encode_jpeg
 from warp_ar.viewer.frames import Lit
 from warp_ar.viewer.gate import HEADER_SECONDS
 from warp_ar.viewer.host import Host
 from warp_ar.viewer.intrinsics import FocalEstimator, guessed_camera
 from warp_ar.viewer.lighting import Lighting, make_target
 from warp_ar.viewer.protocol import Bucket, ProtocolError, parse_picture, parse_text
-from warp_ar.viewer.server import MOST_VIEWERS, Address, Server, encode_jpeg, own_address
+from warp_ar.viewer.server import MOST_VIEWERS, Server
 
 SIZE = (320, 240)
 PATIENCE = 180.0  # seconds that anything may take on a busy machine

@@ -13,7 +13,6 @@ import argparse
 import itertools
 import json
 import math
-import sys
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
 from warp_ar.errors import UsageError
 from warp_ar.input.ball import posed_frames
 from warp_ar.input.ball_measure import measure_ball
@@ -244,4 +243,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
-from warp_ar.errors import UsageError
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
 from warp_ar.input.ball_finder import BallOutline
 from warp_ar.input.support import Support, plane_from_contact, plane_from_rectangle
 from warp_ar.output.places import check_places, check_replaceable
+from warp_ar.output.sink import make_folder
 from warp_ar.photo_capture import Capture, capture_light
 from warp_ar.scene import (
     Camera,
@@ -58,9 +58,14 @@ def make_parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add("--exposures", type=_seconds, nargs="+", metavar="S", help="seconds of each photograph, not what EXIF says")
     add("--shown", type=Path, metavar="PHOTO", help="whose camera values the light is in (default: the best exposed)")
-    add("--transfer", default="srgb", help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)')
+    add(
+        "--transfer",
+        default="srgb",
+        metavar="NAME",
+        help='response that is tried first: "srgb", "gamma:2.2" (default: srgb)',
+    )
     add("--focal-35mm", type=float, metavar="MM", help="focal length for a full frame, if EXIF does not tell")
-    add("--reflectance", type=float, default=0.85, help="of the ball (default: 0.85)")
+    add("--reflectance", type=float, default=0.85, metavar="R", help="of the ball (default: 0.85)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
     support = parser.add_argument_group("the plane under the ball, from the shown photograph")
     support.add_argument(
@@ -100,7 +105,10 @@ def _check(options: argparse.Namespace) -> None:
     writes = {"--output": options.output} | ({} if options.scene is None else {"--scene": options.scene})
     check_places({"the photographs": list(options.photos)}, writes)
     for path in writes.values():
-        check_replaceable(path, overwrite=options.overwrite)
+        if words := check_replaceable(path, overwrite=options.overwrite):
+            say(words)
+    for path in writes.values():
+        make_folder(path.parent)
 
 
 def make_scene(found: Capture, light: Path, ball_radius: float | None) -> Scene:
@@ -158,15 +166,18 @@ def capture(options: argparse.Namespace) -> int:
         )
     if options.scene is not None:
         scene = make_scene(found, options.output, options.ball_radius)
-        write_whole(options.scene, dumps_scene(scene, options.scene.parent).encode())
+        try:
+            write_whole(options.scene, dumps_scene(scene, options.scene.parent).encode())
+        except OSError as error:
+            raise SinkError(f"{options.scene} cannot be written: {reason(error)}") from error
         print(f"{options.scene}: python -m warp_ar.live {options.scene} --output out/")
     return EXIT_DONE
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    return run_command(lambda: capture(make_parser().parse_args(arguments)))
+    return run_command(lambda: capture(make_parser().parse_args(arguments)), SinkError)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

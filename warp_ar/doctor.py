@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command
 from warp_ar.errors import UsageError, printable
 from warp_ar.input.checkup import FRAMES, check_up, source_of
 from warp_ar.input.finding import Finding, worst_first
@@ -109,4 +109,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import datetime
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
-from warp_ar.errors import UsageError
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
     ENVIRONMENT_SUFFIXES,
@@ -51,7 +50,7 @@ def _time(text: str) -> datetime.datetime:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    return run_command(lambda: convert(make_parser().parse_args(arguments)))
+    return run_command(lambda: convert(make_parser().parse_args(arguments)), SinkError)
 
 
 def convert(options: argparse.Namespace) -> int:
@@ -86,4 +85,4 @@ def convert(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

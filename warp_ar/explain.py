@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import resolve_quality
 from warp_ar.input.exposures import plan_bracket
@@ -67,4 +67,4 @@ def print_numerics() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

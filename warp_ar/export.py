@@ -6,22 +6,21 @@ import argparse
 import dataclasses
 import itertools
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError
 from warp_ar.output.environment_file import write_environment
 from warp_ar.output.gltf_file import GLTF_SUFFIX, write_glb
 from warp_ar.output.places import check_places, check_replaceable, files_of
-from warp_ar.output.shot import Shot
+from warp_ar.output.shot import Shot, texture_files
 from warp_ar.output.sink import make_folder
 from warp_ar.output.stmap import distort_map, undistort_map, write_stmap
 from warp_ar.output.track_file import TRACK_SUFFIX, write_track
 from warp_ar.output.usd_file import USD_SUFFIXES, load_usd, write_usd
-from warp_ar.scene import load_scene
+from warp_ar.scene import Scene, load_scene
 
 SUFFIXES = (*USD_SUFFIXES, GLTF_SUFFIX, TRACK_SUFFIX)
 
@@ -67,10 +66,10 @@ def export(options: argparse.Namespace) -> int:
         del beside["environment"]
     if not options.stmaps:
         del beside["undistort"], beside["distort"]
-    reads = {"the scene": [] if scene.path is None else [scene.path], "what the scene names,": [*files_of(scene)]}
-    reads["what the scene names,"] = [path for path in reads["what the scene names,"] if path != scene.path]
-    check_places(reads, {"--output": output, **{f"--output's {name}": path for name, path in beside.items()}})
-    for path in (output, *beside.values()):
+    textures = texture_files(scene, output) if output.suffix.lower() in USD_SUFFIXES else {}
+    writes = {"--output": output, **{f"--output's {name}": path for name, path in {**beside, **textures}.items()}}
+    check_places(_read_by(scene, options), writes)
+    for path in writes.values():
         if words := check_replaceable(path, overwrite=options.overwrite):
             say(words)
     make_folder(output.parent)
@@ -90,6 +89,14 @@ def export(options: argparse.Namespace) -> int:
     for path in (*written, *beside.values()):
         print(path)
     return EXIT_DONE
+
+
+def _read_by(scene: Scene, options: argparse.Namespace) -> dict[str, list[Path]]:
+    """Files and folders that the run reads, by what they are."""
+    named = {"--source": options.source, "--calibration": options.calibration}
+    reads = {name: [Path(value)] for name, value in named.items() if value is not None}
+    reads["the scene"] = [] if scene.path is None else [scene.path]
+    return {**reads, "what the scene names,": [path for path in files_of(scene) if path != scene.path]}
 
 
 def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
@@ -119,4 +126,4 @@ def _read_shot(options: argparse.Namespace, scene: Any) -> tuple[Shot, Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -14,8 +14,9 @@ import os
 import pathlib
 import re
 import stat
+import tomllib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,6 +27,10 @@ _CHUNK = 1 << 20
 _BRACKETS = np.zeros(256, np.int8)
 _BRACKETS[[ord("["), ord("{")]] = 1
 _BRACKETS[[ord("]"), ord("}")]] = -1
+
+_MOST_DOTS: Final = 16
+_PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{_MOST_DOTS}}}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,6 +211,23 @@ def parse_json(text: str, label: str, error: type[WarpArError]) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as problem:
         raise error(f"{label} cannot be read: {reason(problem)}") from problem
+
+
+def parse_toml(text: str, label: str, error: type[WarpArError]) -> dict[str, Any]:
+    """TOML of anyone's making.
+
+    Raises:
+        WarpArError: As ``error``: it is damaged, nested too deeply, or has a dotted key of many parts, each of which is
+            a table in a table: TOML's reader takes long.
+    """
+    check_depth(bracket_depth(text), label, error)
+    if match := _MANY_DOTS.search(text):
+        line = text.count("\n", 0, match.start()) + 1
+        raise error(f"{label}: line {line}: a key of more than {_MOST_DOTS} parts; the longest here has 3")
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as problem:  # ValueError: TOMLDecodeError, and integers of too many digits
+        raise error(f"{label}: not valid TOML: {reason(problem)}") from problem
 
 
 def check_depth(depth: int, label: str, error: type[WarpArError]) -> None:

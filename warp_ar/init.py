@@ -8,12 +8,11 @@ from __future__ import annotations
 import argparse
 import math
 import shutil
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
 from warp_ar.errors import SinkError, UsageError, printable, reason
 from warp_ar.input.card import write_card
 from warp_ar.input.sheet import RINGS, SHEET, ball_center
@@ -97,4 +96,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

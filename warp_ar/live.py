@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,8 @@ from warp_ar.command_line import (
     Parser,
     Terminated,
     handling,
+    leave,
+    loading,
     run_command,
     say,
 )
@@ -51,7 +53,7 @@ if TYPE_CHECKING:
     from warp_ar.output.report import RunLog
     from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
-    from warp_ar.viewer.server import Address
+    from warp_ar.viewer.address import Address
 
 DEFAULT_PORT = 8720
 PORT_TRIES = 20
@@ -241,32 +243,36 @@ def _check_marker(log: RunLog, scene: Scene, *, live: bool) -> None:
     say(message)
 
 
-def _quick_check(options: argparse.Namespace, scene: Scene) -> None:
+def _quick_check(options: argparse.Namespace, scene: Scene) -> bool:
     """Say in one line each what is guessed, and the worst of what is wrong with the set-up.
 
     Frames of a capture device are left to the run itself: a device is not opened twice.
-    """
-    from warp_ar.input.checkup import check_up, source_of
 
-    source = source_of(scene, options.source)
-    recorded = isinstance(source, Path) or (isinstance(source, str) and Path(source).exists())
+    Returns:
+        Whether a mirror ball was seen where the scene has one.
+    """
+    from warp_ar.input.quick_check import quick_check
+
     try:
-        found = check_up(scene, source if recorded else None, quick=True)
+        checked = quick_check(scene, options.source, files_of(scene))
     except WarpArError:
-        return  # the run meets it too, and says it
+        return False  # the run meets it too, and says it
     # What the run itself cannot start with, it says itself.
-    found = [finding for finding in found if not finding.name.startswith(("source.", "marker.", "camera.aspect"))]
+    told = ("source.", "marker.", "camera.aspect")
+    found = [finding for finding in checked.findings if not finding.name.startswith(told)]
     worst = [finding for finding in found if finding.name != "camera.guessed"][:1]
     for finding in [*worst, *(finding for finding in found if finding.name == "camera.guessed")]:
         more = f"; all there is to say: python -m warp_ar.doctor {options.scene}" if finding in worst else ""
         say(f"{finding.text}; to do: {finding.remedy}{more}")
+    return checked.ball_seen
 
 
 class _Evidence:
-    """What frames show of a run: whether any was changed, and some by which to look for the ball."""
+    """What frames show of a run: whether any was changed, and some by which to look for a ball not seen before."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, ball_seen: bool) -> None:
         self.changed = False
+        self.ball_seen = ball_seen
         self.views: list[tuple[Any, Any]] = []
         self._count = 0
 
@@ -275,7 +281,7 @@ class _Evidence:
         self._count += 1
         self.changed = self.changed or bool((result.image != image).any())
         # The first, second, fourth, eighth, ...: all parts of a run, in few frames.
-        if result.pose is not None and self._count & (self._count - 1) == 0:
+        if not self.ball_seen and result.pose is not None and self._count & (self._count - 1) == 0:
             self.views = [*self.views, (image.copy(), result.pose)][-4:]
 
 
@@ -329,7 +335,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
 
 def _page_address(options: argparse.Namespace) -> Address:
     """Where the page is served, and with which token and certificate."""
-    from warp_ar.viewer.server import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, own_address
     from warp_ar.viewer.shared_light import check_origin
     from warp_ar.viewer.tls import load_context, make_context
 
@@ -344,12 +350,28 @@ def _page_address(options: argparse.Namespace) -> Address:
     return Address(options.host, port, options.token if known else secrets.token_hex(16), tls, origins)
 
 
+def _hurry_compilers(device: str) -> None:
+    """Start Warp; what can be done for its compilers beside the imports that follow, and before them, is."""
+    import warp as wp
+
+    from warp_ar.device import start_warp
+    from warp_ar.engine.modules import parse_headers_ahead, remember_references
+
+    start_warp()
+    remember_references()
+    if device == "cpu" or not wp.is_cuda_available():
+        parse_headers_ahead()
+
+
 def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
     """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
-    from warp_ar.device import bound_arenas
-    from warp_ar.viewer.host import Host
+    with loading():
+        from warp_ar.device import bound_arenas
 
-    bound_arenas()
+        _hurry_compilers(options.device)
+        from warp_ar.viewer.host import Host
+
+        bound_arenas()
     # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
     gc.collect()
     gc.freeze()
@@ -367,7 +389,8 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
 def serve_page(options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
     # Here, for what only writes files should not wait for a web server to load.
-    from warp_ar.viewer.server import LOOPBACK, Server
+    from warp_ar.viewer.address import LOOPBACK
+    from warp_ar.viewer.server import Server
 
     scene = _page_scene(options)
     address = _page_address(options)
@@ -478,7 +501,13 @@ def run(options: argparse.Namespace) -> int:
 
 def light_clip(options: argparse.Namespace) -> int:
     """Light a source's frames without a page, and write what options name."""
+    with loading() as loaded:
+        return _light_clip(options, loaded)
+
+
+def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before.
+    _hurry_compilers(options.device)
     from warp_ar.accuracy.budget import AutoPipeline
     from warp_ar.accuracy.traced_frames import TracedFrames
     from warp_ar.output.report import RunLog, print_plan
@@ -507,7 +536,7 @@ def light_clip(options: argparse.Namespace) -> int:
         stack.enter_context(side)
         session = stack.enter_context(_open_session(options, scene, tuple(outputs)))
         balls = _ball_report(scene, session)
-        _quick_check(options, session.scene)
+        ball_seen = _quick_check(options, session.scene)
         for note in session.bracket_notes:
             say(note)
         traced = None
@@ -515,6 +544,7 @@ def light_clip(options: argparse.Namespace) -> int:
             traced = TracedFrames(session.pipeline, options.samples, options.error)  # type: ignore[arg-type]
             session.ahead = False
         _compile(session, shown=not options.headless)
+        loaded()
         source = session.source
         sink: Sink = NullSink()
         if options.output is not None:
@@ -523,7 +553,7 @@ def light_clip(options: argparse.Namespace) -> int:
         for words in (*replaced, sink.replaced):
             if words:
                 say(words)
-        log, evidence = RunLog(session.pipeline), _Evidence()
+        log, evidence = RunLog(session.pipeline), _Evidence(ball_seen=ball_seen)
         try:
             with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink:
                 _light_frames(options, session, log, sink, side, stop, evidence, traced)
@@ -636,4 +666,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     faulthandler.enable()  # should native code crash, the report says what it was at
-    sys.exit(main())
+    leave(main())

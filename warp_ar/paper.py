@@ -22,7 +22,7 @@ from warp_ar.accuracy.charts import require_plots, stand_alone
 from warp_ar.accuracy.paper_figures import FIGURES, READING_SCENES, Context, PaperFigure, compare_readings
 from warp_ar.accuracy.progress import WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE, Parser, leave
 from warp_ar.device import resolve_device
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.output.own_files import OwnFiles
@@ -164,4 +164,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

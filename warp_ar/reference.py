@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import re
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -22,10 +22,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.path_tracer import DEFAULT_SAMPLES, PathTracer, TracedPicture
-from warp_ar.command_line import EXIT_DONE, Parser, run_command, say
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, SourceError, UsageError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.output.places import check_places, check_replaceable, files_of
+from warp_ar.output.sink import make_folder
 from warp_ar.scene import Scene, load_scene
 from warp_ar.session import calibrated, with_light
 from warp_ar.signature import PROGRAM, sign_png
@@ -83,6 +85,8 @@ def trace(options: argparse.Namespace) -> int:
     writes = {name: path for name, path in writes.items() if path is not None}
     check_places({"the scene": _read_by(scene, options)}, writes)
     replaced = [check_replaceable(path, overwrite=options.overwrite) for path in writes.values()]
+    for path in writes.values():
+        make_folder(path.parent)
     console = Console(stderr=True)
     known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
     tracer = known.tracer(device=options.device, size=size, seed=options.seed)
@@ -180,7 +184,7 @@ def write_picture(path: Path, picture: TracedPicture) -> None:
     channels = {name: np.ascontiguousarray(picture.radiance[..., c]) for c, name in enumerate("RGB")}
     channels |= {f"error.{name}": np.ascontiguousarray(picture.error[..., c]) for c, name in enumerate("RGB")}
     image = OpenEXR.File(header, channels)
-    _write(path, lambda part: image.write(str(part)))
+    _write(path, functools.partial(write_exr, image=image))
 
 
 def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
@@ -197,11 +201,10 @@ def write_png(path: Path, image: npt.NDArray[np.uint8]) -> None:
 
 def _write(path: Path, data: bytes | Callable[[Path], object]) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, data)
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

@@ -6,9 +6,10 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 from warp_ar.accuracy.budget import AutoPipeline
+from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result, resolve_quality
 from warp_ar.engine.switcher import PipelineSwitcher, Target
@@ -71,7 +72,7 @@ def with_light(scene: Scene, light: str | Path) -> Scene:
     return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve()))
 
 
-class Session:
+class Session(Closing):
     """Opens a scene's source and lights its frames one after another.
 
     Iterating gives ``(frame, result)`` pairs. Use it in a ``with`` statement, so that devices and threads are let go.
@@ -138,33 +139,20 @@ class Session:
             self.bracket_notes = plan_bracket(exposures, shown).notes
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
-                self.pipeline = AutoPipeline(
-                    self.scene,
-                    budget_ms=budget,
-                    device=device,
-                    size=size,
-                    outputs=outputs,
-                    exposures=exposures,
-                    shown=shown,
-                )
+                given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
+                self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
             else:
-                # The pipeline before a change is kept: results that were handed out may still be read.
-                self._switcher = PipelineSwitcher(
-                    device=device, keep=1, profile=False, synchronous=not self.source.live
-                )
-                self._target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
-                self.pipeline = self._switcher.open(self._target)
+                target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
+                self.pipeline = self._open(target, device)
         except BaseException:
             self.source.close()
             raise
 
-    def __enter__(self) -> Session:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def _open(self, target: Target, device: str) -> Pipeline:
+        """A pipeline that can be changed; the one before is kept: results that were handed out may still be read."""
+        self._target = target
+        self._switcher = PipelineSwitcher(device=device, keep=1, profile=False, synchronous=not self.source.live)
+        return self._switcher.open(target)
 
     def close(self) -> None:
         """Let the source and the pipeline's threads go."""

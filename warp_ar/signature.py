@@ -2,7 +2,7 @@
 
 A PNG says it in its text, an OpenEXR and an HDR in their headers, a WebP in its EXIF, a video in its comment, a report
 or a calibration in its first key, a page, a chart or a text in a comment at its start, a response in its first line, a
-glTF as its generator, a USD in text among its own data.
+glTF as its generator, a USD among its own data.
 """
 
 from __future__ import annotations
@@ -60,6 +60,19 @@ def _is_signed_webp(path: str | os.PathLike[str]) -> bool:
     return False
 
 
+def _is_signed_crate(path: str | os.PathLike[str]) -> bool:
+    """Whether a USD in binary has the signature among its own data; where USD is not installed nothing tells."""
+    try:
+        from pxr import Sdf, Tf
+    except ImportError:
+        return False
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException:
+        return False
+    return layer is not None and layer.customLayerData.get("program") == PROGRAM
+
+
 def is_signed(path: str | os.PathLike[str]) -> bool:
     """Whether this program wrote a file; what cannot be read, it did not."""
     try:
@@ -78,6 +91,8 @@ def is_signed(path: str | os.PathLike[str]) -> bool:
         return head.split(b"\n", 3)[2:3] == [b"% " + name]
     if head.startswith(b"#usda "):
         return b'string program = "' + name + b'"' in head
+    if head.startswith(b"PXR-USDC"):
+        return _is_signed_crate(path)
     if head.startswith(b"glTF"):
         return b'"generator":"' + name + b'"' in head
     if head.startswith(b"#?RADIANCE\n"):

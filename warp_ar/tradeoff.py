@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +28,7 @@ from warp_ar.accuracy.figures import make_figures
 from warp_ar.accuracy.progress import WorkProgress
 from warp_ar.accuracy.report import MIN_COLUMNS, make_cost_table, make_preset_list, print_report, records
 from warp_ar.accuracy.runs import Clock
-from warp_ar.command_line import EXIT_DONE, Parser, run_command
+from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command
 from warp_ar.device import resolve_device
 from warp_ar.errors import SceneError, SinkError, SourceError, UsageError
 from warp_ar.files import parse_json, read_text
@@ -194,4 +193,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main())

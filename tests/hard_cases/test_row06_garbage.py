@@ -32,7 +32,7 @@ MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environmen
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
 GUARDED = ("accumulate", "fill", "irradiance", "prefilter", "environment_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
-SIGNED = ("irradiance_sh", "mirrored", "layer_mirror_ball", "normals", "position", "motion", "coverage")
+SIGNED = ("irradiance_sh", "mirror_ball", "layer_mirror_ball", "normals", "position", "motion", "coverage")
 FRAME_READERS = ("unwrap", "sphere_map", "summed_area", "visibility", "surfaces", "coverage", "motion")
 MAP_READERS = [
     (stage, method) for stage, method in STAGE_METHODS if stage not in FRAME_READERS and method != "sphere_mip"
@@ -200,10 +200,10 @@ def test_a_broken_texel_counts_as_no_light(rig_for, stage, method):
 def test_a_broken_layer_pixel_stays_one_pixel(rig_for, stage, method, bad):
     rig = rig_for(stage, method)
     clean = rig.run(stage)["image"]
-    added = rig.get("physical_added")
+    added = rig.get("added_light")
     row, column = np.argwhere(added.sum(-1) > 0)[10]
     added[row, column] = bad
-    rig.poke("physical_added", added)
+    rig.poke("added_light", added)
     touched = (rig.run(stage)["image"] != clean).any(-1)
     touched[row, column] = False
     assert not touched.any()
@@ -219,12 +219,12 @@ def test_a_frame_pixel_changes_relighting_only_around_it(rig_for, method):
         rig.run("summed_area")
     clean = rig.run("relight")
     bad = FRAMES["grey"].copy()
-    row, column = np.argwhere(clean["physical_added"].sum(-1) > 0)[40]
+    row, column = np.argwhere(clean["added_light"].sum(-1) > 0)[40]
     bad[row, column] = 0
     rig.poke("frame", bad)
     if "summed_area" in rig.arrays:
         rig.run("summed_area")
-    touched = changed(rig, "relight", clean, "physical_added")
+    touched = changed(rig, "relight", clean, "added_light")
     rows, columns = np.nonzero(touched)
     reach = round(SIZE[1] / 8 / 2) + 1
     assert (np.abs(rows - row) <= reach).all()

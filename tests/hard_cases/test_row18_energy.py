@@ -138,7 +138,7 @@ def furnace_for(rig_for):
         rig.arrays["light_array"].assign(lights)
         if "emitters" in rig.arrays:
             rig.arrays["emitters"].zero_()
-        for name, value in (("shadow_ratio", 1.0), ("physical_added", 0.0)):
+        for name, value in (("shadow_ratio", 1.0), ("added_light", 0.0)):
             if name in rig.arrays:
                 rig.poke(name, value)
         names = [one.name for one, _ in rig.pipeline._scheduler._stages]
@@ -205,7 +205,7 @@ def test_white_objects_in_a_white_ball_change_nothing(furnace_for, rig_for, meth
     for color, colors in ((0.0, {"base_color": 0.0, "specular": 0.0}), (1.0, {})):
         rig = furnace_for("mirror_ball", method, {**WHITE[name], **colors})
         rig.arrays["probes"].assign(ball)
-        found[color] = rig.run("mirror_ball")["mirrored"]
+        found[color] = rig.run("mirror_ball")["mirror_ball"]
     black = found[0.0].max(-1) < 0.0
     assert black.any(), "the ball must show the objects"
     if name in ("lambert", "mirror"):

@@ -27,7 +27,7 @@ SHADING = [
 ]
 LIT = [(stage, method) for stage in ("relight", "shade", "mirror_ball") for method in METHODS[stage]]
 # A change of what the camera saw.
-SIGNED = ("mirrored",)
+SIGNED = ("mirror_ball",)
 ENDS = (
     {"model": PHONG, "shininess": 0.0},
     {"model": PHONG, "shininess": 1e5},
@@ -130,7 +130,7 @@ def test_lights_in_hard_places(rig_for, stage, method, name):
         assert_light(outputs, f"for a light {name!r} on a frame {content!r}")
         if name in generators.DARK_LIGHTS and stage == "relight":
             # From below, the box on the desk may catch light on its underside, which the camera does not see.
-            assert (outputs["physical_added"] == 0).all()
+            assert (outputs["added_light"] == 0).all()
 
 
 @pytest.mark.atlas(row=10, stage="relight")
@@ -145,7 +145,7 @@ def test_a_environment_without_direction_says_nothing_about_relief(rig_for, meth
     for direction in ((0, 0, 1), (0, 0, -1), (1, 0, 0), (0, 0, 0)):
         key["direction"], key["directionality"] = direction, 0.0
         rig.arrays["key_lights"].assign(key)
-        found.append(rig.run("relight")["physical_added"])
+        found.append(rig.run("relight")["added_light"])
     for other in found[1:]:
         np.testing.assert_array_equal(other, found[0])
 
@@ -165,8 +165,8 @@ def test_relief_from_one_end_of_alpha_to_the_other(rig_for, method):
     for alpha in np.linspace(-1, 1, 41):
         key["direction"], key["directionality"] = (math.sqrt(max(1 - alpha**2, 0)), 0.0, alpha), 1.0
         rig.arrays["key_lights"].assign(key)
-        found.append(rig.run("relight")["physical_added"])
-        assert_light({"physical_added": found[-1]}, f"at alpha = {alpha}")
+        found.append(rig.run("relight")["added_light"])
+        assert_light({"added_light": found[-1]}, f"at alpha = {alpha}")
     steps = np.abs(np.diff(found, axis=0)).max(axis=(1, 2, 3))
     assert steps.max() <= 5 * np.abs(found[0] - found[-1]).max() / 40 + 1e-6, "alpha moves light by jumps"
     assert np.abs(found[0] - found[-1]).max() > 0.05, "the ends must differ on a desk with structure"

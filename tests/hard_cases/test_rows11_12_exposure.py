@@ -149,8 +149,8 @@ def test_exposures_at_their_ends(device, method, name):
 
 def untouched_by(rig):
     """Pixels that no layer changes."""
-    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("physical_added") == 0).all(-1)
-    for name, neutral in (("shadow_ratio", 1.0), ("mirrored", 0.0)):
+    untouched = (rig.get("virtual") == 0).all(-1) & (rig.get("added_light") == 0).all(-1)
+    for name, neutral in (("shadow_ratio", 1.0), ("mirror_ball", 0.0)):
         if name in rig.arrays:
             untouched &= (rig.get(name) == neutral).all(-1)
     return untouched

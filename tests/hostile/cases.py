@@ -16,12 +16,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.hostile.corpus import READERS, SCENE, Reader
+from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.errors import SinkError
 from warp_ar.input.sources import open_source
+from warp_ar.light.captured import Light
 from warp_ar.output.environment_file import EnvironmentSink
+from warp_ar.output.gltf_file import write_glb
 from warp_ar.output.layer_file import LayerFrame, LayerSink
+from warp_ar.output.places import check_replaceable
+from warp_ar.output.shot import Shot
+from warp_ar.output.sink import make_folder
 from warp_ar.output.sinks import Sink, open_sink, write_environment
-from warp_ar.scene import loads_scene
+from warp_ar.output.stmap import write_stmap
+from warp_ar.output.track_file import write_track
+from warp_ar.output.usd_file import write_usd
+from warp_ar.reference import write_picture
+from warp_ar.scene import Pose, loads_scene
 
 DAMAGES = 28
 """Damaged copies of each file."""
@@ -385,7 +395,28 @@ PICTURES: dict[str, object] = {
 }
 
 
+SHOT = Shot(loads_scene(SCENE), 24.0, (Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5])),))
+RADIANCE = np.ones((4, 8, 3), np.float32)
+BLACK = np.zeros((4, 8, 3), np.uint8)
+FILES: dict[str, Callable[[pathlib.Path], object]] = {
+    "shot.usda": lambda path: write_usd(path, SHOT),
+    "shot.glb": lambda path: write_glb(path, SHOT),
+    "shot.jsonl": lambda path: write_track(path, SHOT),
+    "lens.exr": lambda path: write_stmap(path, RADIANCE[..., :2]),
+    "captured.exr": lambda path: Light(RADIANCE, RADIANCE[..., 0]).save(path),
+    "traced.exr": lambda path: write_picture(
+        path, TracedPicture(RADIANCE, RADIANCE, np.zeros((1, 1, 3), np.uint8), 8, 0, 0)
+    ),
+}
+"""What commands write at their end."""
+
+
 def _write(path: pathlib.Path, name: str, image: object) -> None:
+    if name in FILES:
+        check_replaceable(path, overwrite=False)
+        make_folder(path.parent)
+        FILES[name](path)
+        return
     good = np.zeros((16, 16, 3), np.float32 if name in ("light", "one.exr", "one.hdr") else np.uint8)
     taken: Any = good if image is None else image
     if name.startswith("one."):
@@ -446,10 +477,10 @@ def all_cases(damages: int = DAMAGES) -> Iterator[Case]:
         yield _source_name(what, name)
     for number in range(damages):
         yield _scene_text(f"damage {number}", damaged(SCENE.encode(), 9_900_000 + number).decode("latin-1"))
-    for name in SINKS:
+    for name in (*SINKS, *FILES):
         for what in PLACES:
             yield _place(name, what)
         for what in ("a name of 5,000 characters", "a zero byte", "half a pair", "a terminal's commands"):
             yield _sink_name(name, what, NAMES[what])
-        for what in PICTURES:
+        for what in PICTURES if name in SINKS else ():
             yield _sink_picture(name, what)

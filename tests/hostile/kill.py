@@ -1,6 +1,6 @@
 """Kills a process at random moments while it writes, and looks at what it leaves.
 
-    python -m tests.hostile.kill 50      # so often for each sink; prints a table
+    python -m tests.hostile.kill 50 [SINK ...]      # so often for each sink, or for those named; prints a table
 
 Each attempt is a fork of this process that writes frames; half of them stand on what an earlier run left.
 """
@@ -15,7 +15,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -171,11 +171,11 @@ def attempt(name: str, number: int, kind: signal.Signals, folder: pathlib.Path) 
     return count
 
 
-def main(times: int) -> int:
+def main(times: int, names: Sequence[str] = tuple(SINKS)) -> int:
     """Kill each sink so often by either signal; prints what held, and returns 1 if anything did not."""
     failed = 0
     print("| sink | signal | kills | whole | frames left, least to most |\n| --- | --- | --: | --: | --: |")
-    for name in SINKS:
+    for name in names:
         for kind in (signal.SIGKILL, signal.SIGTERM):
             counts = []
             for number in range(times):
@@ -191,4 +191,4 @@ def main(times: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1])))
+    sys.exit(main(int(sys.argv[1]), sys.argv[2:] or tuple(SINKS)))

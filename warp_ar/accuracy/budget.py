@@ -31,7 +31,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -57,6 +56,7 @@ from warp_ar.accuracy.costs import (
     write_costs,
 )
 from warp_ar.cache_folder import cache_folder
+from warp_ar.closing import Closing
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.pipeline import Pipeline, Result
 from warp_ar.engine.switcher import PipelineSwitcher, Target
@@ -349,7 +349,7 @@ class _OfTheLatest(Generic[T]):
         return self._get(auto.pipeline)
 
 
-class AutoPipeline:
+class AutoPipeline(Closing):
     """A pipeline that changes its quality to keep to a budget; it is called as ``Pipeline`` is."""
 
     def __init__(
@@ -403,14 +403,6 @@ class AutoPipeline:
         self._rejected: list[dict[str, Any]] = []
         self._frames = 0
         self._told = False
-
-    def __enter__(self) -> AutoPipeline:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def warm_up(self, progress: Progress | None = None) -> None:
         """As ``Pipeline.warm_up``, for the settings of the first frame."""

@@ -35,12 +35,12 @@ _OUTPUT = {
     "recover": "environment",
     "irradiance": "irradiance",
     "prefilter": "prefilter_levels",
-    "relight": "physical_added",
+    "relight": "added_light",
     "environment_shadow": "shadow_ratio",
     "shade": "virtual",
-    "mirror_ball": "mirrored",
+    "mirror_ball": "mirror_ball",
     "edge_samples": "virtual",
-    "light_shadow": "physical_added",
+    "light_shadow": "added_light",
     "expose": "image",
 }
 """What a setting's stage writes; settings that are not here change the size of what is written."""
@@ -157,12 +157,12 @@ def _read_output(pipeline: Pipeline, setting: Setting) -> npt.NDArray[Any] | Non
         return None
     arrays = pipeline.arrays
     if name == "virtual" and name not in arrays:
-        name = "physical_added"  # no objects: what has edges is the shadows on the desk
+        name = "added_light"  # no objects: what has edges is the shadows on the desk
     if name == "irradiance":
         if "irradiance_sh" in arrays:
             return irradiance_from_sh(arrays["irradiance_sh"].numpy())
         return resample(arrays["irradiance_map"].numpy(), NORMALS)
-    neutral = {"shadow_ratio": 1.0, "mirrored": 0.0}
+    neutral = {"shadow_ratio": 1.0, "mirror_ball": 0.0}
     if name in neutral and name not in arrays:
         width, height = pipeline.size
         return np.full((height, width, 3), neutral[name], np.float32)

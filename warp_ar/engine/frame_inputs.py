@@ -261,7 +261,7 @@ class FrameInputs:
         outlines = {"object": scene.object_outline(), "direct": scene.light_outline()}
         if "relight_bounced" in arrays:
             outlines["light"] = scene.light_outline(bounced=True)
-        if "mirrored" in arrays:
+        if "mirror_ball" in arrays:
             outlines["ball"] = scene.ball_outline()
         if "shadow_ratio" in arrays:
             outlines["shadow"] = scene.shadow_outline()

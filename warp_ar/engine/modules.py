@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import hashlib
 import os
 import shutil
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -27,6 +30,8 @@ from warp_ar.device import compiling, exclusive, usable_cores
 Progress = Callable[[int, int], None]
 """Told how many of how many modules are compiled, first with 0; not called where all were compiled before."""
 
+_AHEAD: list[threading.Thread] = []
+"""Threads that parse headers before there is anything to compile."""
 _HEADER_WAIT = 10.0
 """Seconds that a thread waits for another's headers before it parses them itself."""
 
@@ -50,8 +55,54 @@ def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress |
                 _load(module, device)
 
 
+def parse_headers_ahead() -> None:
+    """Have Warp's headers parsed beside what this thread imports and builds, where no earlier run has left them.
+
+    Clang takes 1.4 s for them before it compiles the first kernel of an empty cache, and leaves Python to others
+    meanwhile. Warp must have been started.
+    """
+    build = getattr(getattr(getattr(wp, "_src", None), "build", None), "build_cpu", None)
+    headers = _Headers([])
+    if build is None or not headers.missing or any(thread.is_alive() for thread in _AHEAD):
+        return
+    _AHEAD.append(threading.Thread(target=headers.parse, args=(build,), name="warp_ar-headers", daemon=True))
+    _AHEAD[-1].start()
+
+
+def remember_references() -> None:
+    """Have Warp look for what a function of this package refers to once, not again for each kernel that calls it.
+
+    That is half of what it takes to find a kernel in the cache. For commands alone, whose process changes no function
+    and no constant once a module is imported. Where this Warp looks in another way, nothing changes.
+    """
+    adjoint = getattr(getattr(getattr(wp, "_src", None), "codegen", None), "Adjoint", None)
+    find = getattr(adjoint, "get_references", None)
+    if adjoint is None or find is None or hasattr(find, "__wrapped__"):
+        return
+
+    @functools.wraps(find)
+    def get_references(adj: Any) -> Any:
+        kept = adj.__dict__.get("_warp_ar_references")
+        if kept is not None:
+            return kept
+        found = find(adj)
+        home = sys.modules.get(adj.func.__module__)
+        # While a module is imported, a function may name one that comes below it.
+        if home is not None and _is_own(home) and not getattr(home.__spec__, "_initializing", False):
+            adj._warp_ar_references = found
+        return found
+
+    adjoint.get_references = get_references
+
+
+def _is_own(module: Any) -> bool:
+    return str(module.__name__).startswith("warp_ar.")
+
+
 def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
     cores = usable_cores()
+    while _AHEAD:
+        _AHEAD.pop().join()
     headers = _Headers({_flags(module) for module in modules}) if device.is_cpu else None
 
     modules = sorted(modules, key=_has_flags)
@@ -130,6 +181,27 @@ class _Headers:
         parsed = folders.get(threading.get_ident()) if isinstance(folders, dict) else None
         if parsed is not None and not _headers_in(self._store):
             _copy_headers(Path(parsed.name), self._store)
+
+    @property
+    def missing(self) -> bool:
+        """Whether they can be kept, and nobody has left them."""
+        return self._folder_of_thread is not None and not _headers_in(self._store)
+
+    def parse(self, build: Callable[..., None]) -> None:
+        """Parse them on this thread, for all others.
+
+        Args:
+            build: Warp's function that compiles a file of C++.
+        """
+        flags = str(wp.config.cpu_compiler_flags)
+        with self.shared(flags), tempfile.TemporaryDirectory() as folder:
+            source = Path(folder) / "headers.cpp"
+            source.write_text('#include "builtin.h"\n', encoding="utf-8")
+            kept = self._folder_of_thread() if self._folder_of_thread is not None else None
+            target = str(source.with_suffix(".o"))
+            build(target, str(source), extra_flags=flags, use_precompiled_headers=True, pch_dir=kept, block_dim=1)
+        self.close()
+        remove_header_folders([threading.get_ident()])
 
     @contextlib.contextmanager
     def shared(self, flags: str) -> Any:

@@ -11,13 +11,13 @@ import pathlib
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_ar.closing import Closing
 from warp_ar.device import exclusive, resolve_device, translating
 from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
@@ -93,7 +93,7 @@ def _read_scene(scene: object) -> Scene:
     return scene
 
 
-class Pipeline:
+class Pipeline(Closing):
     """Lights frames: call it with one frame after another of one camera.
 
     Arrays are allocated here, never while frames run.
@@ -183,14 +183,6 @@ class Pipeline:
             )
             if self.plan.needs("short_frames"):
                 self._short = ShortFrames(self.plan.features, self._arrays, self.device)
-
-    def __enter__(self) -> Pipeline:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from warp_ar.errors import SceneError
-from warp_ar.farm.tables import JobsError, Span, Table
+from warp_ar.farm.tables import JobsError, JobTable, Span
 from warp_ar.scene import (
     LambertMaterial,
     Light,
@@ -136,7 +136,7 @@ class Dataset:
     exposure: Span
     """Scale of the exposure."""
     catalogue: tuple[ObjectSpec, ...]
-    lamps: tuple[LightSpec, ...]
+    kinds_of_light: tuple[LightSpec, ...]
 
 
 def read_dataset(label: str, folder: Path, data: object) -> Dataset:
@@ -145,12 +145,12 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     Raises:
         JobsError: A key is wrong or missing.
     """
-    table = Table(label, folder, "dataset", data, _KEYS)
+    table = JobTable(label, folder, "dataset", data, _KEYS)
     entries = table.data.get("object")
     if not isinstance(entries, list) or not entries:
         table.fail("object", "expected at least one [[dataset.object]]")
     catalogue = tuple(
-        _read_object(Table(label, folder, f"dataset.object[{index}]", entry, _OBJECT_KEYS), index)
+        _read_object(JobTable(label, folder, f"dataset.object[{index}]", entry, _OBJECT_KEYS), index)
         for index, entry in enumerate(entries)
     )
     if len({spec.name for spec in catalogue}) < len(catalogue):
@@ -158,25 +158,23 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
     entries = table.data.get("light", [])
     if not isinstance(entries, list):
         table.fail("light", "expected [[dataset.light]]")
-    lamps = tuple(
-        _read_light(Table(label, folder, f"dataset.light[{index}]", entry, _LIGHT_KEYS))
+    kinds = tuple(
+        _read_light(JobTable(label, folder, f"dataset.light[{index}]", entry, _LIGHT_KEYS))
         for index, entry in enumerate(entries)
     )
     region = table.data.get("region")
     if region is not None:
-        spans = Table(label, folder, "dataset", {"region": region}, ("region",)).span(
-            "region", None, 4, low=-100, high=100
-        )
+        spans = table.span("region", None, 4, low=-100, high=100)
         x0, y0, x1, y1 = spans.low
         if not (x0 < x1 and y0 < y1) or spans.low != spans.high:
             table.fail("region", "expected [x0, y0, x1, y1] in metres with x0 < x1 and y0 < y1")
         region = (x0, y0, x1, y1)
-    lights = table.pair("lights", (1, 1) if lamps else (0, 0), low=0)
+    lights = table.pair("lights", (1, 1) if kinds else (0, 0), low=0)
     objects = table.pair("objects", (1, 3), low=0)
     for key, (_, most) in (("objects", objects), ("lights", lights)):
         if most > MOST:
             table.fail(key, f"expected {MOST} at most")
-    if lights[1] and not lamps:
+    if lights[1] and not kinds:
         table.fail("lights", "expected at least one [[dataset.light]] to draw them from")
     return Dataset(
         variations=table.integer("variations", 1, low=1),
@@ -188,15 +186,13 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
         margin=table.number("margin", 0.005, low=0.0, high=10.0),
         exposure=table.span("exposure", Span((1.0,), (1.0,)), low=0.01, high=16.0),
         catalogue=catalogue,
-        lamps=lamps,
+        kinds_of_light=kinds,
     )
 
 
-def _read_object(table: Table, index: int) -> ObjectSpec:
+def _read_object(table: JobTable, index: int) -> ObjectSpec:
     shape = table.choice("shape", _SHAPES, "mesh")
-    for key in {key for keys in _SHAPES.values() for key in keys} - set(_SHAPES[shape]):
-        if key in table:
-            table.fail(key, f'not used with shape = "{shape}"; its own keys are {", ".join(_SHAPES[shape])}')
+    table.only("shape", shape, _SHAPES[shape], (key for keys in _SHAPES.values() for key in keys))
     lengths: dict[str, Any] = {}
     for key in _SHAPES[shape]:
         if key == "file":
@@ -215,7 +211,7 @@ def _read_object(table: Table, index: int) -> ObjectSpec:
         **lengths,
     )
     return ObjectSpec(
-        name=table.text("name") or (item.file.stem if item.file is not None else f"{shape}-{index + 1}"),
+        name=table.text("name", f"{shape}-{index + 1}" if item.file is None else item.file.stem),
         item=item,
         turn=table.span("turn", Span((0.0,), (360.0,)), low=-360.0, high=360.0),
         rest=table.choice("rest", RESTS, RESTS[0]),
@@ -224,13 +220,12 @@ def _read_object(table: Table, index: int) -> ObjectSpec:
     )
 
 
-def _read_material(outer: Table, data: object) -> MaterialSpec:
-    model = data.get("model", "metallic_roughness") if isinstance(data, dict) else ""
-    known = _MATERIALS.get(model)
-    names = known[1] if known else ()
-    table = Table(outer.label, outer.folder, f"{outer.section}.material", data, ("model", *names))
-    if known is None:
-        table.choice("model", _MATERIALS, "")
+def _read_material(outer: JobTable, data: object) -> MaterialSpec:
+    every = {name for _, names in _MATERIALS.values() for name in names}
+    table = outer.inner("material", data, ("model", *sorted(every)))
+    model = table.choice("model", _MATERIALS, "metallic_roughness")
+    names = _MATERIALS[model][1]
+    table.only("model", model, names, every)
     spans = []
     for name in names:
         default = getattr(_MATERIALS[model][0], name)
@@ -240,7 +235,7 @@ def _read_material(outer: Table, data: object) -> MaterialSpec:
     return MaterialSpec(model, tuple(spans))
 
 
-def _read_light(table: Table) -> LightSpec:
+def _read_light(table: JobTable) -> LightSpec:
     kind = table.choice("kind", ("spot", "point"), "spot")
 
     def fixed(*values: float) -> Span:
@@ -260,7 +255,7 @@ def _read_light(table: Table) -> LightSpec:
 
 
 def _fixed(
-    table: Table, key: str, size: int, low: float, high: float, default: tuple[float, ...] | None = None
+    table: JobTable, key: str, size: int, low: float, high: float, default: tuple[float, ...] | None = None
 ) -> tuple[float, ...]:
     """Numbers that are not drawn: a label stands for one size."""
     span = table.span(key, None if default is None else Span(default, default), size, low=low, high=high)
@@ -282,9 +277,9 @@ def check_dataset(label: str, dataset: Dataset, base: Scene) -> None:
     """
     if dataset.objects[1] and not sum(spec.weight for spec in dataset.catalogue) > 0.0:
         raise JobsError(f"{label}: dataset.object: every weight is 0; one must be above")
-    if dataset.lights[1] and not sum(spec.weight for spec in dataset.lamps) > 0.0:
+    if dataset.lights[1] and not sum(spec.weight for spec in dataset.kinds_of_light) > 0.0:
         raise JobsError(f"{label}: dataset.light: every weight is 0; one must be above")
-    for section, specs in (("object", dataset.catalogue), ("light", dataset.lamps)):
+    for section, specs in (("object", dataset.catalogue), ("light", dataset.kinds_of_light)):
         for index, spec in enumerate(specs):
             for extreme in (_Extreme(0.0), _Extreme(math.nextafter(1.0, 0.0))):
                 scene = dataclasses.replace(base, source=None, objects=(), lights=())

@@ -32,7 +32,10 @@ def make_parser() -> argparse.ArgumentParser:
     resume.add_argument("--failed", action="store_true", help="try jobs again that have failed for good")
     for command in (run, resume):
         command.add_argument(
-            "--workers", type=int, metavar="N", help="workers here (default: one per GPU, or per 4 cores)"
+            "--workers",
+            type=int,
+            metavar="N",
+            help="workers here (default: as many for each GPU as a short trial finds room for, or one per 4 cores)",
         )
         command.add_argument(
             "--ray",
@@ -48,7 +51,10 @@ def make_parser() -> argparse.ArgumentParser:
         command.add_argument("--device", default="auto", metavar="auto|cpu|cuda", help="where the kernels run")
     status = commands.add_parser("status", help="say where a run stands")
     status.add_argument("folder", type=Path, metavar="DIR", help="the run's folder")
-    status.add_argument("--json", action="store_true", help="as JSON")
+    how = status.add_mutually_exclusive_group()
+    how.add_argument("--json", action="store_true", help="as JSON")
+    how.add_argument("--html", type=Path, metavar="FILE", help="as a page that needs nothing else")
+    how.add_argument("--serve", type=int, metavar="PORT", help="as a page on this machine, drawn anew at each look")
     return parser
 
 
@@ -64,6 +70,23 @@ def command(options: argparse.Namespace) -> int:
             return resume(options)
         case "plan":
             return plan(options)
+    return tell_status(options)
+
+
+def tell_status(options: argparse.Namespace) -> int:
+    """``farm status``."""
+    if options.html is not None or options.serve is not None:
+        from warp_ar.farm.status_page import HOST, make_server, write_page
+
+        if options.html is not None:
+            write_page(options.folder, options.html)
+            return EXIT_DONE
+        if not 0 <= options.serve < 1 << 16:
+            raise UsageError(f"--serve {options.serve}: expected a port from 0 to 65535")
+        with make_server(options.folder, options.serve) as server:
+            say(f"http://{HOST}:{server.server_port} shows {options.folder}; Ctrl+C ends it")
+            server.serve_forever()
+        return EXIT_DONE
     status = read_status(options.folder)
     print(json.dumps(status, indent=1) if options.json else "\n".join(status_lines(options.folder, status)))
     return EXIT_DONE
@@ -74,7 +97,12 @@ def begin(options: argparse.Namespace) -> int:
     from warp_ar.farm.version import program_version
 
     data = read_jobs(options.jobs)
-    parse_jobs(data, str(options.jobs))  # before a folder is made
+    # Before a folder is made: what cannot be begun leaves none.
+    parse_jobs(data, str(options.jobs))
+    if options.ray is None:
+        from warp_ar.farm.pool import devices_of
+
+        devices_of(options.device, options.workers)
     begin_run(options.output, data, program_version())
     return work(options, options.output)
 
@@ -113,12 +141,17 @@ def work(options: argparse.Namespace, folder: Path) -> int:
 
 
 def _make_pool(options: argparse.Namespace, jobs: Any, folder: Path) -> Any:
+    from warp_ar.device import usable_cores
+    from warp_ar.farm.fitting import fit_workers
     from warp_ar.farm.pool import ProcessPool, devices_of
     from warp_ar.farm.records import Context
 
     context = Context(jobs, folder.absolute(), "cpu")
     if options.ray is None:
-        return ProcessPool(context, devices_of(options.device, options.workers))
+        workers = options.workers
+        if workers is None and (devices := devices_of(options.device, None))[0] != "cpu":
+            workers = fit_workers(jobs, devices, usable_cores(), say)
+        return ProcessPool(context, devices_of(options.device, workers))
     from warp_ar.farm.ray_pool import RayPool
 
     pool = RayPool(context, options.ray or None, options.workers)

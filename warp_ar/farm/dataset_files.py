@@ -153,7 +153,7 @@ and by virtual lights. Labels come from the geometry that was rendered; nobody d
 - `normals`: 16-bit PNG, (n + 1) / 2 in the camera's axes (x right, y down, z forward); 0 where nothing is modelled
 - `mask`: the silhouette within the picture, whatever is before it; `mask_visib`: what is seen of it
 - `scene_light.json`: virtual lights in the world's metres, and the environment as nine spherical harmonics of its
-  radiance; `environment_key` numbers the map in `clips/NAME/survey.npz` of the run
+  radiance; `environment_key` numbers the map in `clips/NAME/lights.bin` of the run
 - `annotations.json`: COCO, over all variations; `models/`: PLY in millimetres with `models_info.json`
 
 ## Clips

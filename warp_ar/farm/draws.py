@@ -51,7 +51,7 @@ class Drawn:
 
 
 @dataclasses.dataclass(frozen=True)
-class Desk:
+class Receiver:
     """Where objects of a clip may stand."""
 
     height: float
@@ -80,7 +80,8 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
     lights = int(random.integers(dataset.lights[0], dataset.lights[1] + 1))
     exposure = round(dataset.exposure.draw_one(random), 6)
     kinds = _choose(random, [spec.weight for spec in dataset.catalogue], count)
-    lamps = [dataset.lamps[kind].draw(random) for kind in _choose(random, [s.weight for s in dataset.lamps], lights)]
+    weights = [spec.weight for spec in dataset.kinds_of_light]
+    drawn = [dataset.kinds_of_light[kind].draw(random) for kind in _choose(random, weights, lights)]
     # In the catalogue's order: scenes of the same kinds then share their kernels and their arrays.
     placed = _place(base, dataset, sorted(kinds), poses, random)
     if len(placed) < dataset.objects[0]:
@@ -89,7 +90,7 @@ def draw_variation(base: Scene, dataset: Dataset, clip: int, variation: int, pos
             "dataset.region, or lower dataset.objects or dataset.margin"
         )
     scene = dataclasses.replace(
-        base, objects=tuple(item for _, item in placed), lights=tuple(lamps), exposure=Exposure(exposure)
+        base, objects=tuple(item for _, item in placed), lights=tuple(drawn), exposure=Exposure(exposure)
     )
     return Drawn(scene, tuple(kind for kind, _ in placed))
 
@@ -105,16 +106,16 @@ def _place(
     base: Scene, dataset: Dataset, kinds: Sequence[int], poses: Sequence[Pose], random: np.random.Generator
 ) -> list[tuple[int, Object]]:
     """Objects of these kinds where there is room; the larger kinds do not go first, so that all are treated alike."""
-    desk = desk_of(base, dataset)
+    receiver = receiver_of(base, dataset)
     seen = [poses[i] for i in np.linspace(0, len(poses) - 1, min(CAMERAS, len(poses))).astype(int)] if poses else []
     marker = [_project(base, pose, _marker_corners(base)) for pose in seen] if base.has_marker else []
-    taken = list(desk.taken)
+    taken = list(receiver.taken)
     placed: list[tuple[int, Object]] = []
     for kind in kinds:
         spec = dataset.catalogue[kind]
         material = spec.material.draw(random)
         for _ in range(TRIES):
-            item, points = _try(spec, desk, random)
+            item, points = _try(spec, receiver, random)
             outline = _inflated(_hull(points[:, :2]), dataset.margin)
             if any(_overlap(outline, other) for other in taken):
                 continue
@@ -126,9 +127,9 @@ def _place(
     return placed
 
 
-def _try(spec: ObjectSpec, desk: Desk, random: np.random.Generator) -> tuple[Object, Points]:
+def _try(spec: ObjectSpec, receiver: Receiver, random: np.random.Generator) -> tuple[Object, Points]:
     """An object somewhere in the region, resting on the receiver, and its points in the world."""
-    x0, y0, x1, y1 = desk.region
+    x0, y0, x1, y1 = receiver.region
     x, y = x0 + random.random() * (x1 - x0), y0 + random.random() * (y1 - y0)
     turn = spec.turn.draw_one(random)
     rotation = rotation_matrix((0.0, 0.0, turn)) @ rotation_matrix(spec.item.rotate)
@@ -136,7 +137,7 @@ def _try(spec: ObjectSpec, desk: Desk, random: np.random.Generator) -> tuple[Obj
         rotation = rotation @ _random_rotation(random)
     rotate = _angles(rotation)
     points = spec.item.scale * local_points(spec.item) @ rotation_matrix(rotate).T
-    z = desk.height - float(points[:, 2].min())
+    z = receiver.height - float(points[:, 2].min())
     at = (round(float(x), 6), round(float(y), 6), round(z, 7))
     return dataclasses.replace(spec.item, at=at, rotate=rotate), points + np.array(at)
 
@@ -187,7 +188,7 @@ def local_points(item: Object) -> Points:
     return _points_of(item.shape, item.file, lengths[item.shape])
 
 
-def desk_of(scene: Scene, dataset: Dataset) -> Desk:
+def receiver_of(scene: Scene, dataset: Dataset) -> Receiver:
     """Where objects may stand: on the first level plane that is modelled, or at the marker's height."""
     plane = next((p for p in scene.proxies if p.shape == "plane" and _is_level(p)), None)
     height = 0.0 if plane is None else plane.at[2]
@@ -200,7 +201,7 @@ def desk_of(scene: Scene, dataset: Dataset) -> Desk:
     taken += [_hull(circle * probe.radius + np.array(probe.center[:2])) for probe in scene.probes]
     if scene.has_marker:
         taken.append(_hull(CARD * _marker_corners(scene)[:, :2] / QUIET))
-    return Desk(height, region, tuple(taken))
+    return Receiver(height, region, tuple(taken))
 
 
 def _is_level(proxy: Proxy) -> bool:

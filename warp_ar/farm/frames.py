@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import fractions
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import numpy.typing as npt
+from av.codec.hwaccel import HWAccel
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.input.frame_folder import FrameFolder
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource
 from warp_ar.input.sources import open_source
 from warp_ar.input.video_file import VideoFile
+
+CONVERTERS = 2
+"""Threads of a worker that turn decoded pictures into RGB: of all that is done in order, the slowest in a survey."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,12 +50,27 @@ class VideoPart(VideoFile):
         first: Number of the first frame.
         end: Number behind the last.
         fps: Show frame n at n / fps instead of at its own time.
+        gpu: Number of the GPU whose decoding unit is to be used, where it has one for this coding; None: none is.
     """
 
-    def __init__(self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None) -> None:
+    _converters = CONVERTERS
+
+    def __init__(
+        self, path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
+    ) -> None:
+        self._gpu = gpu
         super().__init__(path, fps=fps)
         self._index, self._first, self._end = index, first, end
         self.length = end - first
+
+    def _open(self, **how: Any) -> Any:
+        """As ``VideoFile``'s; what the GPU's unit cannot begin is decoded by the processor, with the same pictures."""
+        if self._gpu is not None:
+            unit = HWAccel("cuda", device=str(self._gpu), allow_software_fallback=True)
+            with contextlib.suppress(SourceError, NotImplementedError):
+                return super()._open(**how, hwaccel=unit)
+            self._gpu = None
+        return super()._open(**how)
 
     def _decode(self) -> Generator[Frame, None, None]:
         ticks, tick = self._index.ticks, self._index.tick
@@ -140,12 +161,14 @@ def index_frames(path: Path, fps: float | None) -> FrameIndex:
     return FrameIndex(ticks, fractions.Fraction(tick), True)
 
 
-def open_part(path: Path, index: FrameIndex, first: int, end: int, fps: float | None) -> RecordedSource:
+def open_part(
+    path: Path, index: FrameIndex, first: int, end: int, fps: float | None, gpu: int | None = None
+) -> RecordedSource:
     """Frames ``first`` to ``end`` of a recording; arguments as ``VideoPart``."""
     with open_source(path, fps=fps) as source:
         is_video = isinstance(source, VideoFile)
     if is_video:
-        return VideoPart(path, index, first, end, fps)
+        return VideoPart(path, index, first, end, fps, gpu)
     return FolderPart(path, first, end, fps or DEFAULT_FPS)
 
 

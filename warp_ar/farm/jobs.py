@@ -11,14 +11,13 @@ import functools
 import glob
 import json
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from warp_ar.errors import SceneError, reason
+from warp_ar.errors import SceneError
 from warp_ar.farm.catalogue import Dataset, check_dataset, read_dataset
-from warp_ar.farm.tables import JobsError, Table
-from warp_ar.files import bracket_depth, check_depth, is_file, is_folder, read_text
+from warp_ar.farm.tables import JobsError, JobTable
+from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
@@ -27,7 +26,9 @@ LIGHTS = ("follow", "fixed", "preroll")
 """Ways to light a clip whose scene has a mirror ball: by what was captured for each frame, by what was captured at the
 clip's end, or by what each segment finds for itself from some frames before it on."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll")
+DECODERS = ("cpu", "gpu")
+"""What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -43,6 +44,12 @@ class Settings:
     """Frames of a segment; None: a clip is one."""
     preroll: int = 48
     """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
+    decode: str = DECODERS[0]
+    """One of ``DECODERS``."""
+
+    def gpu_of(self, device: str) -> int | None:
+        """Number of the GPU that decodes for a worker on a device; None: the processor does."""
+        return int(device.partition(":")[2] or 0) if self.decode == "gpu" and device.startswith("cuda") else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,11 +164,7 @@ def read_jobs(path: str | Path) -> dict[str, Any]:
     path = Path(path)
     label = str(path)
     text = read_text(path, JobsError, expected="TOML")
-    check_depth(bracket_depth(text), label, JobsError)
-    try:
-        data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise JobsError(f"{label}: not valid TOML: {reason(error)}") from error
+    data = parse_toml(text, label, JobsError)
     folder = path.absolute().parent
     clips = data.get("clip")
     if not isinstance(clips, list) or not clips:
@@ -173,9 +176,9 @@ def read_jobs(path: str | Path) -> dict[str, Any]:
 
 def _resolved(label: str, folder: Path, index: int, clip: object) -> list[dict[str, Any]]:
     """One entry for each file that a clip's path matches."""
-    table = Table(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
-    pattern = table.text("path")
-    if pattern is None or not glob.has_magic(pattern) or (folder / pattern).exists():
+    table = JobTable(label, folder, f"clip[{index}]", clip, _CLIP_KEYS)
+    pattern = table.text("path", "")
+    if not glob.has_magic(pattern) or (folder / pattern).exists():
         return [dict(table.data)]
     found = sorted(glob.glob(pattern, root_dir=folder, recursive=True))
     if not found:
@@ -197,14 +200,14 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         SceneError: A scene, or a file that it names, cannot be used.
     """
     folder = Path(data.get("folder", "."))
-    top = Table(label, folder, "", data, ("schema", "run", "clip", "dataset", "folder"))
+    top = JobTable(label, folder, "", data, ("schema", "run", "clip", "dataset", "folder"))
     if data.get("schema") != SCHEMA:
         top.fail("schema", f"expected {SCHEMA}")
-    settings = _read_settings(Table(label, folder, "run", data.get("run", {}), _RUN_KEYS))
+    settings = _read_settings(JobTable(label, folder, "run", data.get("run", {}), _RUN_KEYS))
     names: dict[str, int] = {}
     clips = []
     for index, entry in enumerate(data["clip"]):
-        clips.append(_read_clip(Table(label, folder, f"clip[{index}]", entry, _CLIP_KEYS), names))
+        clips.append(_read_clip(JobTable(label, folder, f"clip[{index}]", entry, _CLIP_KEYS), names))
     dataset = None if "dataset" not in data else read_dataset(label, folder, data["dataset"])
     if dataset is not None and settings.light == "preroll":
         raise JobsError(
@@ -213,20 +216,43 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
+        _check_exposure(label, jobs, clips[scene], base)
         if dataset is not None:
             check_dataset(label, dataset, base)
     return jobs
 
 
-def _read_settings(table: Table) -> Settings:
+def _check_exposure(label: str, jobs: JobFile, clip: Clip, scene: Scene) -> None:
+    """Refuse exposures that depend on the frames before, where a job does not see those.
+
+    Raises:
+        JobsError: They do.
+    """
+    settings = jobs.settings
+    whole = settings.light == "preroll" and settings.segment_frames is None
+    if scene.source is not None and scene.source.metering == "automatic" and not whole:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says source.metering = "automatic", and its drift is told '
+            'from all frames before; expected run.light = "preroll" without segment_frames, or metering = "fixed"'
+        )
+    cut = settings.segment_frames is not None and settings.light != "preroll"
+    if scene.exposure.scale == "auto" and jobs.dataset is None and cut:
+        raise JobsError(
+            f'{label}: clip {clip.name}: scene {clip.scene} says exposure.scale = "auto", which adapts from frame to '
+            'frame; expected no run.segment_frames, run.light = "preroll", or a number as scale'
+        )
+
+
+def _read_settings(table: JobTable) -> Settings:
     quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
-    size = table.integer("segment_frames", 0, low=1) if "segment_frames" in table else None
-    return Settings(quality, table.choice("light", LIGHTS, LIGHTS[0]), size, table.integer("preroll", 48, low=0))
+    size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
+    light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode)
 
 
-def _read_clip(table: Table, names: dict[str, int]) -> Clip:
+def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:
     """One clip; ``names`` holds how often a name was used."""
-    scene = table.text("scene") or "desk"
+    scene = table.text("scene", "desk")
     source, light, calibration = (table.path(key) for key in ("path", "light", "calibration"))
     if source is not None and not (is_file(source) or is_folder(source)):
         table.fail("path", f"there is no file or folder {source}")
@@ -236,7 +262,7 @@ def _read_clip(table: Table, names: dict[str, int]) -> Clip:
     in_folder = table.folder / scene
     if is_file(in_folder):
         scene = str(in_folder)
-    name = table.text("name")
+    name = table.text("name") if "name" in table else None
     if name is not None and (not _NAME.fullmatch(name) or name in names):
         table.fail("name", "expected letters, digits, dots and dashes that no other clip has")
     if name is None:

@@ -8,18 +8,18 @@ import dataclasses
 import gc
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.closing import Closing
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.farm.frames import open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
 from warp_ar.farm.survey import Survey, lit_scene
-from warp_ar.input.source import Frame
+from warp_ar.input.source import Frame, RecordedSource
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.ray_scene import skeleton
 
@@ -46,7 +46,7 @@ class Lit:
         return self.frame.image if self.result is None else self.result.image
 
 
-class Lighter:
+class Lighter(Closing):
     """Lights segments and variations; one for each worker."""
 
     def __init__(self, jobs: JobFile, folder: Path, device: str) -> None:
@@ -61,14 +61,6 @@ class Lighter:
         self._pipelines: collections.OrderedDict[Any, Pipeline] = collections.OrderedDict()
         self._survey: tuple[int, Survey] | None = None
         self._key: tuple[int, int, Any] | None = None
-
-    def __enter__(self) -> Lighter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let the pipelines' threads go."""
@@ -114,9 +106,8 @@ class Lighter:
         if self._jobs.settings.light == "preroll":
             yield from self._light_alone(job, survey, outputs)
             return
-        path, fps = source_of(self._jobs, job.clip)
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
-        with contextlib.closing(open_part(path, survey.index, job.first, job.end, fps)) as source:
+        with contextlib.closing(self._open(job.clip, job.first, job.end)) as source:
             pipeline = self._pipeline_for(own, source.size, outputs, follows=len(survey.keys) > 0)
             pipeline.restart(saturation=survey.saturation)
             self._key = None
@@ -130,6 +121,12 @@ class Lighter:
                 self._follow(pipeline, survey, job.clip, frame.index)
                 call = pipeline.submit if outputs == ("image",) else pipeline
                 yield Lit(frame, pose, call(frame.image, time_seconds=frame.time, pose=pose), pipeline)
+
+    def _open(self, clip: int, first: int, end: int) -> RecordedSource:
+        """Frames of a clip."""
+        path, fps = source_of(self._jobs, clip)
+        gpu = self._jobs.settings.gpu_of(self._device)
+        return open_part(path, self.survey(clip).index, first, end, fps, gpu)
 
     def _follow(self, pipeline: Pipeline, survey: Survey, clip: int, frame: int) -> None:
         """Give a pipeline the light that holds for a frame."""
@@ -168,11 +165,10 @@ class Lighter:
 
     def _light_alone(self, job: Job, survey: Survey, outputs: tuple[str, ...]) -> Iterator[Lit]:
         """Light a segment that gathers its own light and track from the frames before it on."""
-        path, fps = source_of(self._jobs, job.clip)
         scene = scene_of(self._jobs, job.clip)
         first, _ = lit_range(self._jobs.clips[job.clip], survey.index.length)
         begin = max(first, job.first - self._jobs.settings.preroll)
-        with contextlib.closing(open_part(path, survey.index, begin, job.end, fps)) as source:
+        with contextlib.closing(self._open(job.clip, begin, job.end)) as source:
             pipeline = Pipeline(
                 scene,
                 device=self._device,
@@ -180,7 +176,6 @@ class Lighter:
                 size=source.size,
                 outputs=outputs,
                 synchronous=True,
-                follows_camera=False,
             )
             with pipeline:
                 pipeline.start_clock(0.0)

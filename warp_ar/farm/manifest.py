@@ -20,13 +20,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from warp_ar.errors import UsageError, WarpArError, reason
-from warp_ar.files import write_whole
+from warp_ar.files import kind_of, write_whole
 
 MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
 ASIDE = ".aside"
 """Folder of outputs that are not whole yet."""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+
+LOCK_SECONDS = 1.0
+"""Within which a lock must come free: who asks for a run's state may hold it for a moment."""
 
 
 class RunError(WarpArError):
@@ -79,7 +84,7 @@ class Manifest:
             self._open(len(whole))
 
     def _open(self, size: int) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
         try:
             self._file = os.open(self.path, flags, 0o666)
             os.ftruncate(self._file, size)
@@ -138,18 +143,32 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         RunError: Another driver has it.
     """
-    import fcntl
-
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
-    file = os.open(folder / LOCK, flags, 0o666)
+    lock = filelock.FileLock(folder / LOCK, timeout=LOCK_SECONDS, mode=0o666)
     try:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"{folder} is being worked on by another driver; see: farm status {folder}") from error
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise RunError(f"{folder} is being worked on by another driver; see: farm status {folder}") from error
+    except (OSError, NotImplementedError) as error:
+        raise RunError(
+            f"{folder / LOCK} cannot be locked: {reason(error)}; a run needs a folder on a disk that can"
+        ) from error
+    try:
         yield
     finally:
-        os.close(file)
+        lock.release()
+
+
+def is_locked(folder: Path) -> bool | None:
+    """Whether a driver has a run, whatever the clocks say; None where the folder does not let that be found out."""
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with filelock.FileLock(folder / LOCK, timeout=0, mode=0o666):
+            return False
+    except filelock.Timeout:
+        return True
+    except (OSError, NotImplementedError):
+        return None
 
 
 def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
@@ -160,6 +179,9 @@ def begin_run(folder: Path, data: dict[str, Any], version: str) -> None:
         RunError: It cannot be written.
     """
     try:
+        if (kind := kind_of(folder)) not in ("folder", "nothing"):
+            told = "a file" if kind == "file" else kind
+            raise UsageError(f"--output {folder} is {told}; name a new folder")
         folder.mkdir(parents=True, exist_ok=True)
         if (folder / RUN).exists():
             raise UsageError(f"{folder} holds a run already; go on with: farm resume {folder}, or name another folder")
@@ -221,7 +243,7 @@ def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
     size, digest = 0, hashlib.sha256()
     for path in sorted(path for path in part.rglob("*") if path.is_file()):
         digest.update(path.relative_to(part).as_posix().encode() + b"\0")
-        with open(path, "rb") as stream:
+        with open(path, "r+b") as stream:  # Windows synchronises only what may be written
             digest.update(hashlib.file_digest(stream, "sha256").digest())
             os.fsync(stream.fileno())
         size += path.stat().st_size
@@ -239,7 +261,7 @@ def publish(part: Path, place: Path, key: str) -> dict[str, Any]:
 
 def publish_file(part: Path, place: Path) -> None:
     """Move one file to its place, which it takes from a file that stood there."""
-    with open(part, "rb") as stream:
+    with open(part, "r+b") as stream:
         os.fsync(stream.fileno())
     place.parent.mkdir(parents=True, exist_ok=True)
     part.replace(place)

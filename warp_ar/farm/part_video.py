@@ -16,13 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy.typing as npt
-from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from warp_ar.errors import SinkError, SourceError, reason
 from warp_ar.output.sink import ThreadedSink
-from warp_ar.output.video_sink import CRF, FRAGMENT_SECONDS, rgb_to_yuv
+from warp_ar.output.video_sink import FRAGMENT_SECONDS, add_h264, of_even_size, rgb_to_yuv
 from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
@@ -55,25 +53,14 @@ class PartSink(ThreadedSink):
         self._container = av.open(str(self._path), "w", format="mp4")
         self._container.metadata["comment"] = PROGRAM
         rate = fractions.Fraction(self._fps).limit_denominator(1001)
-        options = {
-            "preset": "veryfast",
-            "crf": str(CRF),
-            "bf": "0",
-            "threads": str(ENCODER_THREADS),
-            "g": str(max(1, round(FRAGMENT_SECONDS * self._fps))),
-        }
-        self._stream = self._container.add_stream("libx264", rate=rate, options=options)
-        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+        group = max(1, round(FRAGMENT_SECONDS * self._fps))
+        options = {"bf": "0", "threads": str(ENCODER_THREADS), "g": str(group)}
+        self._stream = add_h264(self._container, rate, width, height, options)
         self._stream.time_base = self._stream.codec_context.time_base = self._tick
-        context = self._stream.codec_context
-        context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
-        context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         self._converter = rgb_to_yuv(width, height, self._tick)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
-        height, width = image.shape[:2]
-        if height % 2 or width % 2:
-            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        image = of_even_size(image)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
@@ -139,11 +126,7 @@ def join_parts(
             sound: Iterator[Any] = iter(())
             if source is not None:
                 sound = _sound(source, target, float(zero * tick), until)
-                for name, value in source.metadata.items():
-                    target.metadata.setdefault(name, value)
-                for name in _LANGUAGES:
-                    if name in source.streams.video[0].metadata:
-                        video.metadata[name] = source.streams.video[0].metadata[name]
+                _copy_metadata(source, target, video)
             target.metadata["comment"] = PROGRAM
             count = 0
             waiting = next(sound, None)
@@ -160,6 +143,14 @@ def join_parts(
     except (av.FFmpegError, OSError, ValueError) as error:
         raise SinkError(f"{output} cannot be joined: {reason(error)}") from error
     return count
+
+
+def _copy_metadata(source: Any, target: Any, video: Any) -> None:
+    """Into a file and its stream of pictures, what is said of a recording."""
+    for name, value in source.metadata.items():
+        target.metadata.setdefault(name, value)
+    said = source.streams.video[0].metadata
+    video.metadata.update({name: said[name] for name in _LANGUAGES if name in said})
 
 
 def _common_scale(tick: fractions.Fraction, source: Any) -> int:

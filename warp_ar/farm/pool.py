@@ -62,7 +62,7 @@ class Pool(Protocol):
 
 
 def devices_of(device: str, workers: int | None) -> list[str]:
-    """Device of each worker.
+    """Device of each worker, one GPU after another.
 
     Args:
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -130,8 +130,9 @@ class ProcessPool:
     def _start(self, worker: int) -> tuple[Any, Any]:
         mine, theirs = self._spawn.Pipe()
         context = dataclasses.replace(self._context, device=self.names[worker], worker=worker)
+        cores = self._cores[worker], sorted({core for own in self._cores for core in own})
         process = self._spawn.Process(
-            target=_serve, args=(theirs, context, self._cores[worker]), name=f"warp_ar-farm-{worker}", daemon=True
+            target=_serve, args=(theirs, context, *cores), name=f"warp_ar-farm-{worker}", daemon=True
         )
         with _environment(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1"):
             process.start()
@@ -193,8 +194,15 @@ def _environment(**values: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(pipe: Any, context: Context, cores: Sequence[int]) -> None:
-    """A worker's process: does jobs until its pipe ends."""
+def _serve(pipe: Any, context: Context, cores: Sequence[int], every: Sequence[int]) -> None:
+    """A worker's process: does jobs until its pipe ends.
+
+    Args:
+        pipe: To the driver.
+        context: Of the run.
+        cores: Its own; empty: no worker has any of its own.
+        every: Of all workers: a survey may use them all, for others wait for what it finds.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the driver decides what an interrupt ends
     if cores:
         os.sched_setaffinity(0, cores)
@@ -218,7 +226,9 @@ def _serve(pipe: Any, context: Context, cores: Sequence[int]) -> None:
     _say(pipe, "ready", program_version())
     while True:
         job, arguments = jobs.get()
-        _say(pipe, "outcome", work.do(job, Teller(lambda frames: _say(pipe, "frames", frames)), arguments))
+        with keeping_to(every if job.kind == "survey" else ()):
+            outcome = work.do(job, Teller(lambda frames: _say(pipe, "frames", frames)), arguments)
+        _say(pipe, "outcome", outcome)
 
 
 class Teller:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import socket
 import threading
 from collections.abc import Sequence
@@ -79,8 +80,8 @@ class RayPool:
         found = ray.cluster_resources()
         gpus = int(found.get("GPU", 0))
         # A node that is busy or gone comes back, or another does: so does the actor, and its job is given again.
-        needs = {"num_gpus": 1} if gpus else {"num_cpus": cores}
         self.size = workers or gpus or max(1, int(found.get("CPU", 1)) // cores)
+        needs = {"num_gpus": share_of_gpu(self.size, gpus)} if gpus else {"num_cpus": cores}
         environment = {"env_vars": {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}}
         actor = ray.remote(Member).options(
             max_restarts=-1, max_task_retries=0, max_concurrency=2, runtime_env=environment, **needs
@@ -134,6 +135,12 @@ class RayPool:
         for actor in self._actors:
             self._ray.kill(actor, no_restart=True)
         self._ray.shutdown()
+
+
+def share_of_gpu(workers: int, gpus: int) -> float:
+    """What of a GPU each worker takes: a whole one, or a part that all find room for; Ray counts ten-thousandths."""
+    on_one = -(-workers // gpus)
+    return 1 if on_one == 1 else math.floor(1e4 / on_one) / 1e4
 
 
 def _knock(address: str) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import printable
-from warp_ar.farm.manifest import PROGRESS, Manifest, load_run
+from warp_ar.farm.manifest import PROGRESS, Manifest, is_locked, load_run
 
 STALE_SECONDS = 15.0
-"""Since the last word of a driver, after which it is taken to be gone."""
+"""Since the last word of a driver whose lock cannot be asked for, after which it is taken to be gone."""
 
 
 def read_status(folder: Path) -> dict[str, Any]:
@@ -44,10 +44,16 @@ def read_status(folder: Path) -> dict[str, Any]:
         "bytes": sum(int(record.get("bytes") or 0) for record in manifest.done.values()),
         "failed": manifest.failed,
         "progress": progress,
-        "running": bool(progress)
-        and not progress.get("ended")
-        and time.time() - float(progress.get("time", 0)) < STALE_SECONDS,
+        "running": _is_running(folder, progress),
     }
+
+
+def _is_running(folder: Path, progress: dict[str, Any]) -> bool:
+    """Whether a driver is at work: by its lock, and where that cannot be asked for by when it was last heard of."""
+    locked = is_locked(folder)
+    if locked is None:
+        return not progress.get("ended") and abs(time.time() - float(progress.get("time", 0))) < STALE_SECONDS
+    return locked and bool(progress) and not progress.get("ended")
 
 
 def status_lines(folder: Path, status: dict[str, Any]) -> list[str]:

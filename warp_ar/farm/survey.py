@@ -7,8 +7,11 @@ does not depend on which frames were lit before it. The file is a ZIP of NumPy a
 - ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
 - ``saturation`` (3,) int64: codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
-- ``keys`` (k,) int64: numbers of the frames from which on ``light_000000`` ... hold, each float32 (h, 2 h, 3), and
-  ``emitters_000000`` ... where the quality finds their places.
+- ``keys`` (k,) int64: numbers of the frames from which on each of the k maps holds;
+- ``places`` (k + 1,) int64: where in ``lights.bin`` each begins, and where the last ends.
+
+``lights.bin`` holds maps one after another, so that one of 100,000 is read as quickly as one of two: each a zlib stream
+of a map, float32 (h, 2 h, 3), and, where the quality finds their places, its emitters, as ``numpy.save`` has both.
 
 A key is written once a texel of the environment has moved by more than one 8-bit step (``CHANGE_FLOOR + CHANGE_SHARE *
 value``) since the last key: the tolerance within which stages that read the environment do not run again either.
@@ -20,6 +23,7 @@ import dataclasses
 import fractions
 import io
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -41,6 +45,7 @@ from warp_ar.stages.features import has_environment
 Map = npt.NDArray[np.float32]
 
 NAME = "survey.npz"
+MAPS = "lights.bin"
 LIGHT = "light.exr"
 """The environment at the clip's end, with the emitters that were found."""
 _MANTISSA = 12
@@ -57,7 +62,7 @@ class Survey:
         Raises:
             SourceError: It is damaged or not there.
         """
-        self._path = folder / NAME
+        self._path, self._maps = folder / NAME, folder / MAPS
         self.light_file = folder / LIGHT
         try:
             # Opened here: of a damaged file NumPy leaves its own open.
@@ -68,6 +73,7 @@ class Survey:
                 self.poses: npt.NDArray[np.float64] = values["poses"]
                 self.saturation: npt.NDArray[np.int64] = values["saturation"]
                 self.keys: npt.NDArray[np.int64] = values["keys"]
+                self._places: npt.NDArray[np.int64] = values["places"]
                 width, height = (int(v) for v in values["size"])
                 self.size = width, height
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -83,19 +89,40 @@ class Survey:
         return max(int(np.searchsorted(self.keys, frame, side="right")) - 1, 0)
 
     def light(self, key: int) -> tuple[Map, npt.NDArray[Any] | None]:
-        """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known."""
-        with np.load(self._path) as values:
-            name = f"emitters_{key:06d}"
-            return np.asarray(values[f"light_{key:06d}"], np.float32), values.get(name)
+        """A map, float32 (h, 2 h, 3), and where its emitters are: records of ``Emitter``, if they are known.
+
+        Raises:
+            SourceError: It is damaged or not there.
+        """
+        begin, end = (int(place) for place in self._places[key : key + 2])
+        try:
+            with open(self._maps, "rb") as stream:
+                stream.seek(begin)
+                stored = io.BytesIO(zlib.decompress(stream.read(end - begin)))
+            radiance = np.asarray(np.load(stored), np.float32)
+            return radiance, np.load(stored) if stored.tell() < len(stored.getbuffer()) else None
+        except (OSError, ValueError, zlib.error) as error:
+            raise SourceError(f"{self._maps} cannot be read: {reason(error)}; remove its folder and resume") from error
 
 
 class _Writer:
-    """A ZIP of arrays that is the same for the same arrays."""
+    """Maps one after another, and a ZIP of arrays that is the same for the same arrays."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+    def __init__(self, folder: Path) -> None:
+        self._file = zipfile.ZipFile(folder / NAME, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+        self._maps = open(folder / MAPS, "wb")  # noqa: SIM115  (closed by `close`)
+        self.places = [0]
+
+    def keep(self, *arrays: npt.NDArray[Any] | None) -> None:
+        """Add a map, and its emitters where they are known."""
+        buffer = io.BytesIO()
+        for array in arrays:
+            if array is not None:
+                np.save(buffer, array, allow_pickle=False)
+        self.places.append(self.places[-1] + self._maps.write(zlib.compress(buffer.getbuffer(), 1)))
 
     def add(self, name: str, values: npt.ArrayLike) -> None:
+        """Add an array to the ZIP."""
         buffer = io.BytesIO()
         np.save(buffer, np.asarray(values), allow_pickle=False)
         info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
@@ -103,7 +130,11 @@ class _Writer:
         self._file.writestr(info, buffer.getvalue(), compresslevel=1)
 
     def close(self) -> None:
-        self._file.close()
+        """Finish both files."""
+        try:
+            self._maps.close()
+        finally:
+            self._file.close()
 
 
 def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Callable[[int], None]) -> dict[str, Any]:
@@ -128,7 +159,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
     scene = scene_of(jobs, clip)
     poses = np.full((index.length, 12), np.nan)
     look = _Look(jobs, scene, folder, poses)
-    writer = _Writer(folder / NAME)
+    writer = _Writer(folder)
     try:
         if jobs.settings.light != "preroll":
             _look_at_frames(jobs, clip, look, index, writer, device, tell)
@@ -140,6 +171,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
             writer.add("size", source.size)
         writer.add("saturation", look.saturation)
         writer.add("keys", look.keys)
+        writer.add("places", writer.places)
     finally:
         writer.close()
     found = int(np.isfinite(poses[first:end, 0]).sum())
@@ -179,9 +211,7 @@ class _Look:
             if same and not (np.abs(environment - self.last) > tolerated).any():
                 return
         self.last, self.emitters = _rounded(environment), emitters
-        writer.add(f"light_{len(self.keys):06d}", self.last)
-        if emitters is not None:
-            writer.add(f"emitters_{len(self.keys):06d}", emitters)
+        writer.keep(self.last, emitters)
         self.keys.append(frame)
 
 
@@ -206,7 +236,7 @@ def _look_at_frames(
             return
     outputs = ("pose", "environment") if look.captures else ("pose",)
     environment: Map | None = None
-    with open_part(path, index, first, end, fps) as source:
+    with open_part(path, index, first, end, fps, jobs.settings.gpu_of(device)) as source:
         pipeline = Pipeline(
             look.scene,
             device=device,

@@ -1,17 +1,16 @@
-"""Tables of a job file: checked values, and errors that name file, key, value and what would be right."""
+"""Tables of a job file: what those of a scene have, and values that are drawn."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.scene.messages import nearest, show_key, show_value
+from warp_ar.scene.table import Table
 
 
 class JobsError(UsageError):
@@ -35,68 +34,16 @@ class Span:
         return self.draw(random)[0]
 
 
-class Table:
+class JobTable(Table):
     """One table of a job file."""
 
-    def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
-        """Check the keys.
-
-        Raises:
-            JobsError: It is no table, or has a key that is none of ``keys``.
-        """
-        self.label, self.folder, self.section = label, folder, section
-        if not isinstance(data, dict):
-            raise JobsError(f"{label}: {section} = {show_value(data)}: expected a table with {', '.join(keys)}")
-        self.data: dict[str, Any] = data
-        for key in data:
-            if key not in keys:
-                raise JobsError(f"{label}: {self.name(key)}: unknown key; {nearest(str(key), keys)}")
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.data
-
-    def name(self, key: str) -> str:
-        """How messages call a key."""
-        return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
-
-    def fail(self, key: str, right: str) -> NoReturn:
-        """Say what is wrong with a key, and what would be right."""
-        value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
-        raise JobsError(f"{self.label}: {self.name(key)}{value}: {right}")
-
-    def integer(self, key: str, default: int, *, low: int, high: int = 10**9) -> int:
-        """A whole number."""
-        value = self.data.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            self.fail(key, f"expected a whole number from {low} to {high}")
-        return value
-
-    def number(self, key: str, default: float, *, low: float, high: float) -> float:
-        """A number."""
-        value = self.data.get(key, default)
-        if not _is_number(value) or not low <= value <= high:
-            self.fail(key, f"expected a number from {low:g} to {high:g}")
-        return float(value)
-
-    def text(self, key: str, default: str | None = None) -> str | None:
-        """Some text, or None where there is none."""
-        value = self.data.get(key, default)
-        if value is not None and (not isinstance(value, str) or not value):
-            self.fail(key, "expected some text")
-        return value
-
-    def choice(self, key: str, options: Iterable[str], default: str) -> str:
-        """One of several words."""
-        value, options = self.data.get(key, default), list(options)
-        if value not in options:
-            self.fail(key, "expected " + ", ".join(f'"{option}"' for option in options))
-        return str(value)
+    error = JobsError
 
     def path(self, key: str) -> Path | None:
         """A file or folder, relative to the job file; whether it is there is not asked."""
-        value = self.text(key)
-        if value is None:
+        if key not in self.data:
             return None
+        value = self.text(key)
         if "\0" in value:
             self.fail(key, "expected a path; this cannot be one")
         return Path(self.folder / value).absolute()

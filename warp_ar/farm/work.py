@@ -9,9 +9,9 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+from warp_ar.closing import Closing
 from warp_ar.errors import WarpArError, reason
 from warp_ar.farm.draws import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
@@ -32,21 +32,13 @@ LEAST_FREE = 1 << 20
 """Bytes below which a disk is full, whatever a library says of its failure."""
 
 
-class Work:
+class Work(Closing):
     """Does one job after another; one for each worker."""
 
     def __init__(self, context: Context) -> None:
         """Do nothing yet."""
         self.context = context
         self._lighter = Lighter(context.jobs, context.folder, context.device)
-
-    def __enter__(self) -> Work:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let threads go."""
@@ -78,7 +70,8 @@ class Work:
         seconds = time.perf_counter() - start
         frames = int(values.get("frames", 0))
         _note(log, f"done: {frames} frames in {seconds:.2f} s by worker {context.worker} on {context.device}")
-        return Outcome("done", {**values, "seconds": round(seconds, 3), "worker": context.worker})
+        timing = {"seconds": round(seconds, 3), "ended": round(time.time(), 3), "worker": context.worker}
+        return Outcome("done", {**values, **timing})
 
     def _do(self, job: Job, tell: Callable[[int], None], arguments: Any) -> dict[str, Any]:
         context, jobs = self.context, self.context.jobs

@@ -1,9 +1,9 @@
-"""Where a mirror ball stands, to a fraction of a millimetre, from what it mirrors of the desk around it.
+"""Where a mirror ball stands, to a fraction of a millimetre, from what it mirrors of the receiver around it.
 
 A ball's outline is a poor edge to measure by: at the rim a mirror reflects what lies right behind it, nearly at full
 strength, so that the outline is a step of some percent, and the reflections that crowd inside it are far stronger. The
-same reflections say more. A ray from the camera to the ball goes on to the desk, whose picture the same frame holds; so
-for a ball at c every pixel x of it that mirrors a visible point of a proxy has a prediction,
+same reflections say more. A ray from the camera to the ball goes on to the receiver, whose picture the same frame
+holds; so for a ball at c every pixel x of it that mirrors a visible point of a proxy has a prediction,
 
     I(x) = reflectance * I(project(hit(x, c))),
 
@@ -11,7 +11,7 @@ linear, for surfaces that scatter light alike to all sides. The printed card bes
 move by some pixels per millimetre in every direction, height included. The centre is what makes the residuals e, taken
 between square roots of radiance, least under a cost that redescends (Geman-McClure, rho = e^2 / (e^2 + s^2)): clutter
 that the scene leaves out, shine and shadows are outvoted. Gauss-Newton with numerical derivatives, s and the steps
-shrinking. The camera sees the desk far larger than the ball does, so it is blurred before it is compared.
+shrinking. The camera sees the receiver far larger than the ball does, so it is blurred before it is compared.
 
 Along the line of sight the centre is determined least: there, edges move slowly. But a ball stands on something, and
 its height is better known than its place; so the height as given has a say, ``HEIGHT_COST``.
@@ -41,8 +41,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 BLURS = ((2.0, 8.0), (0.0, 3.0))
-"""Pixels: standard deviations by which ball and desk are blurred, for the search and for the fit. The ball shows the
-desk about a tenth as large."""
+"""Pixels: standard deviations by which ball and receiver are blurred, for the search and for the fit. The ball shows
+the receiver about a tenth as large."""
 SEARCH_STEP = 2e-3
 """Metres between places that are tried first; edges blurred by 8 pixels lead from there."""
 SEARCH_HEIGHT = 4e-3
@@ -85,7 +85,7 @@ REFINE_VIEWS = 3
 REFINE_SEARCH = 0.006
 """Metres: a ruler is no worse, and less takes less time."""
 UNMODELLED = 0.02
-"""Square root of radiance: what even a perfect match may be off by, such as shine; a plain desk determines nothing."""
+"""Square root of radiance: what even a perfect match may be off by, such as shine; an even receiver tells nothing."""
 _BOUND = 1e-4
 """Metres, and share of the distance: tolerance of what hides a point from the camera."""
 
@@ -237,7 +237,7 @@ class _Task:
 
     views: Sequence[_View]
     probe: Probe
-    desk: _Receiver
+    receiver: _Receiver
     is_coarse: bool = False
 
     def pixels(self, view: _View, center: Array) -> Array:
@@ -254,7 +254,7 @@ class _Task:
         point = eye + np.where(told, t, 1.0)[:, None] * direction
         normal = (point - center) / radius
         mirrored = direction - 2.0 * _dot(direction, normal)[:, None] * normal
-        s = self.desk.trace(point, mirrored)
+        s = self.receiver.trace(point, mirrored)
         told &= np.isfinite(s)
         hit = point + np.where(told, s, 1.0)[:, None] * mirrored
         seen, inside = view.project(hit)
@@ -264,10 +264,10 @@ class _Task:
         away /= np.maximum(distance, 1e-9)[:, None]
         # The ball with a margin: it bleeds into what is blurred.
         told &= _meet_ball(center, 1.1 * radius, eye, away) > distance
-        told &= self.desk.trace(eye, away) > distance * (1.0 - _BOUND) - _BOUND
-        of_ball, of_desk = view.coarse if self.is_coarse else view.fine
+        told &= self.receiver.trace(eye, away) > distance * (1.0 - _BOUND) - _BOUND
+        of_ball, of_receiver = view.coarse if self.is_coarse else view.fine
         ball = view.sample(of_ball, pixels)
-        wanted = view.sample(of_desk, np.where(told[:, None], seen, 0.0))
+        wanted = view.sample(of_receiver, np.where(told[:, None], seen, 0.0))
         told &= (ball[:, 3] < 0.1) & (wanted[:, 3] < 0.1)
         return ball[:, :3] - wanted[:, :3] * np.sqrt(self.probe.reflectance), told
 
@@ -314,7 +314,7 @@ class _Task:
             step = -np.linalg.solve(matrix + (1e-9 * np.trace(matrix) + 1e-12) * np.eye(3), vector)
             step *= min(1.0, LONGEST / max(float(np.linalg.norm(step)), 1e-12))
             for _ in range(4):
-                # Fewer samples are cheaper to explain: the ball must not turn its back on the desk.
+                # Fewer samples are cheaper to explain: the ball must not turn its back on the receiver.
                 better, left = self.cost(center + step, scale)
                 if better < cost and left >= 0.8 * count:
                     break
@@ -342,12 +342,12 @@ def fit_ball(
         frames: uint8 RGB pictures with ``camera_from_world``; one is enough, several from different sides are better.
         camera: The camera of all of them.
         probe: The ball: a rough centre, the radius and the reflectance.
-        proxies: What stands on the desk; without planes or boxes a desk at the marker's height is assumed.
+        proxies: What stands on the receiver; without planes or boxes a desk at the marker's height is assumed.
         others: Other balls.
         search: Metres around the rough centre, along x and y, in which the ball is looked for.
 
     Returns:
-        The fit, or None where too little of the desk is mirrored; look at ``is_good`` before believing it.
+        The fit, or None where too little of the receiver is mirrored; look at ``is_good`` before believing it.
     """
     table = decode_table(camera.transfer)
     views = [_View(image, pose, camera, table) for image, pose in frames]

@@ -1,8 +1,8 @@
-"""A mirror ball's centre and radius with intervals that hold: its outlines first, then the desk that it mirrors.
+"""A mirror ball's centre and radius with intervals that hold: its outlines first, then the receiver that it mirrors.
 
-The mirrored desk gives the centre within a fraction of a millimetre, but only for the radius that is assumed: a radius
-1 mm wrong moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval does not
-tell. So the radius comes from the outlines, and what is uncertain of it is added to the centre's interval.
+The mirrored receiver gives the centre within a fraction of a millimetre, but only for the radius that is assumed: a
+radius 1 mm wrong moves that centre by ``SLOPE`` millimetres, mostly along the line of sight, and its own interval does
+not tell. So the radius comes from the outlines, and what is uncertain of it is added to the centre's interval.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SLOPE = 1.8
 OUTLINES = 6
 """Frames whose outlines are looked for: each takes half a second."""
 SEARCH = 5e-3
-"""Metres around the outlines' centre in which the mirrored desk is compared."""
+"""Metres around the outlines' centre in which the mirrored receiver is compared."""
 ASSUMED = 0.01
 """Share of a radius that is only assumed by which it may be off: a ruler's error."""
 SEARCH_DEVIATION = 0.0015
@@ -65,7 +65,7 @@ def measure_ball(
         views: RGB frames with ``camera_from_world``.
         camera: The camera.
         probe: The ball; its centre within its radius, its radius within a fifth.
-        proxies: What stands on the desk.
+        proxies: What stands on the receiver.
         others: Other balls.
         keep_radius: Believe the probe's radius.
 
@@ -96,7 +96,7 @@ def measure_ball(
     if better is not None and better.is_good:
         spread = math.hypot(better.deviation, SLOPE * deviation)
         center = tuple(float(value) for value in better.center)
-        # Both are right within their intervals, or the mirrored desk has been confused with another part of it.
+        # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
         if math.dist(center, solution.center) < 3 * math.hypot(spread, own) and spread < own:
             return BallMeasurement((center[0], center[1], center[2]), spread, radius, told, "by the desk in it")
     return BallMeasurement(solution.center, own, radius, told, f"by {len(outlines)} outlines")

@@ -21,7 +21,7 @@ Image = NDArray[np.uint8]
 _SEARCH = 10
 """Millimetres around the rough centre in which the ball is looked for."""
 _MOST_FRAMES = 6
-"""Frames that the mirrored desk is compared in: more cost seconds each, and add little."""
+"""Frames that the mirrored receiver is compared in: more cost seconds each, and add little."""
 _BLUR = 0.9
 """Pixels: standard deviation of the blur under which the ball's rim is looked for."""
 _RIM_POINTS = 96
@@ -39,7 +39,7 @@ class BallReport:
     views: int
     """Frames that were used."""
     deviation: float | None = None
-    """Standard deviation in metres along the worst axis, where the mirrored desk told; None: only the outline did."""
+    """Standard deviation in metres along the worst axis, where the mirrored receiver told; None: the outline alone."""
 
 
 def outline_ball(camera: Camera, pose: Pose, center: Array, radius: float) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -80,16 +80,16 @@ def locate_ball(
     proxies: Sequence[Proxy] = (),
     others: Sequence[Probe] = (),
 ) -> BallReport:
-    """Centre of a mirror ball from frames with known poses: by the desk that it mirrors, else by its outline.
+    """Centre of a mirror ball from frames with known poses: by the receiver that it mirrors, else by its outline.
 
-    On path-traced desks the mirrored desk gives the centre within 0.2 to 0.7 mm where the height is right, and within
-    1.7 mm where that is off by 1.5.
+    On path-traced desks the mirrored receiver gives the centre within 0.2 to 0.7 mm where the height is right, and
+    within 1.7 mm where that is off by 1.5.
 
     Args:
         views: RGB frames with ``camera_from_world``.
         camera: The camera.
         probe: The ball; its centre within 10 mm.
-        proxies: What stands on the desk.
+        proxies: What stands on the receiver.
         others: Other balls.
 
     Raises:
@@ -111,7 +111,7 @@ def outline_search(
     The height stays as given: a ball stands on something, and from nearby viewpoints height and distance are hard to
     tell apart. Over the other two the mean contrast across the outline is largest where the ball is, less that just
     outside: reflections crowd inside the rim and would pull the outline in. Only the upper half counts, where the rim
-    reflects what lies behind the desk; below, it reflects the desk before the desk. No edge is picked by threshold.
+    reflects what lies behind the receiver; below, it reflects that before it. No edge is picked by threshold.
 
     On path-traced desks this comes within 1 mm where the rim stands out, and within 9 mm where a bright band lies just
     inside it: look at the result, and measure such a ball with a ruler.

@@ -31,6 +31,7 @@ from warp_ar.errors import UsageError
 from warp_ar.input.marker_pattern import printed_cells
 from warp_ar.input.markers import make_board
 from warp_ar.input.sheet import GREY_SIZE, GREYS, SHEET, grey_centers
+from warp_ar.srgb import decode_srgb
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -194,7 +195,7 @@ def _codes_at(image: Image, matrix: Array, points: Array) -> Array | None:
 
 def _log_srgb(code: Array) -> Array:
     """Logarithm of sRGB's linear value of codes 0 to 1."""
-    value = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    value: Array = decode_srgb(code)
     return np.log(np.maximum(value, 1e-6))
 
 

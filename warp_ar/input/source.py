@@ -14,15 +14,14 @@ import functools
 import math
 import pathlib
 import weakref
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.closing import Closing
 from warp_ar.errors import SourceError, UsageError, reason
 from warp_ar.files import kind_of
 
@@ -52,7 +51,7 @@ class Frame:
     """Exposure in seconds, None where the source does not tell."""
 
 
-class Source(ABC):
+class Source(Closing):
     """Where frames come from: a context manager, and iterable."""
 
     size: tuple[int, int]
@@ -85,14 +84,6 @@ class Source(ABC):
     @abstractmethod
     def close(self) -> None:
         """Stop every thread and release files and devices; a second call does nothing."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class RecordedSource(Source):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
-import functools
 import math
 import pathlib
-from collections.abc import Generator, Sequence
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import av
@@ -51,6 +53,9 @@ class VideoFile(RecordedSource):
         SourceError: The file does not exist, is no video, or its first frame cannot be decoded.
     """
 
+    _converters = 1
+    """Threads that convert pictures to RGB beside the one that decodes; 1: that one does."""
+
     def __init__(
         self,
         path: str | pathlib.Path,
@@ -81,9 +86,10 @@ class VideoFile(RecordedSource):
         self.size = (width, height)
         self.description = f"{self._path} ({codec}, {width}x{height}, {self.fps:g} fps)"
 
-    def _open(self) -> Any:
+    def _open(self, **how: Any) -> Any:
+        """The file's container; ``how``: more of PyAV's arguments."""
         try:
-            container = av.open(str(self._path), options=_OPTIONS)
+            container = av.open(str(self._path), options=_OPTIONS, **how)
         except (av.FFmpegError, OSError, ValueError) as error:
             raise SourceError(
                 f"{self._path} cannot be read as a video ({reason(error)}): damaged, cut off, or no video file"
@@ -131,9 +137,18 @@ class VideoFile(RecordedSource):
             first: Time stamp, in ticks of the stream, from which on pictures are wanted, where the container stands
                 somewhere before it; None: all are, from the start.
         """
+        pictures = self._decoded(container, first)
+        if self._converters == 1:
+            reformatter = VideoReformatter()
+            for picture in pictures:
+                yield rgb_from_video(reformatter, picture), picture.time
+        else:
+            yield from _convert_beside(pictures, self._converters)
+
+    def _decoded(self, container: Any, first: int | None) -> Generator[Any, None, None]:
+        """As ``_pictures``, each as its codec has it."""
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
-        to_rgb = functools.partial(rgb_from_video, VideoReformatter())
         count, packets, damage = 0, 0, ""
         demuxer = container.demux(stream)
         while not damage:
@@ -152,7 +167,7 @@ class VideoFile(RecordedSource):
                 damage = reason(error)
             for picture in pictures:
                 if first is None or picture.pts >= first:
-                    yield to_rgb(picture), picture.time
+                    yield picture
                 count += 1
         # An MP4's header counts its samples exactly; a file cut between two of them ends like a whole one.
         if not damage and first is None and "mp4" in container.format.name and packets < stream.frames:
@@ -161,9 +176,37 @@ class VideoFile(RecordedSource):
             # Threads and reordering hold frames back; those before the damage are still good.
             with contextlib.suppress(av.FFmpegError):
                 for picture in stream.decode(None):
-                    yield to_rgb(picture), picture.time
+                    yield picture
                     count += 1
             raise SourceError(f"{self._path}: frame {count} cannot be decoded: {damage}; frames before it are good")
+
+
+def _convert_beside(pictures: Iterator[Any], threads: int) -> Generator[tuple[Image, float | None], None, None]:
+    """Pictures in RGB with their times, in order, converted while the next are decoded; errors keep their place."""
+    own = threading.local()
+
+    def convert(picture: Any) -> tuple[Image, float | None]:
+        if not hasattr(own, "reformatter"):
+            own.reformatter = VideoReformatter()
+        return rgb_from_video(own.reformatter, picture), picture.time
+
+    waiting: collections.deque[Future[tuple[Image, float | None]]] = collections.deque()
+    damage: SourceError | None = None
+    with ThreadPoolExecutor(threads, thread_name_prefix="warp-ar-convert") as pool:
+        try:
+            try:
+                for picture in pictures:
+                    waiting.append(pool.submit(convert, picture))
+                    if len(waiting) > threads:
+                        yield waiting.popleft().result()
+            except SourceError as error:
+                damage = error
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    if damage is not None:
+        raise damage
 
 
 def rgb_from_video(reformatter: VideoReformatter, picture: Any) -> Image:

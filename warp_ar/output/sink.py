@@ -13,14 +13,14 @@ import pathlib
 import tempfile
 import threading
 import weakref
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from warp_ar.closing import Closing
 from warp_ar.errors import SinkError, reason
 from warp_ar.files import kind_of
 
@@ -47,7 +47,7 @@ def close_open_sinks() -> None:
             stack.callback(sink.close)
 
 
-class Sink(ABC):
+class Sink(Closing):
     """Where frames go: a context manager."""
 
     description: str
@@ -78,14 +78,6 @@ class Sink(ABC):
         Raises:
             SinkError: A frame could not be written, and no `write` has said so yet.
         """
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 class ThreadedSink(Sink):

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import OpenEXR
 
 from warp_ar.errors import SinkError, reason
+from warp_ar.exr_file import write_exr
 from warp_ar.files import write_whole
 from warp_ar.scene import Camera
 from warp_ar.scene.pixel_rays import pixel_rays
@@ -55,10 +56,6 @@ def write_stmap(path: Path, coordinates: npt.NDArray[np.float32]) -> None:
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "software": PROGRAM}
     image = OpenEXR.File(header, {"RGB": np.ascontiguousarray(values)})
     try:
-        write_whole(path, functools.partial(_write, image))
+        write_whole(path, functools.partial(write_exr, image=image))
     except (RuntimeError, OSError) as error:
         raise SinkError(f"{path} cannot be written: {reason(error)}") from error
-
-
-def _write(image: OpenEXR.File, path: Path) -> None:
-    image.write(str(path))

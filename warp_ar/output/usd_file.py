@@ -15,7 +15,7 @@ import numpy as np
 
 from warp_ar.errors import SinkError, UsageError, reason
 from warp_ar.files import write_whole
-from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, encode_texture, key_frames
+from warp_ar.output.shot import FILM_WIDTH, Body, Matrix, Shot, encode_texture, key_frames, texture_file
 from warp_ar.scene.description import Light
 from warp_ar.signature import PROGRAM
 
@@ -176,7 +176,7 @@ def _write_look(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list
     if look.texture is None or body.mesh.uvs is None:
         diffuse.Set(pxr.Gf.Vec3f(*look.base_color))
     else:
-        picture = path.with_name(f"{path.stem}_{body.name}.png")
+        picture = texture_file(path, body.name)
         try:
             write_whole(picture, encode_texture(look.texture))
         except OSError as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import fractions
 import math
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import av
@@ -97,24 +98,14 @@ class VideoSink(ThreadedSink):
         options = {**fragments, "flush_packets": "1"}
         self._container = av.open(self._file, "w", format=_FORMATS[self._path.suffix.lower()], options=options)
         self._container.metadata["comment"] = PROGRAM
-        self._stream = self._container.add_stream(
-            "libx264",
-            rate=self._rate,
-            options={"preset": "veryfast", "crf": str(CRF), "g": str(group)},
-        )
-        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
-        context = self._stream.codec_context
-        context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
-        context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+        self._stream = add_h264(self._container, self._rate, width, height, {"g": str(group)})
         self._container.start_encoding()
         self._converter = rgb_to_yuv(width, height, 1 / self._rate)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         if self._broken:
             return  # FFmpeg may crash when it goes on after a failure.
-        height, width = image.shape[:2]
-        if height % 2 or width % 2:
-            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+        image = of_even_size(image)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
@@ -160,6 +151,32 @@ def _count_frames(path: pathlib.Path) -> int:
             return sum(packet.size > 0 for packet in container.demux(video=0))
     except (av.FFmpegError, OSError, ValueError):
         return 0
+
+
+def add_h264(container: Any, rate: fractions.Fraction, width: int, height: int, options: Mapping[str, str]) -> Any:
+    """A stream of H.264 in a new container, of colours as they are commonly understood.
+
+    Args:
+        container: PyAV's.
+        rate: Frames per second.
+        width: Even.
+        height: Even.
+        options: Of x264, besides speed and quality.
+    """
+    stream = container.add_stream("libx264", rate=rate, options={"preset": "veryfast", "crf": str(CRF), **options})
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    context = stream.codec_context
+    context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
+    context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+    return stream
+
+
+def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A picture whose last row or column stands twice where its size is odd: chroma has half the size."""
+    height, width = image.shape[:2]
+    if height % 2 or width % 2:
+        image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    return image
 
 
 def rgb_to_yuv(width: int, height: int, time_base: fractions.Fraction) -> Any:

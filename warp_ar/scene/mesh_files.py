@@ -23,6 +23,7 @@ from warp_ar.scene.mesh_assets import Assets, check_counts
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
 from warp_ar.scene.mtl import read_library_material
+from warp_ar.srgb import decode_srgb
 
 FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
@@ -221,6 +222,4 @@ def _corner_normals(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int64], cr
 
 def linear_color(colors: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Linear RGBA of (n, 3 or 4) colours of 8 bits, sRGB-encoded as programs write them; PLY's alpha is not used."""
-    rgb = colors[:, :3] / 255.0
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([linear, np.ones((len(rgb), 1))], axis=1)
+    return np.concatenate([decode_srgb(colors[:, :3] / 255.0), np.ones((len(colors), 1))], axis=1)

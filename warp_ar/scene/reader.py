@@ -13,15 +13,14 @@ from __future__ import annotations
 import importlib.resources
 import math
 import re
-import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NoReturn, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import cv2
 
 from warp_ar.errors import SceneError, reason
-from warp_ar.files import bracket_depth, check_depth, is_file, is_folder, read_text
+from warp_ar.files import is_file, is_folder, parse_toml, read_text
 from warp_ar.scene.calibration_file import load_calibration
 from warp_ar.scene.description import (
     RGB,
@@ -48,13 +47,13 @@ from warp_ar.scene.description import (
     Proxy,
     Scene,
     SourceSpec,
-    Vec3,
 )
 from warp_ar.scene.exif import camera_by_exif
 from warp_ar.scene.keys import IN_MEMORY, INTRINSICS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, PROXY_KEYS, keys_of
 from warp_ar.scene.mesh_files import MESH_SUFFIXES
-from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest, show_key, show_value
+from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest
 from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
+from warp_ar.scene.table import Table
 
 _TOP_KEYS: Final = ("schema", "name")
 _SECTIONS: Final = ("camera", "source", "marker", "probe", "proxy", "object", "light", "pose", "exposure")
@@ -69,110 +68,14 @@ _NOMINAL_SIZE: Final = (640, 480)
 """Pixels of a guessed camera until its frames' size is known."""
 _DICTIONARIES: Final = {name: int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
-_MOST_DOTS: Final = 16
-_PART: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
-_MANY_DOTS: Final = re.compile(rf"(?m)(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{_MOST_DOTS}}}")
-
 _T = TypeVar("_T")
 
 
-class _Table:
-    """One table of a scene file: hands out checked values and knows how to complain about them."""
+class _Table(Table):
+    """One table of a scene file."""
 
     world: Marker | None = None
     """The world's marker, if there is one."""
-
-    def __init__(self, label: str, folder: Path, section: str, data: object, keys: Sequence[str]) -> None:
-        self.label, self.folder, self.section = label, folder, section
-        if not isinstance(data, dict):
-            raise SceneError(f"{label}: {section} = {show_value(data)}: expected a table with {', '.join(keys)}")
-        self.data: dict[str, Any] = data
-        for key in data:
-            if key not in keys:
-                raise SceneError(f"{label}: {self.name(key)}: unknown key; {nearest(key, keys)}")
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.data
-
-    def name(self, key: str) -> str:
-        return f"{self.section}.{show_key(key)}" if self.section else show_key(key)
-
-    def fail(self, key: str, right: str) -> NoReturn:
-        """Say what is wrong with a key: its value if it has one, and what would be right."""
-        value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
-        raise SceneError(f"{self.label}: {self.name(key)}{value}: {right}")
-
-    def only(self, kind: str, allowed: Iterable[str], others: Iterable[str]) -> None:
-        """Complain about keys that other kinds of this section use, but not the one that ``kind`` names."""
-        unused = sorted(set(others) - set(allowed))
-        for key in self.data:
-            if key in unused:
-                used = ", ".join(sorted(set(allowed)))
-                self.fail(key, f"not used with {kind} = {show_value(self.data.get(kind))}; its own keys are {used}")
-
-    def number(
-        self, key: str, default: float | None = None, *, low: float = -LARGEST, high: float = LARGEST, unit: str = ""
-    ) -> float:
-        if default is not None and key not in self.data:
-            return default
-        return self._number(key, self.data.get(key), low, high, _range("a number", low, high, unit))
-
-    def _number(self, key: str, value: object, low: float, high: float, right: str) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            self.fail(key, f"expected {right}")
-        # Compared before it is converted: an integer may be too large for a float.
-        if not low <= value <= high:
-            self.fail(key, f"expected {right}")
-        return float(value)
-
-    def length(self, key: str) -> float:
-        return self.number(key, low=SMALLEST, unit="metres")
-
-    def integer(self, key: str, default: int | None = None, *, low: int, high: int) -> int:
-        if default is not None and key not in self.data:
-            return default
-        value = self.data.get(key)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            self.fail(key, f"expected a whole number from {low} to {high}")
-        return value
-
-    def text(self, key: str, default: str | None = None, *, right: str = "some text") -> str:
-        if default is not None and key not in self.data:
-            return default
-        value = self.data.get(key)
-        if not isinstance(value, str) or not value:
-            self.fail(key, f"expected {right}")
-        return value
-
-    def choice(self, key: str, options: Iterable[str], default: str | None = None) -> str:
-        options = list(options)
-        few = len(options) < 8
-        right = "one of " + ", ".join(f'"{option}"' for option in options) if few else f'a name such as "{options[0]}"'
-        value = self.text(key, default, right=right)
-        if value not in options:
-            self.fail(key, f"expected {right}" if few else f"unknown; {nearest(value, options)}")
-        return value
-
-    def vector(
-        self,
-        key: str,
-        default: tuple[float, ...] | None = None,
-        *,
-        sizes: Sequence[int] = (3,),
-        low: float = -LARGEST,
-        high: float = LARGEST,
-        unit: str = "",
-    ) -> tuple[float, ...]:
-        if default is not None and key not in self.data:
-            return default
-        value = self.data.get(key)
-        right = _range(f"a list of {' or '.join(map(str, sizes))} numbers", low, high, unit)
-        if not isinstance(value, list) or len(value) not in sizes:
-            self.fail(key, f"expected {right}")
-        return tuple(self._number(key, element, low, high, right) for element in value)
-
-    def vec3(self, key: str, default: Vec3 | None = None, *, low: float = -LARGEST, unit: str = "") -> Vec3:
-        return cast(Vec3, self.vector(key, default, low=low, unit=unit))
 
     def reflectance(self, key: str, default: Color) -> Color:
         """A colour from 0 to 1, or the path of a texture."""
@@ -182,33 +85,6 @@ class _Table:
         if not isinstance(value, list | tuple):
             self.fail(key, "expected a list of 3 numbers from 0 to 1, or the path of a texture")
         return cast(RGB, self.vector(key, cast(RGB, default), low=0.0, high=1.0))
-
-    def resolve(self, key: str, right: str) -> Path:
-        value = self.text(key, right=f"the path of {right}")
-        try:
-            path = (self.folder / value).resolve()
-            path.exists()
-        except (OSError, RuntimeError, ValueError):  # too long, a loop of links, a zero byte
-            self.fail(key, f"expected the path of {right}; this cannot be one")
-        return path
-
-    def file(self, key: str, right: str) -> Path:
-        path = self.resolve(key, right)
-        if not is_file(path):
-            self.fail(key, f"no such file: {path}")
-        return path
-
-
-def _range(what: str, low: float, high: float, unit: str) -> str:
-    """Words for a range of numbers."""
-    unit = f" ({unit})" if unit else ""
-    if low > -LARGEST and high < LARGEST:
-        return f"{what} from {low:g} to {high:g}{unit}"
-    if low == SMALLEST:
-        return f"{what} above 0{unit}" if what.startswith("a number") else f"{what}, each above 0{unit}"
-    if low > -LARGEST:
-        return f"{what}, {low:g} or more{unit}"
-    return f"{what}, finite{unit}" if what == "a number" else f"{what}, each finite{unit}"
 
 
 def _exif_camera(table: _Table, source: object, transfer: str | Path) -> Camera:
@@ -319,7 +195,7 @@ def _read_own_marker(parent: _Table) -> Marker | None:
         if world and world.board is None and "board" not in value:
             given = {"size": world.size, **given}
         keys = [key for key in keys_of(Marker) if key != "white"]
-        own = _read_marker(_Table(parent.label, parent.folder, parent.name("marker"), given, keys))
+        own = _read_marker(parent.inner("marker", given, keys))
     elif world is None or world.board is not None or isinstance(value, bool) or not isinstance(value, int):
         right = 'a table such as { id = 7, size = 0.05 } or { board = "grid 2x2 0.03 0.01" }'
         parent.fail("marker", f"expected {right}" + (", or an id" if world and world.board is None else ""))
@@ -371,7 +247,7 @@ def _read_probe(table: _Table) -> Probe:
 
 def _read_proxy(table: _Table) -> Proxy:
     shape = table.choice("shape", PROXY_KEYS)
-    table.only("shape", PROXY_KEYS[shape], ("size", "file"))
+    table.only("shape", shape, PROXY_KEYS[shape], ("size", "file"))
     sides = {"plane": 2, "box": 3}.get(shape)
     return Proxy(
         shape=cast(Any, shape),
@@ -392,7 +268,7 @@ def _read_mesh_path(table: _Table) -> Path:
 
 def _read_object(table: _Table) -> Object:
     shape = table.choice("shape", OBJECT_KEYS)
-    table.only("shape", OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
+    table.only("shape", shape, OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
     major = table.length("major_radius") if shape == "torus" else Object.major_radius
     minor = table.length("minor_radius") if shape == "torus" else Object.minor_radius
     if shape == "torus" and minor >= major:
@@ -415,10 +291,10 @@ def _read_object(table: _Table) -> Object:
 
 def _read_material(parent: _Table) -> Material:
     known = ["model", *keys_of(*MATERIALS.values())]
-    table = _Table(parent.label, parent.folder, parent.name("material"), parent.data["material"], known)
+    table = parent.inner("material", parent.data["material"], known)
     model = table.choice("model", MATERIALS)
     kind = MATERIALS[model]
-    table.only("model", keys_of(kind), known[1:])
+    table.only("model", model, keys_of(kind), known[1:])
     if kind is FileMaterial:
         return FileMaterial()
     if kind is PhongMaterial:
@@ -441,8 +317,7 @@ def _read_material(parent: _Table) -> Material:
 def _read_animation(parent: _Table) -> Animation | None:
     if "animate" not in parent:
         return None
-    section = parent.name("animate")
-    table = _Table(parent.label, parent.folder, section, parent.data["animate"], keys_of(Animation))
+    table = parent.inner("animate", parent.data["animate"], keys_of(Animation))
     if "period" in table and "sway" not in table:
         table.fail("period", "is the duration of a swing; give sway too, its excursion in metres")
     if "pivot" in table and "turn" not in table:
@@ -457,7 +332,7 @@ def _read_animation(parent: _Table) -> Animation | None:
 
 def _read_light(table: _Table) -> Light:
     kind = table.choice("kind", LIGHT_KEYS)
-    table.only("kind", LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
+    table.only("kind", kind, LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
     spot = kind == "spot"
     at = Light.at if kind == "directional" else table.vec3("at", unit="metres")
     target = table.vec3("target", unit="metres") if "target" in table else None
@@ -587,23 +462,6 @@ def load_scene(path_or_name: str | Path) -> Scene:
     return loads_scene(read_text(path, SceneError, expected="TOML"), path)
 
 
-def _check_dots(text: str, label: str) -> None:
-    """Complain about dotted keys of many parts, each of which is a table in a table: TOML's reader takes long."""
-    match = _MANY_DOTS.search(text)
-    if match is not None:
-        line = text.count("\n", 0, match.start()) + 1
-        raise SceneError(f"{label}: line {line}: a key of more than {_MOST_DOTS} parts; the longest here has 3")
-
-
-def _parse(text: str, label: str) -> dict[str, Any]:
-    check_depth(bracket_depth(text), label, SceneError)
-    _check_dots(text, label)
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: TOMLDecodeError, and integers of too many digits
-        raise SceneError(f"{label}: not valid TOML: {' '.join(str(error).split())}") from error
-
-
 def _check_top(top: _Table, data: dict[str, Any], label: str) -> None:
     """What every scene file must have."""
     if "schema" not in top:
@@ -643,7 +501,7 @@ def loads_scene(text: str, path: str | Path | None = None) -> Scene:
     path = None if path is None else Path(path)
     label = "scene" if path is None else str(path)
     folder = Path.cwd() if path is None else path.parent.resolve()
-    data = _parse(text, label)
+    data = parse_toml(text, label, SceneError)
     top = _Table(label, folder, "", {key: data[key] for key in data if key not in _SECTIONS}, (*_TOP_KEYS, *_SECTIONS))
     _check_top(top, data, label)
 

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from warp_ar.kernels import structs
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.mesh_materials import IDENTITY, MeshMaterial, TextureUse
+from warp_ar.srgb import decode_srgb
 
 FloatArray = npt.NDArray[np.float32]
 ByteArray = npt.NDArray[np.uint8]
@@ -30,12 +31,11 @@ _WRAPS: Final = {"repeat": structs.REPEATED, "clamp": structs.CLAMP, "mirror": s
 
 def _decode_table() -> FloatArray:
     code = np.arange(256) / 255.0
-    encoded = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([code, encoded]).astype(np.float32)
+    return np.concatenate([code, decode_srgb(code)]).astype(np.float32)
 
 
 DECODE: Final = _decode_table()
-"""Value of each linear code, then of each sRGB-encoded one (IEC 61966-2-1), (512,)."""
+"""Value of each linear code, then of each sRGB-encoded one, (512,)."""
 
 
 def linear_texture(texture: ByteArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """The stages, in the order in which they may run.
 
-They are imported when ``STAGES`` is first asked for: presets and words of this room can be read without loading Warp.
+They are imported when ``STAGES`` is first asked for: presets and words of this layer can be read without loading Warp.
 """
 
 from __future__ import annotations

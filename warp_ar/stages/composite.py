@@ -20,7 +20,7 @@ class Composite(Stage):
     """Lays virtual light and virtual objects over the frame."""
 
     name: ClassVar[str] = "composite"
-    summary: ClassVar[str] = "frame, virtual light on the desk and virtual objects, in linear light"
+    summary: ClassVar[str] = "frame, virtual light on the receiver and virtual objects, in linear light"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32 to 8-bit codes by exact thresholds",
         bound=0.501,
@@ -68,5 +68,5 @@ class Composite(Stage):
         if not device.is_cpu:
             return [Pass(launch, rows=height)]
         extents = [arrays["object_rows"]] * config.virtual + [arrays["light_rows"]] * config.added
-        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirrored
+        extents += [arrays["shadow_rows"]] * config.ratio + [arrays["ball_rows"]] * config.mirror_ball
         return [Pass(lambda rows: copy(image, frame), rows=height), Pass(launch, rows=height, extent=union_of(extents))]

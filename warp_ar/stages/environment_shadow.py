@@ -1,4 +1,4 @@
-"""What virtual objects do to the environment on the desk."""
+"""What virtual objects do to the environment on the receiver."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Method:
     stride: int
     """Pixels from one estimate to the next in frames of ``STRIDE_ROWS`` rows."""
     bounce: Literal["estimated", "traced"]
-    """How what objects reflect onto the desk is found."""
+    """How what objects reflect onto the receiver is found."""
     secondary: float = 1.0
     """Share of the rays that look for it: light that takes rays to find is smooth, and half of them find it."""
 
@@ -75,7 +75,7 @@ class EnvironmentShadow(Stage):
         "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
         "brute_force": "every texel of the environment at every pixel",
     }
-    summary: ClassVar[str] = "shadows of virtual objects on the desk under the environment"
+    summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"
     subject: ClassVar[str] = "shadows of virtual objects in the environment, and light reflected onto the receiver"
     converges: ClassVar[bool] = True
     unseen_method: ClassVar[str | None] = "none"

@@ -40,7 +40,7 @@ class Features:
     merged: bool
     """Frames of several exposures are merged."""
     layers: tuple[str, ...]
-    """Resources that are laid over the frame: of ``virtual``, ``physical_added``, ``shadow_ratio``, ``mirrored``."""
+    """Resources that are laid over the frame: of ``virtual``, ``added_light``, ``shadow_ratio``, ``mirror_ball``."""
     exposed: bool
     """The picture is shown at another exposure than the camera's."""
     boxed: bool
@@ -72,7 +72,7 @@ class Features:
     @property
     def lit(self) -> bool:
         """Virtual light falls on the receiver."""
-        return "physical_added" in self.layers
+        return "added_light" in self.layers
 
     @property
     def near_names(self) -> tuple[str, ...]:
@@ -91,7 +91,7 @@ def find_features(request: Request) -> Features:
     recovered = bracketed and (scene.has_marker or bool(scene.proxies))
     layers = _find_layers(scene, quality)
     scale = scene.exposure.scale
-    exposed = "physical_added" in layers if isinstance(scale, str) else scale != 1.0
+    exposed = "added_light" in layers if isinstance(scale, str) else scale != 1.0
     darkened = exposed and (isinstance(scale, str) or scale < 1.0)
     relight_method = quality.method("relight") if environment else FLAT
     lit_by_both = bool(environment and scene.lights and scene.proxies)
@@ -130,12 +130,12 @@ def _find_layers(scene: Scene, quality: Quality) -> tuple[str, ...]:
     if scene.objects:
         layers.append("virtual")
     if scene.lights and scene.proxies:
-        layers.append("physical_added")
+        layers.append("added_light")
     shadows = quality.method("environment_shadow") not in ("default", "none")
     if shadows and scene.objects and scene.proxies and has_environment(scene):
         layers.append("shadow_ratio")
     if layers and scene.probes and quality.method("mirror_ball") not in ("default", "none"):
-        layers.append("mirrored")
+        layers.append("mirror_ball")
     return tuple(layers)
 
 

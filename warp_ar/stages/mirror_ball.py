@@ -30,7 +30,7 @@ def mirror_config(features: Features) -> mirror_ball.MirrorBallConfig:
     """What the mirrored part of a request's scene calls for."""
     layers = features.layers
     shading = mirrored_shading(features) if "virtual" in layers else None
-    lit = "physical_added" in layers
+    lit = "added_light" in layers
     return mirror_ball.MirrorBallConfig(
         trace_config(features.request.scene),
         SAMPLES[features.request.quality.method("mirror_ball")],
@@ -59,7 +59,7 @@ def mirrored_shading(features: Features) -> ShadeConfig:
 
 
 def mirrored_relighting(features: Features) -> RelightConfig:
-    """How the desk that a ball shows responds: cells of the frame say nothing about it."""
+    """How the receiver that a ball shows responds: cells of the frame say nothing about it."""
     return dataclasses.replace(relight_config(features), ambient_visibility=False, bounced=False)
 
 
@@ -101,15 +101,15 @@ class MirrorBall(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what the objects and the desk are lit by."""
+        """Reads what the objects and the receiver are lit by."""
         quality = features.request.quality
         if not features.request.scene.probes:
             return LeftOut("the scene has no mirror ball")
         if quality.method(cls.name) not in SAMPLES:
             return LeftOut(f"the quality {quality.name!r} leaves the ball as the camera saw it")
-        if "mirrored" not in features.layers:
+        if "mirror_ball" not in features.layers:
             return LeftOut("the scene has nothing virtual that a ball could mirror")
-        return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirrored",))
+        return Wiring(tuple(sorted(_reads(features, lit=features.lit))), ("mirror_ball",))
 
     def idle(self, reach: Reach) -> str | None:
         """A ball may show what is out of the picture itself."""
@@ -129,7 +129,7 @@ class MirrorBall(Stage):
         """The change, and the table of reflectance where materials need it."""
         width, height = self.request.size
         return {
-            "mirrored": ArraySpec((height, width), wp.vec3),
+            "mirror_ball": ArraySpec((height, width), wp.vec3),
             **distant_light_arrays(self.features, self.name),
         }
 
@@ -162,6 +162,6 @@ class MirrorBall(Stage):
         )
 
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirrored"], rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]

@@ -56,15 +56,15 @@ def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
 
 
 class NearField(Stage):
-    """Light that reaches objects past each other, and what they mirror of the desk and of each other."""
+    """Light that reaches objects past each other, and what they mirror of the receiver and of each other."""
 
     name: ClassVar[str] = "near_field"
-    summary: ClassVar[str] = "what of the desk and of other objects virtual objects show"
+    summary: ClassVar[str] = "what of the receiver and of other objects virtual objects show"
     unread: ClassVar[str] = "virtual objects show the distant environment only"
     numerics: ClassVar[Numerics] = Numerics(
         precision="float32",
         bound=6e-2,
-        cause="two rays of 64 at the picture's border see the desk or do not",
+        cause="two rays of 64 at the picture's border see the receiver or do not",
         measured=2e-07,
         rows=(5, 6, 8, 13, 14, 17, 18),
     )
@@ -79,7 +79,7 @@ class NearField(Stage):
         reads = ["frame", "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
-        reads += [name for name in features.layers if name not in ("virtual", "mirrored")]
+        reads += [name for name in features.layers if name not in ("virtual", "mirror_ball")]
         return Wiring(tuple(reads), features.near_names)
 
     def idle(self, reach: Reach) -> str | None:
@@ -108,7 +108,7 @@ class NearField(Stage):
         if config.ratio:
             layers.shadow_ratio = arrays["shadow_ratio"]
         if config.added:
-            layers.added = arrays["physical_added"]
+            layers.added = arrays["added_light"]
         distant = make_distant_light(self.features, arrays, self.name)
         samples = arrays["environment_samples"] if config.distant.diffuse != "none" else None
         raw, near = near_field.NearLight(), near_field.NearLight()
@@ -144,5 +144,5 @@ class NearField(Stage):
             MIRROR_SAMPLES if any(sharp) else 0,
             SIDE,
             "shadow_ratio" in layers,
-            "physical_added" in layers,
+            "added_light" in layers,
         )

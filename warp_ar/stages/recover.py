@@ -331,7 +331,7 @@ class Recover(Stage):
             self._worker.shutdown(wait=False)
 
     def resume(self, other: Stage) -> None:
-        """Keep the emitters that were found, and when; on another method, or on another desk, look anew."""
+        """Keep the emitters that were found, and when; on another method, or on another receiver, look anew."""
         if not isinstance(other, Recover) or other.method != self.method:
             return
         mine, yours = self.request.scene, other.request.scene

@@ -1,4 +1,4 @@
-"""Virtual light on the physical desk."""
+"""Virtual light on the receiver."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from warp_ar.stages.shared.variants import relight_variant
 
 @dataclasses.dataclass(frozen=True)
 class Grain:
-    """How finely cells of the desk are estimated."""
+    """How finely cells of the receiver are estimated."""
 
     samples: int
     """Of the environment, for ambient visibility."""
@@ -45,11 +45,11 @@ GRAINS: Mapping[str, Grain] = MappingProxyType({"bounce": Grain(128, 4, 8, 16), 
 
 
 class Relight(Stage):
-    """Adds what virtual lights send to the proxies, shadowed, to the desk in the frame."""
+    """Adds what virtual lights send to the proxies, shadowed, to the receiver in the frame."""
 
     name: ClassVar[str] = "relight"
     methods: ClassVar[Mapping[str, str]] = {
-        "flat": "on a grey desk",
+        "flat": "on a grey receiver",
         "paper": "blended by the frame's brightness (the paper)",
         "directional": "the same, as far as the environment's light has a direction",
         "relief": "the paper's blend, relief told from paint",
@@ -57,8 +57,8 @@ class Relight(Stage):
         "bounce": "the same, knowing the environment's own shadows, and what lit surfaces send each other",
         "brute_force": "the same at every pixel, with 1,024 rays and patches of 4 pixels",
     }
-    summary: ClassVar[str] = "virtual light and its shadows on the physical desk"
-    subject: ClassVar[str] = "virtual light on the real desk"
+    summary: ClassVar[str] = "virtual light and its shadows on the receiver"
+    subject: ClassVar[str] = "virtual light on the receiver"
     settings: ClassVar[tuple[str, ...]] = (
         "edge_samples",
         "light_shadow",
@@ -79,15 +79,15 @@ class Relight(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads what its method needs to know of the environment and the desk."""
+        """Reads what its method needs to know of the environment and the receiver."""
         if not features.request.scene.lights:
             return LeftOut("the scene has no virtual light")
         if not features.lit:
             return LeftOut("the scene has no proxy for virtual light to fall on")
-        return Wiring(relight_reads(features), ("physical_added",))
+        return Wiring(relight_reads(features), ("added_light",))
 
     def runs_after(self) -> tuple[str, ...]:
-        """Only the picture waits for both; what objects mirror of the desk waits for this alone longer."""
+        """Only the picture waits for both; what objects mirror of the receiver waits for this alone longer."""
         return () if self.features.near_field else ("environment_shadow",)
 
     def idle(self, reach: Reach) -> str | None:
@@ -99,7 +99,7 @@ class Relight(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The added radiance, and cells of what it is made from."""
         width, height = self.request.size
-        specs = {"physical_added": ArraySpec((height, width), wp.vec3)}
+        specs = {"added_light": ArraySpec((height, width), wp.vec3)}
         if self.request.quality.edge_samples > 1:
             specs["relight_visibility"] = ArraySpec((height, width), wp.int32)
             specs |= edge_arrays(self.request, self.name)
@@ -123,7 +123,7 @@ class Relight(Stage):
         relight.make_relight_kernel(config)
         receiver = self._receiver(config, arrays)
         inputs = arrays["params"], arrays["ray_scene"], arrays["light_array"], receiver
-        added = arrays["physical_added"]
+        added = arrays["added_light"]
         visibility = arrays["relight_visibility"] if config.edge_samples > 1 else None
 
         def launch(rows: Rows | None) -> None:

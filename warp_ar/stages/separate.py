@@ -18,10 +18,10 @@ from warp_ar.stages.shared.variants import composite_variant
 SOURCES: Mapping[str, str] = {
     "objects": "virtual",
     "shadow_ratio": "shadow_ratio",
-    "added_light": "physical_added",
-    "mirror_ball": "mirrored",
+    "added_light": "added_light",
+    "mirror_ball": "mirror_ball",
 }
-"""Resource that a layer is taken from."""
+"""Resource that a layer is taken from: ``objects`` names the objects' records there."""
 
 
 class Separate(Stage):

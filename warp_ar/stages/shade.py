@@ -37,9 +37,9 @@ class Shade(Stage):
     name: ClassVar[str] = "shade"
     methods: ClassVar[Mapping[str, str]] = {
         "environment": "the environment (the paper)",
-        "one_bounce": "the environment, the desk and each other",
+        "one_bounce": "the environment, the receiver and each other",
     }
-    summary: ClassVar[str] = "shade virtual objects by the environment and virtual lights, shadowed and anti-aliased"
+    summary: ClassVar[str] = "shades virtual objects by the environment and virtual lights, shadowed and anti-aliased"
     subject: ClassVar[str] = "what virtual objects reflect"
     settings: ClassVar[tuple[str, ...]] = (
         "edge_samples",

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 
 from warp_ar.errors import SceneError, UsageError, WarpArError
-from warp_ar.files import limits, too_much
+from warp_ar.files import limits, parse_toml, too_much
 from warp_ar.light.captured import Light
 from warp_ar.light.latlong_axes import from_axes
 from warp_ar.output.places import files_of
@@ -156,9 +155,9 @@ def _read_hdr(name: str, path: Path) -> Any:
 def _scene_edit(name: str, data: bytes, wanted: Wanted) -> Edit:
     try:
         text = data.decode()
-        document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UsageError(f"{name}: not valid TOML: {str(error)[:160]}") from error
+    document = parse_toml(text, name, UsageError)
     known = {str(path) for path in files_of(wanted.scene)}
     for value in _texts(document):
         if value not in known and (re.search(r"[/\\]", value) or re.search(r"\.\w{2,5}$", value)):

@@ -10,20 +10,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import errno
 import functools
 import hmac
 import importlib.resources
 import json
 import socket
-import ssl
 import threading
 import time
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -32,8 +29,10 @@ from warp_ar.errors import UsageError, WarpArError
 from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
+from warp_ar.viewer.address import LOOPBACK, Address, listen
 from warp_ar.viewer.dropped import MOST_BYTES
-from warp_ar.viewer.gate import BACKLOG, HEADER_SECONDS, Gate
+from warp_ar.viewer.encoding import encode_jpeg, encode_light
+from warp_ar.viewer.gate import HEADER_SECONDS, Gate
 from warp_ar.viewer.shared_light import SharedLight
 
 if TYPE_CHECKING:
@@ -42,11 +41,6 @@ if TYPE_CHECKING:
 
 _T = TypeVar("_T")
 
-LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
-EVERYWHERE: Final = ("0.0.0.0", "::", "")
-"""Not an address, but all that this machine has."""
-JPEG_QUALITY: Final = 85
-"""At 640x480 a desk takes 60 KB; at 95 it takes twice that."""
 MOST_VIEWERS: Final = 8
 IN_FLIGHT: Final = 2
 """Frames that a viewer may have unshown: one on the way while another is decoded."""
@@ -87,65 +81,6 @@ _HEADERS: Final = {
 def own_headers() -> dict[str, str]:
     """Headers of every answer, refusals too."""
     return dict(_HEADERS)
-
-
-def encode_jpeg(image: npt.NDArray[np.uint8]) -> bytes:
-    """JPEG of an RGB picture."""
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1])
-
-
-def encode_light(light: npt.NDArray[np.float32]) -> bytes:
-    """PNG of an environment: x / (1 + x), so that what clips in the camera still shows, encoded as sRGB."""
-    value = np.maximum(light, 0.0)
-    value = value / (1.0 + value)
-    encoded = np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
-    return bytes(cv2.imencode(".png", np.uint8(np.round(encoded[..., ::-1] * 255.0)))[1])
-
-
-def own_address() -> str | None:
-    """Address of this machine on its network; None without one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # an address for documentation: it finds the way out and sends nothing
-        except OSError:
-            return None
-        return str(probe.getsockname()[0])
-
-
-@dataclasses.dataclass(frozen=True)
-class Address:
-    """Where the page is served, and what it takes to see it."""
-
-    host: str = "127.0.0.1"
-    """Address to listen on."""
-    port: int = 8720
-    token: str | None = None
-    """Secret that the page's address must hold; None asks for none."""
-    tls: ssl.SSLContext | None = None
-    origins: tuple[str, ...] = ()
-    """Other sites' pages that may ask for the light."""
-
-    @property
-    def loopback(self) -> bool:
-        """Whether only this machine can reach it."""
-        return self.host in LOOPBACK
-
-    @property
-    def url(self) -> str:
-        """The page's address as it is printed."""
-        return self._url("localhost" if self.host in EVERYWHERE else self.host)
-
-    @property
-    def outside_url(self) -> str | None:
-        """The same for other machines, where the page is served at all of this one's addresses and one is known."""
-        own = own_address() if self.host in EVERYWHERE else None
-        return None if own is None else self._url(own)
-
-    def _url(self, host: str) -> str:
-        host = f"[{host}]" if ":" in host else host
-        token = f"?token={self.token}" if self.token else ""
-        return f"http{'s' * (self.tls is not None)}://{host}:{self.port}/{token}"
 
 
 class _Viewer:
@@ -672,34 +607,6 @@ class Server:
             self.address = dataclasses.replace(self.address, port=listeners[0].getsockname()[1])
             return listeners
         raise AssertionError("a port was tried at least")
-
-
-async def listen(host: str, port: int) -> list[socket.socket]:
-    """Sockets that listen at all addresses that a name stands for.
-
-    Raises:
-        OSError: There is none, or it is taken.
-    """
-    found = await asyncio.get_running_loop().getaddrinfo(
-        host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-    )
-    listeners: list[socket.socket] = []
-    try:
-        for family, address in dict.fromkeys((family, address) for family, _, _, _, address in found):
-            # A free port that was found for the first address is taken for the others too.
-            chosen = listeners[0].getsockname()[1] if listeners else port
-            try:
-                own = socket.create_server((address[0], chosen), family=family, backlog=BACKLOG)
-            except OSError as error:
-                if listeners and error.errno in (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT):
-                    continue  # a machine without the other kind of address
-                raise
-            listeners.append(own)
-    except OSError:
-        for own in listeners:
-            own.close()
-        raise
-    return listeners
 
 
 def _same(given: str, expected: str) -> bool:

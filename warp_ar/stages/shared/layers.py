@@ -10,7 +10,7 @@ from warp_ar.kernels import composite
 
 def layers_of(arrays: Mapping[str, Any]) -> composite.Layers:
     """The layers that there are, as kernels read them."""
-    names = ("virtual", "physical_added", "shadow_ratio", "mirrored")
+    names = ("virtual", "added_light", "shadow_ratio", "mirror_ball")
     return composite.make_layers(*(arrays.get(name) for name in names))
 
 
@@ -18,7 +18,7 @@ def composite_config(layers: tuple[str, ...]) -> composite.CompositeConfig:
     """Which layers to compile in."""
     return composite.CompositeConfig(
         virtual="virtual" in layers,
-        added="physical_added" in layers,
+        added="added_light" in layers,
         ratio="shadow_ratio" in layers,
-        mirrored="mirrored" in layers,
+        mirror_ball="mirror_ball" in layers,
     )

@@ -1,0 +1,293 @@
+"""The farm from file to file: GPUs and workers, what bounds a worker, a long recording, a data set of variations.
+
+    python -m bench farm --device cuda --output DIR [--parts gpus,bounds] [--minutes 6]
+
+Parts, each of which keeps to its share of the minutes:
+
+- ``bounds``: what a frame costs in each step of a worker, alone and on one stream: decoding, conversion, tracking,
+  kernels, encoding; and a whole worker beside them;
+- ``gpus``: frames a second of segments with one GPU and half of the cores, and with two and all of them, in turn; one
+  and several workers per GPU. On a machine of one GPU only the first;
+- ``cpu``: the same on the processor alone, for several numbers of workers;
+- ``long``: a recording through 8 segments: memory over time, and every picture of them equal to those of one run. As
+  many of the asked frames as fit its minutes; the figures say how many;
+- ``variations``: variations of one clip by 1, 2 and 4 workers at once, each with its share of the cores: bytes equal;
+  and a variation's frame over one of ``live`` with the same light, in turn.
+
+Results are JSON lines, on the standard output and in ``DIR/farm_PART.jsonl``; progress is on the standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import os
+import shutil
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from bench.common import commit
+from bench.farm_recordings import write_recording, write_scene
+from bench.farm_runs import jobs_done, prepare, rates, work
+
+PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18}
+"""Parts in their order, and their shares of the minutes."""
+CLIP_FRAMES = 480
+"""Of the recording that ``gpus`` and ``cpu`` light again and again."""
+START_SECONDS = 90.0
+"""Within which workers should have done their first jobs, kernels compiled."""
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Options of this benchmark."""
+    parser = argparse.ArgumentParser(prog="python -m bench farm", description=__doc__.partition("\n")[0])
+    parser.add_argument("--output", type=Path, metavar="DIR", help="where the JSON lines go (default: nowhere)")
+    parser.add_argument("--parts", default=",".join(PARTS), metavar="A,B", help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("--minutes", type=float, default=6.0, help="of all chosen parts (default: 6)")
+    parser.add_argument("--size", default="1920x1080", metavar="WxH", help="of the recordings (default: 1920x1080)")
+    parser.add_argument("--quality", default="medium")
+    parser.add_argument("--per-gpu", default="1,4,8", metavar="N,M", help="workers of a GPU to try (default: 1,4,8)")
+    parser.add_argument("--cpu-workers", default="1,2,4,8", metavar="N,M", help="of part cpu (default: 1,2,4,8)")
+    parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
+    parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
+    parser.add_argument("--variations", type=int, default=2000, help="of part variations (default: 2000)")
+    parser.add_argument("--variation-size", default="640x480", metavar="WxH", help="of their pictures (640x480)")
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR", help="for recordings and runs (default: a temporary folder)"
+    )
+    options = parser.parse_args(arguments)
+    unknown = [part for part in options.parts.split(",") if part not in PARTS]
+    if unknown:
+        parser.error(f"--parts {','.join(unknown)}: there are {', '.join(PARTS)}")
+    return options
+
+
+@dataclasses.dataclass
+class Bench:
+    """What all parts share."""
+
+    options: argparse.Namespace
+    device: str
+    folder: Path
+    """For recordings and runs."""
+    part: str = ""
+    until: float = 0.0
+    """When the part should be over, on ``time.monotonic``."""
+    begun: float = dataclasses.field(default_factory=time.monotonic)
+    costs: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Milliseconds of a frame that were measured: ``survey``, ``worker``, ``worker_processor``."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Of the recordings."""
+        return size_of(self.options.size)
+
+    @property
+    def left(self) -> float:
+        """Seconds that the part has."""
+        return self.until - time.monotonic()
+
+    def say(self, line: str) -> None:
+        """A line of progress."""
+        print(f"[{time.monotonic() - self.begun:6.1f} s] {self.part}: {line}", file=sys.stderr, flush=True)
+
+    def tell(self, case: str, **figures: Any) -> None:
+        """One result."""
+        names = [str(device.name) for device in wp.get_cuda_devices()] if self.device != "cpu" else []
+        record = {
+            "case": f"farm {case}",
+            "size": self.options.variation_size if self.part == "variations" else self.options.size,
+            **figures,
+            "quality": self.options.quality,
+            "decode": self.options.decode,
+            "gpus": names,
+            "cores": len(os.sched_getaffinity(0)),
+            "warp": wp.__version__,
+            "commit": commit(),
+        }
+        line = json.dumps(record)
+        print(line, flush=True)
+        if self.options.output is not None:
+            self.options.output.mkdir(parents=True, exist_ok=True)
+            with open(self.options.output / f"farm_{self.part}.jsonl", "a", encoding="utf-8") as stream:
+                stream.write(line + "\n")
+
+    def surveyed(self) -> Path:
+        """A run that has surveyed the recording of parts ``bounds``, ``gpus`` and ``cpu``; made once."""
+        folder = self.folder / "surveyed"
+        if folder.exists():
+            return folder
+        scene, video = self.folder / "desk.toml", self.folder / "desk.mp4"
+        write_scene(scene, self.size)
+        start = time.monotonic()
+        write_recording(video, self.size, CLIP_FRAMES)
+        self.say(f"a recording of {CLIP_FRAMES} frames in {time.monotonic() - start:.1f} s")
+        jobs = self.write_jobs("survey.toml", 1, CLIP_FRAMES)
+        prepare(folder, jobs, None)
+        seen = work(folder, 1, self.device, self.say, steady=0.0)
+        surveys = jobs_done(folder, "survey")
+        if not surveys:
+            raise SystemExit(f"the survey failed: {seen.errors}")
+        self.costs["survey"] = 1e3 * (surveys[0].end - surveys[0].start) / CLIP_FRAMES
+        self.tell("survey", ms_per_frame=round(self.costs["survey"], 2), frames=CLIP_FRAMES, bytes=surveys[0].bytes)
+        return folder
+
+    def write_jobs(self, name: str, clips: int, segment_frames: int) -> Path:
+        """A job file of so many clips that are one recording."""
+        settings = f'quality = "{self.options.quality}"\ndecode = "{self.options.decode}"\n'
+        run = f"schema = 1\n[run]\n{settings}segment_frames = {segment_frames}\n"
+        clip = '[[clip]]\nscene = "desk.toml"\npath = "desk.mp4"\nname = "c{:04d}"\n'
+        path = self.folder / name
+        path.write_text(run + "".join(clip.format(number) for number in range(clips)), encoding="utf-8")
+        return path
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height of ``WxH``."""
+    width, _, height = text.partition("x")
+    return int(width), int(height)
+
+
+def numbers_of(text: str) -> list[int]:
+    """Numbers with commas between."""
+    return [int(part) for part in text.split(",")]
+
+
+def steady_run(
+    bench: Bench, name: str, workers: int, device: str, seconds: float, *, gpus: Sequence[int], cores: Sequence[int]
+) -> dict[str, Any]:
+    """Frames a second of segments with so many workers; what it writes is removed."""
+    surveyed = bench.surveyed()
+    jobs = bench.write_jobs(f"{name}.toml", 60, bench.options.segment_frames)
+    folder = bench.folder / name
+    prepare(folder, jobs, surveyed)
+    limit = START_SECONDS + seconds
+    seen = work(folder, workers, device, bench.say, gpus=gpus, cores=cores, limit=limit, steady=seconds)
+    done = jobs_done(folder, "segment")
+    figures = rates(done, workers) | {
+        "workers": workers,
+        "run_seconds": round(seen.seconds, 1),
+        "processor_cores": round(seen.processor_seconds / seen.seconds, 2),
+        "bytes_per_frame": round(sum(job.bytes for job in done) / max(sum(job.frames for job in done), 1)),
+        **seen.gpu_figures(),
+    }
+    if not done:
+        figures["error"] = seen.errors[-500:]
+    shutil.rmtree(folder)
+    return figures
+
+
+def run_gpus(bench: Bench) -> None:
+    """One GPU and two, in turn."""
+    count = len(wp.get_cuda_devices())
+    if not count or bench.device == "cpu":
+        bench.tell("gpus", left_out="there is no CUDA device")
+        return
+    bench.surveyed()
+    cores = sorted(os.sched_getaffinity(0))
+    half = cores[: max(1, len(cores) // 2)] if count > 1 else cores
+    cases: list[tuple[int, int, Sequence[int]]] = []
+    for per_gpu in numbers_of(bench.options.per_gpu):
+        cases.append((1, per_gpu, half))
+        if count > 1:
+            cases.append((2, per_gpu, cores))
+    if count > 1:
+        cases.append((1, 2 * numbers_of(bench.options.per_gpu)[-1], cores))
+    seconds = max(4.0, bench.left / (2 * len(cases)) - 8.0)
+    found: dict[tuple[int, int, int], list[float]] = {}
+    for turn in range(2):
+        for gpus, per_gpu, own in cases:
+            if turn and bench.left < seconds + 8.0:
+                bench.say("no time is left for the second turn")
+                break
+            bench.say(f"{gpus} GPU, {per_gpu} workers each, {len(own)} cores, turn {turn + 1}")
+            name = f"gpus-{gpus}-{per_gpu}-{turn}"
+            figures = steady_run(bench, name, gpus * per_gpu, "cuda", seconds, gpus=range(gpus), cores=own)
+            bench.tell("gpus", gpus=gpus, per_gpu=per_gpu, used_cores=len(own), turn=turn + 1, figures=figures)
+            if "fps" in figures:
+                found.setdefault((gpus, per_gpu, len(own)), []).append(figures["fps"])
+    for per_gpu in numbers_of(bench.options.per_gpu):
+        one, two = found.get((1, per_gpu, len(half)), []), found.get((2, per_gpu, len(cores)), [])
+        ratios = [b / a for a, b in zip(one, two, strict=False)]
+        if ratios:
+            bench.tell(
+                f"two GPUs over one, {per_gpu} workers each",
+                ratio=round(statistics.median(ratios), 3),
+                ratios=[round(ratio, 3) for ratio in ratios],
+                asked=1.9,
+                one_fps=one,
+                two_fps=two,
+            )
+
+
+def run_cpu(bench: Bench) -> None:
+    """Numbers of workers on the processor alone."""
+    bench.surveyed()
+    cores = sorted(os.sched_getaffinity(0))
+    counts = [count for count in numbers_of(bench.options.cpu_workers) if count <= len(cores)]
+    frames, bench.options.segment_frames = bench.options.segment_frames, min(4, bench.options.segment_frames)
+    try:
+        seconds = max(4.0, bench.left / len(counts) - 8.0)
+        for count in counts:
+            bench.say(f"{count} workers on {len(cores)} cores")
+            figures = steady_run(bench, f"cpu-{count}", count, "cpu", seconds, gpus=(), cores=cores)
+            bench.tell("cpu", used_cores=len(cores), figures=figures)
+    finally:
+        bench.options.segment_frames = frames
+
+
+def run_parts(bench: Bench) -> None:
+    """All parts that are asked for, each within its share of the minutes."""
+    from bench.farm_bounds import run_bounds
+    from bench.farm_equal import run_long, run_variations
+
+    runs = {
+        "bounds": run_bounds,
+        "gpus": run_gpus,
+        "cpu": run_cpu,
+        "long": run_long,
+        "variations": run_variations,
+    }
+    asked = [part for part in PARTS if part in bench.options.parts.split(",")]
+    end = time.monotonic() + 60.0 * bench.options.minutes
+    for index, part in enumerate(asked):
+        left = sum(PARTS[name] for name in asked[index:])
+        bench.part = part
+        bench.until = time.monotonic() + max(end - time.monotonic(), 20.0) * PARTS[part] / left
+        bench.say(f"has {bench.left:.0f} s")
+        start = time.monotonic()
+        try:
+            runs[part](bench)
+        except Exception as error:
+            # The other parts are run all the same; the caller sees this one's end.
+            bench.tell(part, error=f"{type(error).__name__}: {error}"[:500])
+            if len(asked) == 1:
+                raise
+        bench.say(f"took {time.monotonic() - start:.0f} s")
+
+
+def main(device: str, arguments: Sequence[str] = ()) -> None:
+    """Run the parts that the arguments ask for."""
+    options = parse(arguments)
+    with _folder(options.work) as folder:
+        run_parts(Bench(options, "cpu" if device == "cpu" else "cuda", folder))
+
+
+@contextlib.contextmanager
+def _folder(path: Path | None) -> Iterator[Path]:
+    """A folder that is there, temporary unless it is named."""
+    if path is not None:
+        path.mkdir(parents=True, exist_ok=True)
+        yield path.absolute()
+        return
+    with tempfile.TemporaryDirectory(prefix="warp_ar-farm-") as name:
+        yield Path(name)

@@ -1,0 +1,105 @@
+"""What is asked of a CUDA machine beside what it does, in one run of less than five minutes, as a table.
+
+Starts come first, in caches of their own that the other parts then use: nothing cached, seen before, another scene at
+``high``. Then whole frames at 480p, 1080p and 4K, streams, and frames on the host's cores. What these print is printed;
+a part for which no time is left is named. ``WARP_AR_BENCH`` may name parts, separated by commas: ``start``, ``frame``,
+``streams``, ``cores``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.bench_start import cache_variables, start
+from bench.common import commit
+
+SECONDS = 290.0
+"""After which nothing is begun, and what is under way ends."""
+STARTS: Mapping[str, tuple[str, str]] = {
+    "cold": ("desk", "medium"),
+    "seen": ("desk", "medium"),
+    "new scene high": ("torus", "high"),
+}
+PARTS: Mapping[str, str] = {"frame": "graph", "streams": "1080,60,1,4,16", "cores": "480,1"}
+"""Benches, and what ``WARP_AR_BENCH`` tells them."""
+MARKS: Mapping[str, tuple[str, str, str]] = {
+    "nothing cached, s": ("15", "start cold", "median_s"),
+    "seen before, s": ("2", "start seen", "median_s"),
+    "a new scene at high, s": ("6", "start new scene high", "median_s"),
+    "480p medium, device, ms": ("-", "graph 480p medium", "median_ms"),
+    "1080p medium, device, ms": ("0.75", "graph 1080p medium", "median_ms"),
+    "1080p high, device, ms": ("2.2", "graph 1080p high", "median_ms"),
+    "4K medium, device, ms": ("1.5", "graph 4K medium", "median_ms"),
+    "1080p medium, both transfers, frames a second": ("1300", "stream 1080p medium, fast camera", "fps_settled"),
+    "1 camera of 1080p, frames a second": ("60", "streams 1 of 1080 rows, 60 frames a second each", "fps"),
+    "4 cameras": ("240", "streams 4 of 1080 rows, 60 frames a second each", "fps"),
+    "16 cameras": ("960", "streams 16 of 1080 rows, 60 frames a second each", "fps"),
+    "16 cameras, median latency, ms": ("-", "streams 16 of 1080 rows, 60 frames a second each", "median_ms"),
+    "16 cameras, 99th percentile of latency, ms": ("-", "streams 16 of 1080 rows, 60 frames a second each", "p99_ms"),
+    "480p medium on 2 cores, ms": ("-", "cores 480p 2", "median_ms"),
+    "8 cores over 2": ("2.5", "cores 480p 8", "of_2"),
+    "16 cores over 2": ("3.5", "cores 480p 16", "of_2"),
+    "processor time on 16 cores over that on 2": ("at most 1.3", "cores 480p 16", "busy_of_2"),
+}
+"""What is asked, the case and the field that say what is reached."""
+
+
+def run_part(name: str, asked: str, device: str, caches: Path, end: float) -> dict[str, dict[str, Any]]:
+    """Run a bench in a process of its own and hand on what it prints; its records, by case."""
+    environment = {**os.environ, **cache_variables(caches), "WARP_AR_BENCH": asked}
+    command = [sys.executable, "-m", "bench", name, "--device", device]
+    found: dict[str, dict[str, Any]] = {}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        timer = threading.Timer(max(end - time.perf_counter(), 0.0), process.kill)
+        timer.start()
+        for line in process.stdout:
+            print(line, end="", flush=True)
+            if line.startswith("{"):
+                record = json.loads(line)
+                found[record["case"]] = record
+        timer.cancel()
+    if process.returncode:
+        print(f"bench marks: {name} did not come to its end, exit code {process.returncode}", flush=True)
+    return found
+
+
+def add_ratios(found: dict[str, dict[str, Any]]) -> None:
+    """Put frames on many cores beside those on two."""
+    base = found.get("cores 480p 2")
+    for case, record in found.items():
+        if base is not None and case.startswith("cores 480p"):
+            record["of_2"] = base["median_ms"] / record["median_ms"]
+            record["busy_of_2"] = record["processor_ms"] / base["processor_ms"]
+
+
+def main(device: str) -> None:
+    """All parts, or those that the environment names, and the table."""
+    begun = time.perf_counter()
+    wanted = set(filter(None, os.environ.get("WARP_AR_BENCH", "").split(","))) or {"start", *PARTS}
+    found: dict[str, dict[str, Any]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        caches = Path(folder) / "caches"
+        for index, (label, (scene, quality)) in enumerate(STARTS.items() if "start" in wanted else ()):
+            wall, busy = start(scene, device, caches, Path(folder) / f"out_{index}", quality)
+            record = {"case": f"start {label}", "median_s": wall * 1e-3, "processor_s": busy * 1e-3, "commit": commit()}
+            found[str(record["case"])] = record
+            print(json.dumps(record), flush=True)
+        for name, asked in PARTS.items():
+            if name in wanted and time.perf_counter() - begun < SECONDS:
+                found |= run_part(name, asked, device, caches, begun + SECONDS)
+    add_ratios(found)
+    print(f"\n{'what':<48} {'asked':>12} {'measured':>12}")
+    for what, (mark, case, field) in MARKS.items():
+        measured = f"{found[case][field]:.2f}" if field in found.get(case, {}) else "not run"
+        print(f"{what:<48} {mark:>12} {measured:>12}")
+    print(f"{time.perf_counter() - begun:.0f} s")

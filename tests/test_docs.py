@@ -1,0 +1,48 @@
+"""Commands in the documentation are commands: their options exist."""
+
+from __future__ import annotations
+
+import importlib
+import pathlib
+import re
+import shlex
+
+import pytest
+
+from warp_ar.errors import UsageError
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PACKAGES = {"farm": "farm.cli"}
+"""Commands whose options are told by another module."""
+NUMBERS = {"N": "1", "X": "1", "E": "0.1", "WxH": "4x3"}
+"""What stands for a number."""
+
+
+def commands(page: pathlib.Path) -> list[str]:
+    """Of blocks of shell, and of code in the text."""
+    text = page.read_text(encoding="utf-8")
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    spans = re.findall(r"`([^`\n]+(?:\n[^`\n]+)?)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    found = (re.search(r"python -m warp_ar\.(.*)", " ".join(line.split())) for line in (*lines, *spans))
+    return [match[1] for match in found if match is not None]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_options_of_commands_exist(page: pathlib.Path) -> None:
+    for command in commands(page):
+        name, *words = shlex.split(command.split(" && ")[0], comments=True)
+        words = [NUMBERS.get(word, word) for word in words]
+        parser = importlib.import_module(f"warp_ar.{PACKAGES.get(name, name)}").make_parser()
+        options = [word.split("=")[0] for word in words if word.startswith("--")]
+        try:
+            parser.parse_args(words)
+        except UsageError as error:
+            # A command may be told by its name and an option alone; that option must be one.
+            assert "required" in str(error), f"{page.name}: {command}: {error}"
+            known = {one for action in parser._actions for one in action.option_strings}
+            assert set(options) <= known, f"{page.name}: {command}"
+
+
+def test_pages_have_commands() -> None:
+    assert sum(len(commands(page)) for page in PAGES) > 50

@@ -1,0 +1,62 @@
+"""How many workers share a GPU, by what one alone was seen to need."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.farm_rig import make_jobs, write_recording
+from warp_ar.farm import fitting
+from warp_ar.farm.fitting import Probe, fit_workers, jobs_at_once, probe_worker, workers_of_gpu
+from warp_ar.farm.ray_pool import share_of_gpu
+
+GIB = 1 << 30
+
+
+@pytest.mark.parametrize(
+    ("cores_kept_busy", "cores", "gpus", "bytes_used", "free", "expected"),
+    [
+        (3.2, 16, 1, 1 * GIB, 78 * GIB, 5),
+        (3.2, 32, 2, 1 * GIB, 78 * GIB, 5),
+        (3.2, 32, 1, 1 * GIB, 78 * GIB, 10),
+        (3.2, 32, 1, 3 * GIB, 10 * GIB, 3),  # by its memory
+        (3.2, 2, 1, 1 * GIB, 78 * GIB, 1),
+        (3.2, 32, 1, 20 * GIB, 10 * GIB, 1),  # one there must be; what it lacks it says itself
+        (0.5, 256, 1, 1 * GIB, 200 * GIB, fitting.MOST),
+    ],
+)
+def test_as_many_as_cores_feed_and_memory_holds(cores_kept_busy, cores, gpus, bytes_used, free, expected):
+    assert workers_of_gpu(Probe(40.0, cores_kept_busy, bytes_used, free), cores, gpus) == expected
+
+
+def test_one_worker_is_tried_and_a_clip_that_cannot_be_is_passed_over(tmp_path):
+    write_recording(tmp_path / "good.mp4", 4)
+    (tmp_path / "bad.mp4").write_bytes(b"no video")
+    clips = [{"scene": "torus", "path": "bad.mp4"}, {"scene": "torus", "path": "good.mp4"}]
+    probe = probe_worker(make_jobs(tmp_path, clips), "cpu")
+    assert probe is not None
+    assert probe.frames_per_second > 0.0
+    assert probe.cores > 0.0
+    assert probe_worker(make_jobs(tmp_path, clips[:1]), "cpu") is None
+
+
+def test_no_more_workers_than_there_are_jobs(tmp_path, monkeypatch):
+    write_recording(tmp_path / "good.mp4", 4)
+    clips = [{"scene": "torus", "path": "good.mp4"}] * 3
+    whole = make_jobs(tmp_path, clips)
+    cut = make_jobs(tmp_path, clips, run={"quality": "low", "segment_frames": 2})
+    assert jobs_at_once(whole) == 3
+    assert jobs_at_once(cut) is None
+    monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: Probe(40.0, 2.0, GIB, 78 * GIB))
+    said = []
+    assert fit_workers(cut, ["cuda:0", "cuda:1"], 16, said.append) == 8
+    assert fit_workers(whole, ["cuda:0", "cuda:1"], 16, said.append) == 3
+    assert "4 workers for each of 2 GPUs" in said[0]
+    monkeypatch.setattr(fitting, "probe_worker", lambda jobs, device: pytest.fail("three clips keep three GPUs busy"))
+    assert fit_workers(whole, ["cuda:0", "cuda:1", "cuda:2"], 16, said.append) == 3
+
+
+@pytest.mark.parametrize(("workers", "gpus"), [(1, 1), (2, 2), (1, 4), (3, 1), (7, 2), (16, 2), (48, 8)])
+def test_all_actors_find_room_on_the_gpus(workers, gpus):
+    share = share_of_gpu(workers, gpus)
+    assert 0 < share <= 1
+    assert gpus * int(1 / share + 1e-9) >= workers

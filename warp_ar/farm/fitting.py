@@ -1,0 +1,148 @@
+"""How many workers share a GPU: found by having one light a few frames alone.
+
+A worker decodes and encodes on the processor, which takes it much longer than its kernels take the GPU: as many fit as
+a GPU's share of the cores can feed and its memory holds. What is tried runs in a process of its own, so that the
+driver holds no part of a GPU.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import concurrent.futures.process
+import dataclasses
+import math
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from warp_ar.errors import WarpArError
+from warp_ar.farm.frames import index_frames
+from warp_ar.farm.jobs import Job, JobFile, job_of_clip, lit_range, source_of
+from warp_ar.farm.records import Context
+
+FRAMES = 24
+"""That the worker lights, twice: the first time kernels are loaded and arrays allocated."""
+CLIPS = 3
+"""That are tried before the probe gives up."""
+MOST = 16
+"""Workers of a GPU."""
+CONTEXT_BYTES = 600 << 20
+"""Of a GPU's memory that a process takes before it has allocated anything."""
+SPARE = 0.9
+"""Share of a GPU's memory that workers may fill."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """What one worker alone was seen to need."""
+
+    frames_per_second: float
+    cores: float
+    """That it kept busy: processor time over time."""
+    bytes: int
+    """Of the device's memory; 0 on CPU."""
+    free_bytes: int
+    """Of the device's memory before."""
+
+
+def workers_of_gpu(probe: Probe, cores: int, gpus: int) -> int:
+    """How many workers share each GPU.
+
+    Args:
+        probe: Of one worker.
+        cores: Of the machine.
+        gpus: Of the machine.
+    """
+    by_cores = cores / gpus / max(probe.cores, 0.1)
+    by_memory = SPARE * probe.free_bytes / max(probe.bytes, 1)
+    return max(1, min(MOST, round(by_cores), math.floor(by_memory)))
+
+
+def jobs_at_once(jobs: JobFile) -> int | None:
+    """How many jobs there are at most; None: that is known when the clips have been surveyed."""
+    if jobs.dataset is not None or jobs.settings.segment_frames is not None:
+        return None
+    return len(jobs.clips)
+
+
+def probe_worker(jobs: JobFile, device: str) -> Probe | None:
+    """Have one worker of a process of its own light a few frames; None where no clip can be tried.
+
+    Args:
+        jobs: The job file.
+        device: ``cpu`` or ``cuda:N``.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as process:
+        try:
+            return process.submit(_probe, jobs, device).result()
+        except concurrent.futures.process.BrokenProcessPool:
+            return None
+
+
+def fit_workers(jobs: JobFile, devices: list[str], cores: int, say: Callable[[str], None]) -> int:
+    """Workers for GPUs, all told.
+
+    Args:
+        jobs: The job file.
+        devices: The GPUs.
+        cores: Of the machine.
+        say: Called with a line for people.
+    """
+    most = jobs_at_once(jobs)
+    if most is not None and most <= len(devices):
+        return len(devices)
+    probe = probe_worker(jobs, devices[0])
+    if probe is None:
+        return len(devices)
+    each = workers_of_gpu(probe, cores, len(devices))
+    say(
+        f"a worker alone lights {probe.frames_per_second:.0f} frames/s and keeps {probe.cores:.1f} of {cores} cores "
+        f"busy: {each} workers for each of {len(devices)} GPUs; --workers says otherwise"
+    )
+    total = each * len(devices)
+    return total if most is None else min(total, most)
+
+
+def _probe(jobs: JobFile, device: str) -> Probe | None:
+    """As ``probe_worker``, in this process."""
+    import warp as wp
+
+    from warp_ar.device import start_warp
+    from warp_ar.farm.work import Work
+
+    start_warp()
+    target = wp.get_device(device)
+    free = target.free_memory if target.is_cuda else 0
+    for clip in range(min(len(jobs.clips), CLIPS)):
+        try:
+            length = index_frames(*source_of(jobs, clip)).length
+            first, end = lit_range(jobs.clips[clip], length)
+        except WarpArError:
+            continue
+        few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))
+        tried = dataclasses.replace(jobs, clips=(*jobs.clips[:clip], few, *jobs.clips[clip + 1 :]))
+        with (
+            tempfile.TemporaryDirectory(prefix="warp_ar-probe-") as name,
+            Work(Context(tried, Path(name), device)) as work,
+        ):
+            if work.do(Job("survey", clip), lambda _: None).state != "done":
+                continue
+            job = job_of_clip(tried, clip, 0, length)
+            wall = busy = 0.0
+            frames = 0
+            for turn in range(2):
+                start, spent = time.perf_counter(), time.process_time()
+                outcome = work.do(job, lambda _: None)
+                wall, busy = time.perf_counter() - start, time.process_time() - spent
+                if outcome.state != "done":
+                    break
+                frames = int(outcome.values["frames"])
+                place = Path(name) / job.place(tried)
+                place.rename(place.with_name(f"tried-{turn}"))
+            else:
+                used = free - target.free_memory + CONTEXT_BYTES if target.is_cuda else 0
+                return Probe(frames / wall, busy / wall, used, free)
+    return None
