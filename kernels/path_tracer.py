@@ -73,13 +73,8 @@ from warp_ar.kernels.path_sampling import (
 )
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.relight import reflectance_of
-<<<<<<< HEAD
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
-from warp_ar.kernels.shade import MIN_FACING
-=======
-from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import face_viewer
->>>>>>> main
 from warp_ar.kernels.shadow import has_penumbra, sample_light
 from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, ROUNDING, Hit, TraceConfig, intersect_sphere, make_trace, offset_origin
