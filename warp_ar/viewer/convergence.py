@@ -73,7 +73,7 @@ class Convergence:
             frame: As the camera gave it.
             result: What the pipeline made of it.
             seconds: On the pipeline's clock: where what is animated stands.
-            builder: Compiles and uploads beside the frames.
+            builder: Compiles, uploads and takes the first sample beside the frames.
         """
         if key == self._key or result.pose is None:
             return
@@ -85,7 +85,11 @@ class Convergence:
 
         def make() -> PathTracer:
             tracer = known.tracer(device=str(pipeline.device), light_samples=LIGHT_SAMPLES)
-            tracer.sample_for(0.0)  # compiles
+            # All kernels are compiled here, so that no slice waits for that; what is dropped meanwhile ends.
+            while self._key is key and not tracer.sample_for(SLICE_SECONDS):
+                pass
+            if tracer.samples > 0:
+                tracer.picture()
             return tracer
 
         self._made = builder.submit(make)

@@ -237,7 +237,7 @@ class FrameLoop:
     def _beside(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
         """What the picture is compared with."""
         controls, lighting = self._controls, self._helpers.lighting
-        if controls.compare not in CONVERGING or controls.playing:
+        if controls.compare not in CONVERGING or controls.playing or lighting.changing:
             self.convergence.drop()
         if controls.compare not in CONVERGING:
             return lighting.other(frame, now)
