@@ -9,6 +9,7 @@ import shlex
 
 import pytest
 
+from warp_ar.command_line import Parser
 from warp_ar.errors import UsageError
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -28,6 +29,15 @@ def commands(page: pathlib.Path) -> list[str]:
     return [match[1] for match in found if match is not None]
 
 
+def refusal(parser: Parser, words: list[str]) -> str | None:
+    """What a command's parser says against words, None where it takes them."""
+    try:
+        parser.parse_args(words)
+    except UsageError as error:
+        return str(error)
+    return None
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_options_of_commands_exist(page: pathlib.Path) -> None:
     for command in commands(page):
@@ -35,11 +45,10 @@ def test_options_of_commands_exist(page: pathlib.Path) -> None:
         words = [NUMBERS.get(word, word) for word in words]
         parser = importlib.import_module(f"warp_ar.{PACKAGES.get(name, name)}").make_parser()
         options = [word.split("=")[0] for word in words if word.startswith("--")]
-        try:
-            parser.parse_args(words)
-        except UsageError as error:
+        refused = refusal(parser, words)
+        if refused is not None:
             # A command may be told by its name and an option alone; that option must be one.
-            assert "required" in str(error), f"{page.name}: {command}: {error}"
+            assert "required" in refused, f"{page.name}: {command}: {refused}"
             known = {one for action in parser._actions for one in action.option_strings}
             assert set(options) <= known, f"{page.name}: {command}"
 
