@@ -164,9 +164,9 @@ class Controls:
         Raises:
             UsageError: There is no such choice.
         """
-        choices = (CAMERA, *CONVERGING, *PRESETS)
-        if other not in ("", *choices):
-            raise UsageError(f"compare with {other!r}; expected one of {', '.join(choices)}")
+        if other not in ("", CAMERA, *CONVERGING, *PRESETS):
+            known = ", ".join((CAMERA, *CONVERGING))
+            raise UsageError(f"compare with {other!r}; expected {known} or a preset: {', '.join(PRESETS)}")
         with self.changed:
             self.compare = other
             self._touch()
