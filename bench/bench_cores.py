@@ -87,7 +87,8 @@ class Watch:
         """Means over frames."""
         parts = {name: statistics.mean(values) for name, values in self.parts.items()}
         parts["python"] = parts["render"] - parts.get("native", 0.0)
-        return {"parts": parts, "stages": {name: statistics.mean(values) for name, values in self.stages.items()}}
+        stages = {name: round(statistics.mean(values), 3) for name, values in self.stages.items()}
+        return {"parts": {name: round(value, 3) for name, value in parts.items()}, "stages": stages}
 
 
 def least_times(crew: Crew) -> tuple[float, float]:
@@ -133,7 +134,7 @@ def print_parts(runs: dict[int, list[dict[str, Any]]]) -> None:
     """The second table: a line for each part of a frame, a column for each count of cores."""
 
     def means(kind: str, name: str) -> list[float]:
-        return [float(np.mean([run[kind].get(name, 0.0) for run in found])) for found in runs.values()]
+        return [round(float(np.mean([run[kind].get(name, 0.0) for run in found])), 3) for found in runs.values()]
 
     print(f"\n{'ms of a frame on cores':<28}" + "".join(f"{count:>9}" for count in runs))
     words = {

@@ -38,6 +38,8 @@ import warp as wp
 from bench.common import commit
 from bench.farm_recordings import write_recording, write_scene
 from bench.farm_runs import jobs_done, prepare, rates, work
+from warp_ar.farm.fitting import probe_worker, workers_of_gpu
+from warp_ar.farm.jobs import parse_jobs, read_jobs
 
 PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18}
 """Parts in their order, and their shares of the minutes."""
@@ -60,6 +62,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
     parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
     parser.add_argument("--variations", type=int, default=2000, help="of part variations (default: 2000)")
+    parser.add_argument("--decode", choices=("cpu", "gpu"), default="cpu", help="what decodes (default: cpu)")
     parser.add_argument("--variation-size", default="640x480", metavar="WxH", help="of their pictures (640x480)")
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="for recordings and runs (default: a temporary folder)"
@@ -131,8 +134,11 @@ class Bench:
         start = time.monotonic()
         write_recording(video, self.size, CLIP_FRAMES)
         self.say(f"a recording of {CLIP_FRAMES} frames in {time.monotonic() - start:.1f} s")
-        jobs = self.write_jobs("survey.toml", 1, CLIP_FRAMES)
-        prepare(folder, jobs, None)
+        start = time.monotonic()
+        prepare(self.folder / "first", self.write_jobs("first.toml", 1, 8, end=16), None)
+        work(self.folder / "first", 1, self.device, self.say, steady=0.0)
+        self.say(f"kernels are compiled and kept after {time.monotonic() - start:.1f} s")
+        prepare(folder, self.write_jobs("survey.toml", 1, 8), None)
         seen = work(folder, 1, self.device, self.say, steady=0.0)
         surveys = jobs_done(folder, "survey")
         if not surveys:
@@ -141,13 +147,13 @@ class Bench:
         self.tell("survey", ms_per_frame=round(self.costs["survey"], 2), frames=CLIP_FRAMES, bytes=surveys[0].bytes)
         return folder
 
-    def write_jobs(self, name: str, clips: int, segment_frames: int) -> Path:
-        """A job file of so many clips that are one recording."""
+    def write_jobs(self, name: str, clips: int, segment_frames: int, end: int = CLIP_FRAMES) -> Path:
+        """A job file of so many clips that are the first frames of one recording."""
         settings = f'quality = "{self.options.quality}"\ndecode = "{self.options.decode}"\n'
         run = f"schema = 1\n[run]\n{settings}segment_frames = {segment_frames}\n"
-        clip = '[[clip]]\nscene = "desk.toml"\npath = "desk.mp4"\nname = "c{:04d}"\n'
+        clip = '[[clip]]\nscene = "desk.toml"\npath = "desk.mp4"\nname = "c{:04d}"\nframes = [0, {}]\n'
         path = self.folder / name
-        path.write_text(run + "".join(clip.format(number) for number in range(clips)), encoding="utf-8")
+        path.write_text(run + "".join(clip.format(number, end) for number in range(clips)), encoding="utf-8")
         return path
 
 
@@ -194,6 +200,10 @@ def run_gpus(bench: Bench) -> None:
         return
     bench.surveyed()
     cores = sorted(os.sched_getaffinity(0))
+    jobs = parse_jobs(read_jobs(bench.write_jobs("trial.toml", 1, bench.options.segment_frames)), "trial.toml")
+    if (trial := probe_worker(jobs, "cuda:0")) is not None:
+        each = workers_of_gpu(trial, len(cores), count)
+        bench.tell("trial of one worker", **dataclasses.asdict(trial), workers_of_a_gpu=each)
     half = cores[: max(1, len(cores) // 2)] if count > 1 else cores
     cases: list[tuple[int, int, Sequence[int]]] = []
     for per_gpu in numbers_of(bench.options.per_gpu):

@@ -67,7 +67,7 @@ def run_long(bench: Bench) -> None:
     text = RECORDING.format(quality=options.quality, decode=options.decode, segment=-(-frames // SEGMENTS))
     jobs.write_text(text)
     prepare(folder, jobs, None)
-    seen = work(folder, SEGMENTS, bench.device, bench.say, limit=max(bench.left, 60.0))
+    seen = work(folder, SEGMENTS, bench.device, bench.say, limit=max(bench.left, 120.0))
     survey, segments = jobs_done(folder, "survey"), jobs_done(folder, "segment")
     whole = seen.code == 0 and (folder / "long.mp4").is_file()
     minutes = bench.options.long_frames / RATE / 60
@@ -98,7 +98,8 @@ def frames_that_fit(bench: Bench) -> int:
     cores = usable_cores()
     lit = max(bench.costs["worker"] / SEGMENTS, bench.costs["worker_processor"] / cores)
     # Surveyed once; lit by the run, then once by one run beside eight segments.
-    each = bench.costs["survey"] + lit + max(bench.costs["worker"], 2.0 * lit) + 2.0
+    # (without being encoded, which is half of a worker's time).
+    each = bench.costs["survey"] + lit + max(0.5 * bench.costs["worker"], 2.0 * lit) + 2.0
     fixed = 25.0  # workers' starts, and the recording
     frames = int(0.85 * (bench.left - fixed) * 1e3 / each)
     frames = max(min(frames, bench.options.long_frames), SEGMENTS * EDGE * 2)
@@ -224,7 +225,7 @@ CLIP = 96
 
 def run_variations(bench: Bench) -> None:
     """Variations by 1, 2 and 4 workers, and a frame of one against one of ``live``."""
-    from bench.bench_farm import size_of
+    from bench.bench_farm import START_SECONDS, size_of
 
     size = size_of(bench.options.variation_size)
     write_scene(bench.folder / "small.toml", size)
@@ -246,7 +247,7 @@ def run_variations(bench: Bench) -> None:
         runs = {}
         for count, share in shares.items():
             prepare(bench.folder / f"data-{count}", jobs, None)
-            options = {"cores": share, "limit": limit}
+            options = {"cores": share, "limit": START_SECONDS + limit, "steady": limit}
             say = bench.say if count == 4 else (lambda _: None)
             runs[count] = threads.submit(work, bench.folder / f"data-{count}", count, bench.device, say, **options)
         seen = {count: run.result() for count, run in runs.items()}

@@ -3,7 +3,8 @@
 Behind the ball, and near its rim, where a pixel is many degrees, the map of the environment is filled from neighbours.
 A good part of it stands in the picture, beyond and beside the ball. A direction d from the ball's centre is looked up
 
-- where a proxy is in the way: at the pixel of the point that is hit, if the camera sees that point;
+- where a proxy is in the way: at the pixel of the point that is hit, if the camera sees that point, and if it lies
+  ``OWN_SHADOW`` radii from every ball: closer, the picture shows the ball's own shadow, which no object elsewhere sees;
 - elsewhere at infinity: at the pixel in which the camera looks along d, if it sees past balls and proxies there.
 
 What is near and not modelled is seen from another side than the ball would see it, so the picture is trusted less than
@@ -32,6 +33,8 @@ FRAME_TRUST = wp.constant(wp.float32(0.8))
 """Of what the picture shows, beside 1 of what a ball shows."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
 """How much larger a ball is taken to be where it hides what is behind it: its outline's blur."""
+OWN_SHADOW = wp.constant(wp.float32(6.0))
+"""Radii around a ball within which it shades surfaces: as far reaches its shadow of light 10 degrees above them."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 ENOUGH = wp.constant(wp.float32(0.999))
@@ -49,6 +52,15 @@ def passes_balls(probes: wp.array[Probe], origin: wp.vec3, direction: wp.vec3, r
         if along > 0.0 and along < reach and wp.dot(off, off) < radius * radius:
             return False
     return True
+
+
+@wp.func
+def shaded_by_ball(probes: wp.array[Probe], point: wp.vec3) -> wp.bool:
+    """Whether a point of a surface lies in what a ball may shade."""
+    for k in range(probes.shape[0]):
+        if wp.length(point - probes[k].center) < OWN_SHADOW * probes[k].radius:
+            return True
+    return False
 
 
 @functools.cache
@@ -85,7 +97,9 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
             ray = direction
             reach = wp.float32(FAR)
             hit = trace.closest_proxy(scene, probes[0].center, direction, FAR)
+            shaded = wp.bool(False)
             if hit.shape >= 0:
+                shaded = shaded_by_ball(probes, hit.point)
                 ray = hit.point - camera.camera_position
                 reach = wp.length(ray)
                 ray = ray / reach
@@ -93,7 +107,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
             row = wp.int32(wp.round(wp.clamp(at[1], -1.0, 1.0e6)))
             column = wp.int32(wp.round(wp.clamp(at[0], -1.0, 1.0e6)))
             inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
-            if inside and passes_balls(probes, camera.camera_position, ray, reach):
+            if inside and not shaded and passes_balls(probes, camera.camera_position, ray, reach):
                 if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
                     total += decode(table, frame[row, column])
                     count += 1.0

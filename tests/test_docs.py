@@ -20,12 +20,12 @@ NUMBERS = {"N": "1", "X": "1", "E": "0.1", "WxH": "4x3"}
 """What stands for a number."""
 
 
-def commands(page: pathlib.Path) -> list[str]:
-    """Of blocks of shell, and of code in the text."""
+def commands(page: pathlib.Path, start: str = "python -m warp_ar.") -> list[str]:
+    """What begins so, less that beginning, in blocks of shell and in code of the text."""
     text = page.read_text(encoding="utf-8")
     lines = [line for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
     spans = re.findall(r"`([^`\n]+(?:\n[^`\n]+)?)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
-    found = (re.search(r"python -m warp_ar\.(.*)", " ".join(line.split())) for line in (*lines, *spans))
+    found = (re.search(re.escape(start) + "(.*)", " ".join(line.split())) for line in (*lines, *spans))
     return [match[1] for match in found if match is not None]
 
 
@@ -51,6 +51,19 @@ def test_options_of_commands_exist(page: pathlib.Path) -> None:
             assert "required" in refused, f"{page.name}: {command}: {refused}"
             known = {one for action in parser._actions for one in action.option_strings}
             assert set(options) <= known, f"{page.name}: {command}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_benches_and_tools_exist(page: pathlib.Path) -> None:
+    for command in commands(page, "python -m bench "):
+        for name in shlex.split(command, comments=True):
+            if name.startswith("-"):
+                break
+            assert (ROOT / "bench" / f"bench_{name}.py").exists() or name == "NAME", f"{page.name}: {command}"
+    for folder in ("bench", "tests"):
+        for command in commands(page, f"python -m {folder}."):
+            place = ROOT.joinpath(folder, *command.split()[0].split("."))
+            assert place.with_suffix(".py").exists() or place.is_dir(), f"{page.name}: {command}"
 
 
 def test_pages_have_commands() -> None:

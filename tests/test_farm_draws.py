@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from tests.farm_rig import make_jobs
-from warp_ar.farm.draws import NoPlace, _overlap, draw_variation, local_points, receiver_of
+from warp_ar.farm import draws
+from warp_ar.farm.draws import NoPlace, _overlap, draw_variation, in_kindred_order, local_points, receiver_of
 from warp_ar.scene import Pose, load_scene
 from warp_ar.scene.geometry import rotation_matrix
 
@@ -146,3 +147,19 @@ def test_any_way_up_is_any_way_up_evenly():
     assert np.abs(np.mean(turns, 0)).max() < 5 * np.sqrt(1 / 3 / len(turns))
     for turn in turns[:50]:
         assert np.abs(rotation_matrix(_angles(turn)) - turn).max() < 1e-5
+
+
+def test_variations_of_the_same_kinds_follow_each_other(dataset, drawn, monkeypatch):
+    order = list(in_kindred_order(dataset, 0, len(drawn)))
+    assert sorted(order) == list(range(len(drawn)))
+    assert all(len(variation.kinds) >= 2 for variation in drawn)
+    kinds = [tuple(sorted(draws._draw_kinds(dataset, 0, number).kinds)) for number in order]
+    changes = sum(a != b for a, b in itertools.pairwise(kinds))
+    assert changes == len(set(kinds)) - 1 < len(kinds) - 1
+    # What is said of kinds beforehand is what is drawn, where all find their place.
+    for number, told in zip(order, kinds, strict=True):
+        if len(told) == len(drawn[number].kinds):
+            assert told == drawn[number].kinds
+    monkeypatch.setattr(draws, "CHUNK", 5)
+    chunked = list(in_kindred_order(dataset, 0, len(drawn)))
+    assert [sorted(chunked[n : n + 5]) for n in range(0, len(drawn), 5)] == [[*range(5)], [*range(5, 10)], [10, 11]]

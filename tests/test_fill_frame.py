@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.fill_frame import FRAME_TRUST, fill_frame
+from warp_ar.kernels.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
 from warp_ar.scene import loads_scene
 from warp_ar.scene.ray_scene import HostScene, trace_config
 
@@ -113,12 +113,24 @@ def test_modelled_surfaces_are_looked_up_where_they_are(device):
     hit = np.array([0.0, 0.0, 0.1]) - 0.1 * d / np.where(down, d[..., 2], -1.0)[..., None]
     pixel = pixels_of(hit - EYE)
     away = np.linalg.norm(np.cross(hit - EYE, [1.0, 0.0, 0.0]), axis=-1) / np.linalg.norm(hit - EYE, axis=-1)
-    told = down & inside(pixel, 6.0) & (away > 0.12)
+    # A texel's directions lie up to 2.8 degrees from its middle, by which their hits move along the plane.
+    far = np.linalg.norm(hit - [0.0, 0.0, 0.1], axis=-1) > 1.5 * float(OWN_SHADOW) * 0.03
+    told = down & far & inside(pixel, 6.0) & (away > 0.12)
     assert told.sum() > 100
     # Texels near the horizon span many pixels of the plane.
     assert np.median(np.abs(level[told][:, 1] - pixel[told][:, 1] / 255)) < CODES
     # Parallax: at infinity the same directions are elsewhere.
     assert np.median(np.abs(pixels_of(d)[told][:, 1] - pixel[told][:, 1])) > 10.0
+
+
+def test_the_ball_s_own_shadow_is_not_taken_for_light(device):
+    level = filled(device, ramp(), SCENE + PLANE, np.zeros((HEIGHT, WIDTH, 4), np.float32))
+    d = directions()
+    to_plane = np.where(d[..., 2] < 0.0, -0.1 / np.minimum(d[..., 2], -1e-6), np.inf)
+    near = to_plane < 0.9 * float(OWN_SHADOW) * 0.03
+    assert near.sum() > 1000
+    assert (level[near][:, 3] == 0.0).all()
+    assert (level[(to_plane > 0.3) & (d[..., 2] < -0.1)][:, 3] > 0.0).sum() > 100
 
 
 def test_what_the_ball_tells_is_kept(device):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
 
-from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_USAGE
+from warp_ar.accuracy.path_tracer import PathTracer, TracedPicture
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from warp_ar.reference import MAGNIFIED, main
 
 QUICK = ["torus", "--quality", "low", "--size", "64x48", "--samples", "8", "--device", "cpu"]
@@ -93,3 +96,20 @@ def test_a_place_that_cannot_be_written_is_told_before_paths_are_followed(
     said = capsys.readouterr().err
     assert "is a file, not a folder to write to" in said
     assert said.count("\n") == 1
+
+
+def test_who_interrupts_keeps_what_was_rendered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = PathTracer.render
+
+    def interrupted(self: PathTracer, *arguments: Any, **options: Any) -> Iterator[TracedPicture]:
+        yield next(original(self, *arguments, **options))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PathTracer, "render", interrupted)
+    path = tmp_path / "torus.exr"
+    assert main([*QUICK, "--samples", "16", "--output", str(path)]) == EXIT_INTERRUPTED
+    assert "ended early: what is written has 8 samples a pixel" in capsys.readouterr().err
+    with OpenEXR.File(str(path)) as file:
+        assert file.header()["samples"] == 8

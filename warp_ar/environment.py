@@ -8,7 +8,7 @@ import datetime
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_ar.command_line import EXIT_DONE, Parser, leave, run_command, say
+from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import SinkError, UsageError
 from warp_ar.output.environment_axes import AXES, LAYOUTS
 from warp_ar.output.environment_file import (
@@ -50,7 +50,7 @@ def _time(text: str) -> datetime.datetime:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
-    return run_command(lambda: convert(make_parser().parse_args(arguments)), SinkError)
+    return run_command(lambda: convert(make_parser().parse_args(arguments)))
 
 
 def convert(options: argparse.Namespace) -> int:
@@ -70,15 +70,12 @@ def convert(options: argparse.Namespace) -> int:
     info = dataclasses.replace(info, **{name: value for name, value in given.items() if value is not None})
     radiance = read_environment(options.environment)
     replaced = check_replaceable(output, overwrite=options.overwrite)
-    write_environment(
-        output,
-        radiance,
-        overwrite=options.overwrite,
-        axes=options.axes,
-        layout=options.layout,
-        size=options.size,
-        info=info,
-    )
+    form = {"axes": options.axes, "layout": options.layout, "size": options.size, "info": info}
+    try:
+        write_environment(output, radiance, overwrite=options.overwrite, **form)
+    except SinkError as error:
+        say(error)
+        return EXIT_FAILED
     if replaced:
         say(replaced)
     return EXIT_DONE

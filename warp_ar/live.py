@@ -506,19 +506,19 @@ def light_clip(options: argparse.Namespace) -> int:
 
 
 def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
-    # Here, for they load Warp: the page is to be there before.
-    _hurry_compilers(options.device)
-    from warp_ar.accuracy.budget import AutoPipeline
-    from warp_ar.accuracy.traced_frames import TracedFrames
-    from warp_ar.output.report import RunLog, print_plan
-    from warp_ar.output.side_files import SideFiles, parse_layers
-
     if options.save_layers is None and (options.layers is not None or options.layer_pictures):
         which = "--layer-pictures" if options.layers is None else f"--layers {options.layers}"
         raise UsageError(f"{which} needs --save-layers DIR, the folder to write them to")
 
     scene = load_scene(options.scene)
     _check_places(options, scene)
+    # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
+    _hurry_compilers(options.device)
+    from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.accuracy.traced_frames import TracedFrames
+    from warp_ar.output.report import RunLog, print_plan
+    from warp_ar.output.side_files import SideFiles, parse_layers
+
     side = SideFiles(
         environment=options.save_environment,
         layers=options.save_layers,

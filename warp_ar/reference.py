@@ -90,15 +90,28 @@ def trace(options: argparse.Namespace) -> int:
     console = Console(stderr=True)
     known = light_up_to(scene, options.frame, quality=options.quality, device=options.device, source=options.source)
     tracer = known.tracer(device=options.device, size=size, seed=options.seed)
-    picture = render(tracer, options.samples, options.error, console)
-    if options.output is not None:
-        write_picture(options.output, picture)
-    if options.compare is not None:
-        write_png(options.compare, side_by_side(known, picture))
+    pictures: list[TracedPicture] = []
+    try:
+        render(tracer, options.samples, options.error, console, pictures)
+    except KeyboardInterrupt:
+        if pictures and writes:
+            _write_all(options, known, pictures[-1])
+            say(f"ended early: what is written has {pictures[-1].samples} samples a pixel")
+        raise
+    picture = pictures[-1]
+    _write_all(options, known, picture)
     for text in filter(None, replaced):
         say(text)
     print(summary(known, picture, str(tracer.device)))
     return EXIT_DONE
+
+
+def _write_all(options: argparse.Namespace, known: KnownFrame, picture: TracedPicture) -> None:
+    """All files that are asked for."""
+    if options.output is not None:
+        write_picture(options.output, picture)
+    if options.compare is not None:
+        write_png(options.compare, side_by_side(known, picture))
 
 
 def _check(options: argparse.Namespace) -> tuple[int, int] | None:
@@ -125,20 +138,22 @@ def _read_by(scene: Scene, options: argparse.Namespace) -> list[Path]:
     return [*files_of(dataclasses.replace(scene)), *(Path(name) for name in named if name is not None)]
 
 
-def render(tracer: PathTracer, samples: int, error: float | None, console: Console) -> TracedPicture:
-    """Follow paths, showing how far that is."""
+def render(
+    tracer: PathTracer, samples: int, error: float | None, console: Console, pictures: list[TracedPicture]
+) -> None:
+    """Follow paths, showing how far that is; the newest picture is the last of ``pictures``."""
     text = TextColumn("{task.description}")
     with Progress(text, BarColumn(), TimeRemainingColumn(), console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("reflectance", total=samples)
         tracer.prepare()
         for picture in tracer.render(samples, error=error, step=STEP):
+            pictures[:] = [picture]
             shown = f"{picture.samples} samples, error {picture.relative_error:.2%}"
             total = samples
             if error is not None and picture.relative_error > error:
                 # The error falls with the root of the samples.
                 total = min(samples, round(picture.samples * (picture.relative_error / error) ** 2))
             bar.update(task, completed=picture.samples, description=shown, total=total)
-    return picture
 
 
 def summary(known: KnownFrame, picture: TracedPicture, device: str) -> str:

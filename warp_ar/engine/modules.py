@@ -65,7 +65,8 @@ def parse_headers_ahead() -> None:
     headers = _Headers([])
     if build is None or not headers.missing or any(thread.is_alive() for thread in _AHEAD):
         return
-    _AHEAD.append(threading.Thread(target=headers.parse, args=(build,), name="warp_ar-headers", daemon=True))
+    # No daemon: a process that ends sooner waits, so that no files are left.
+    _AHEAD.append(threading.Thread(target=headers.parse, args=(build,), name="warp_ar-headers"))
     _AHEAD[-1].start()
 
 

@@ -192,7 +192,7 @@ def read_dataset(label: str, folder: Path, data: object) -> Dataset:
 
 def _read_object(table: JobTable, index: int) -> ObjectSpec:
     shape = table.choice("shape", _SHAPES, "mesh")
-    table.only("shape", shape, _SHAPES[shape], (key for keys in _SHAPES.values() for key in keys))
+    table.only("shape", _SHAPES[shape], (key for keys in _SHAPES.values() for key in keys), default=shape)
     lengths: dict[str, Any] = {}
     for key in _SHAPES[shape]:
         if key == "file":
@@ -225,7 +225,7 @@ def _read_material(outer: JobTable, data: object) -> MaterialSpec:
     table = outer.inner("material", data, ("model", *sorted(every)))
     model = table.choice("model", _MATERIALS, "metallic_roughness")
     names = _MATERIALS[model][1]
-    table.only("model", model, names, every)
+    table.only("model", names, every, default=model)
     spans = []
     for name in names:
         default = getattr(_MATERIALS[model][0], name)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import reason
+from warp_ar.farm.draws import in_kindred_order
 from warp_ar.farm.jobs import Job, JobFile, job_of_clip, jobs_of_clip
 from warp_ar.farm.manifest import PROGRESS, Manifest, RunError, is_no_space, record_at
 from warp_ar.farm.pool import Event, Pool, is_from_outside, words_of_exit
@@ -134,7 +135,8 @@ class Driver:
         self._surveyed.append(self._jobs_of(clip, count, length))
 
     def _jobs_of(self, clip: int, count: int, length: int) -> Iterator[Job]:
-        for number in range(count):
+        dataset = self._jobs.dataset
+        for number in range(count) if dataset is None else in_kindred_order(dataset, clip, count):
             job = job_of_clip(self._jobs, clip, number, length)
             if job.key(self._jobs) in self._manifest.failed:
                 self._settle(clip, failed=True)

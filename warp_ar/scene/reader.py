@@ -247,7 +247,7 @@ def _read_probe(table: _Table) -> Probe:
 
 def _read_proxy(table: _Table) -> Proxy:
     shape = table.choice("shape", PROXY_KEYS)
-    table.only("shape", shape, PROXY_KEYS[shape], ("size", "file"))
+    table.only("shape", PROXY_KEYS[shape], ("size", "file"))
     sides = {"plane": 2, "box": 3}.get(shape)
     return Proxy(
         shape=cast(Any, shape),
@@ -268,7 +268,7 @@ def _read_mesh_path(table: _Table) -> Path:
 
 def _read_object(table: _Table) -> Object:
     shape = table.choice("shape", OBJECT_KEYS)
-    table.only("shape", shape, OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
+    table.only("shape", OBJECT_KEYS[shape], (key for keys in OBJECT_KEYS.values() for key in keys))
     major = table.length("major_radius") if shape == "torus" else Object.major_radius
     minor = table.length("minor_radius") if shape == "torus" else Object.minor_radius
     if shape == "torus" and minor >= major:
@@ -294,7 +294,7 @@ def _read_material(parent: _Table) -> Material:
     table = parent.inner("material", parent.data["material"], known)
     model = table.choice("model", MATERIALS)
     kind = MATERIALS[model]
-    table.only("model", model, keys_of(kind), known[1:])
+    table.only("model", keys_of(kind), known[1:])
     if kind is FileMaterial:
         return FileMaterial()
     if kind is PhongMaterial:
@@ -332,7 +332,7 @@ def _read_animation(parent: _Table) -> Animation | None:
 
 def _read_light(table: _Table) -> Light:
     kind = table.choice("kind", LIGHT_KEYS)
-    table.only("kind", kind, LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
+    table.only("kind", LIGHT_KEYS[kind], LIGHT_KEYS["spot"])
     spot = kind == "spot"
     at = Light.at if kind == "directional" else table.vec3("at", unit="metres")
     target = table.vec3("target", unit="metres") if "target" in table else None

@@ -58,13 +58,21 @@ class Table:
         value = f" = {show_value(self.data[key])}" if key in self.data else " is missing"
         raise self.error(f"{self.label}: {self.name(key)}{value}: {right}")
 
-    def only(self, kind: str, value: str, allowed: Iterable[str], others: Iterable[str]) -> None:
+    def only(self, kind: str, allowed: Iterable[str], others: Iterable[str], *, default: str = "") -> None:
         """Complain about keys that other kinds of this section use, but not the one that key ``kind`` names."""
         unused = sorted(set(others) - set(allowed))
         for key in self.data:
             if key in unused:
                 used = ", ".join(sorted(set(allowed)))
-                self.fail(key, f"not used with {kind} = {show_value(value)}; its own keys are {used}")
+                value = show_value(self.data.get(kind, default))
+                self.fail(key, f"not used with {kind} = {value}; its own keys are {used}")
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Whether something is so."""
+        value = self.data.get(key, default)
+        if not isinstance(value, bool):
+            self.fail(key, "expected true or false")
+        return value
 
     def number(
         self, key: str, default: float | None = None, *, low: float = -LARGEST, high: float = LARGEST, unit: str = ""
