@@ -12,9 +12,13 @@ follows paths in the light that the pipeline had. One JSON line per scene and qu
   flip_*     nothing and lost as mean FLIP; flip_half between two halves of the reference's samples: its noise
   truth_*    kept of the difference to the truth, by the pipeline and by the reference
 
+  unsure     share of those blocks that are left out: noise of the reference may or may not clip there
+
 Differences are those of means over blocks of BLOCK x BLOCK pixels in linear light, encoded. Noise of the reference is
 taken out of them: of a difference d1 to one half of its samples and d2 to the other, the mean of d1 d2 is that of the
-square of the difference to what both converge to.
+square of the difference to what both converge to. Pixels are clipped as the camera does, at its size: averaged down
+before, a mirrored lamp of a few pixels is brighter than the camera ever shows it. Where noise reaches clipping, clipped
+means are too dark, and such blocks do not judge.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ import numpy.typing as npt
 from bench.common import commit
 from warp_ar.accuracy.known_frame import KnownFrame, light_up_to
 from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.accuracy.path_tracer import TracedPicture
 from warp_ar.kernels.color import decode_table
 from warp_ar.scene import Scene, load_scene
 from warp_ar.session import with_light
@@ -42,6 +47,8 @@ BLOCK = 3
 """Pixels to each side of a block."""
 CHANGED = 2.0
 """Codes from which on a block differs from the camera's frame."""
+NEAR_CLIPPING = 2.0
+"""Standard errors within which a pixel may or may not clip."""
 
 
 def averaged(image: Image, size: tuple[int, int]) -> Image:
@@ -81,9 +88,20 @@ def difference(
     return float(np.sqrt(max(product.mean(), 0.0)))
 
 
-def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, device: str) -> dict[str, Any]:
+def unsure_blocks(halves: list[TracedPicture]) -> npt.NDArray[np.bool_]:
+    """Blocks with a pixel whose standard error reaches across clipping."""
+    rows, columns = (side // BLOCK for side in halves[0].radiance.shape[:2])
+    unsure = np.zeros(halves[0].radiance.shape[:2], bool)
+    for half in halves:
+        unsure |= (np.abs(half.radiance - 1.0) < NEAR_CLIPPING * half.error).any(axis=2)
+    cut = unsure[: rows * BLOCK, : columns * BLOCK]
+    return cut.reshape(rows, BLOCK, columns, BLOCK).any(axis=(1, 3))
+
+
+def judge(known: KnownFrame, truth: Image | None, width: int | None, samples: int, device: str) -> dict[str, Any]:
     """Errors of one quality on one scene."""
     camera = known.scene.camera
+    width = camera.width if width is None else width
     size = (width, width * camera.height // camera.width)
     frame, lit = averaged(known.image, size), averaged(known.lit, size)
     halves = []
@@ -97,7 +115,10 @@ def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, devi
     nothing, lost = (float(flip_map(reference, image)[region].mean()) for image in (frame, lit))
     traced = [blocks_of(half.radiance, known) for half in halves]
     seen, shown = (blocks_of(decoded(image, known), known) for image in (frame, lit))
+    unsure = unsure_blocks(halves)
     apart = np.abs(seen - 0.5 * (traced[0] + traced[1])).max(axis=2) > CHANGED
+    left_out = float((unsure & apart).sum() / max(apart.sum(), 1))
+    apart &= ~unsure
     before = difference(seen, traced, apart)
     after = difference(shown, traced, apart)
     row: dict[str, Any] = {
@@ -107,12 +128,13 @@ def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, devi
         "flip_nothing": round(nothing, 4),
         "flip_lost": round(lost, 4),
         "flip_half": round(float(flip_map(halves[0].image, halves[1].image)[region].mean()), 4),
+        "unsure": round(left_out, 4),
         "seconds": round(sum(half.seconds for half in halves), 1),
         "pipeline_ms": round(known.milliseconds, 1),
     }
     if truth is not None:
         true = blocks_of(decoded(averaged(truth, size), known), known)
-        changed = np.abs(seen - true).max(axis=2) > CHANGED
+        changed = (np.abs(seen - true).max(axis=2) > CHANGED) & ~unsure
         before = difference(seen, [true], changed)
         row["truth_pipeline"] = round(difference(shown, [true], changed) / before, 3)
         row["truth_reference"] = round(difference(true, traced, changed) / before, 3)
@@ -121,7 +143,11 @@ def judge(known: KnownFrame, truth: Image | None, width: int, samples: int, devi
 
 def encoded(radiance: npt.NDArray[np.float32], known: KnownFrame) -> Image:
     """Codes of linear radiance by the camera's transfer."""
-    table = decode_table(known.scene.camera.transfer)
+    return encoded_by(radiance, decode_table(known.scene.camera.transfer))
+
+
+def encoded_by(radiance: npt.NDArray[np.float32], table: npt.NDArray[np.float32]) -> Image:
+    """Codes of linear radiance by a transfer's table."""
     edges = 0.5 * (table[:-1] + table[1:])
     codes = [np.searchsorted(edges[:, c], radiance[..., c], side="right") for c in range(3)]
     return np.stack(codes, axis=-1).astype(np.uint8)
@@ -133,7 +159,7 @@ def main() -> int:
     parser.add_argument("--quality", default="high,medium", help="several are separated by commas")
     parser.add_argument("--frame", type=int, default=6)
     parser.add_argument("--samples", type=int, default=512)
-    parser.add_argument("--width", type=int, default=240, help="of the pictures that are compared")
+    parser.add_argument("--width", type=int, help="of the pictures that are compared (default: the camera's)")
     parser.add_argument("--light", help="captured light instead of the ball's")
     parser.add_argument("--device", default="auto")
     options = parser.parse_args()

@@ -31,8 +31,8 @@ before, of E averaged over 5 x 5 pixels of one surface; of a point that no pixel
 
 **Toward objects.** A difference begins where a path meets a virtual object, and most of what mirrors and metals throw
 onto matt surfaces comes by few directions. So a matt surface draws one direction in ``GUIDED`` toward the bounding
-sphere of a virtual object, evenly within its cone, or toward a ball. The density of every direction is then that of the
-mixture, (1 - q) p + q sum [within cone k] / (n Omega_k), Omega the cone's solid angle.
+sphere of a virtual object or a ball, or to where one of these mirrors light (``path_guides``). The density of every
+direction is then that of the mixture, (1 - q) p + q g.
 
 Where no frame is given, all paths are whole, and proxies have the reflectance that they are given.
 
@@ -51,6 +51,7 @@ from warp_ar.kernels.color import encode
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.materials import Surface, make_surface
 from warp_ar.kernels.mirror_ball import nearest_ball
+from warp_ar.kernels.path_guides import Guides, draw_guide, guide_count, guide_density
 from warp_ar.kernels.path_sampling import (
     ALL_MODELS,
     NO_DENSITY,
@@ -72,10 +73,10 @@ from warp_ar.kernels.path_sampling import (
 )
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.relight import reflectance_of
-from warp_ar.kernels.sampling import frame_from_normal, pcg3d_hash, uniform_from_bits
+from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import face_viewer
 from warp_ar.kernels.shadow import has_penumbra, sample_light
-from warp_ar.kernels.structs import LAMBERT, MIRROR, SPHERE, FrameParams, Light, Picture, Probe, RayScene
+from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Light, Picture, Probe, RayScene
 from warp_ar.kernels.visibility import FAR, ROUNDING, Hit, TraceConfig, intersect_sphere, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
@@ -95,8 +96,6 @@ LEAST_WEIGHT = wp.constant(wp.float32(0.25))
 """Of the frame's four pixels around a point, what those of its surface must have for the frame to show it."""
 GUIDED = wp.constant(wp.float32(0.5))
 """Share of directions that a matt surface draws toward objects and balls."""
-LEAST_VERSINE = wp.constant(wp.float32(1.0e-6))
-"""Of a cone: half an angle of 0.08 degrees."""
 SMOOTHED = wp.constant(2)
 """Pixels to each side over which irradiance is averaged for the map of reflectance."""
 PICK = wp.constant(0)
@@ -118,6 +117,7 @@ class LocalScene:
     lights: wp.array[Light]
     probes: wp.array[Probe]
     sky: Sky
+    guides: Guides
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``
     proxy_reflectance: wp.array[wp.vec3]  # of each proxy, where no pixel tells
     picture: Picture  # rays of pixels; of the frame only the size is read
@@ -307,73 +307,11 @@ def make_look_up_material() -> wp.Function:
 
 
 @wp.func
-def guide_sphere(scene: LocalScene, k: wp.int32) -> wp.vec4:
-    """Centre and radius of a sphere around virtual object number k, or after these around a ball."""
-    count = scene.rays.objects.shape[0]
-    if k < count:
-        shape = scene.rays.objects[k]
-        radius = wp.length(shape.extent)
-        if shape.kind == wp.static(int(SPHERE)):
-            radius = shape.extent[0]
-        return wp.vec4(shape.position[0], shape.position[1], shape.position[2], shape.scale * radius)
-    probe = scene.probes[k - count]
-    return wp.vec4(probe.center[0], probe.center[1], probe.center[2], probe.radius)
-
-
-@wp.func
-def guide_count(scene: LocalScene, changes_only: wp.bool) -> wp.int32:
-    """Spheres that directions are drawn to: those of balls show what is there anyway, which changes nothing."""
-    if changes_only:
-        return scene.rays.objects.shape[0]
-    return scene.rays.objects.shape[0] + scene.probes.shape[0]
-
-
-@wp.func
 def guided_chance(scene: LocalScene, surface: Surface, changes_only: wp.bool) -> wp.float32:
     """Chance of a direction to be drawn toward an object or a ball."""
-    if guide_count(scene, changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
+    if guide_count(scene.guides, changes_only) == 0 or surface.model == wp.static(int(MIRROR)):
         return 0.0
     return GUIDED * (1.0 - lobe_chance(surface))
-
-
-@wp.func
-def cone_versine(sphere: wp.vec4, point: wp.vec3) -> wp.float32:
-    """1 - cosine of the half angle under which a sphere is seen; 2, all directions, from within."""
-    away = wp.vec3(sphere[0], sphere[1], sphere[2]) - point
-    square = wp.dot(away, away)
-    radius = sphere[3] * sphere[3]
-    if square <= radius:
-        return 2.0
-    sine = radius / square
-    return wp.max(sine / (1.0 + wp.sqrt(1.0 - sine)), LEAST_VERSINE)
-
-
-@wp.func
-def guide_density(scene: LocalScene, point: wp.vec3, direction: wp.vec3, changes_only: wp.bool) -> wp.float32:
-    """Density with which ``draw_guide`` gives a direction."""
-    count = guide_count(scene, changes_only)
-    density = float(0.0)
-    for k in range(count):
-        sphere = guide_sphere(scene, k)
-        versine = cone_versine(sphere, point)
-        axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
-        off = axis - direction
-        # |a - b|^2 / 2 is 1 - cos, without its cancellation.
-        if 0.5 * wp.dot(off, off) <= versine:
-            density += 1.0 / (2.0 * wp.pi * versine)
-    return density / wp.float32(wp.max(count, 1))
-
-
-@wp.func
-def draw_guide(scene: LocalScene, point: wp.vec3, pick: wp.float32, u: wp.vec2, changes_only: wp.bool) -> wp.vec3:
-    """Direction toward an object or a ball."""
-    count = guide_count(scene, changes_only)
-    sphere = guide_sphere(scene, wp.min(wp.int32(pick * wp.float32(count)), count - 1))
-    versine = u[0] * cone_versine(sphere, point)
-    sine = wp.sqrt(wp.max(versine * (2.0 - versine), 0.0))
-    phi = 2.0 * wp.pi * u[1]
-    axis = wp.normalize(wp.vec3(sphere[0], sphere[1], sphere[2]) - point)
-    return wp.normalize(frame_from_normal(axis) * wp.vec3(sine * wp.cos(phi), sine * wp.sin(phi), 1.0 - versine))
 
 
 @wp.func
@@ -384,7 +322,7 @@ def next_density(
     chance = guided_chance(scene, surface, changes_only)
     density = (1.0 - chance) * surface_density(surface, hit.normal, wo, wi)
     if chance > 0.0:
-        density += chance * guide_density(scene, hit.point, wi, changes_only)
+        density += chance * guide_density(scene.guides, scene.sky, hit.point, wi, changes_only)
     return density
 
 
@@ -398,7 +336,7 @@ def draw_next(
         return draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
     drawn = Drawn()
     if pick[2] < chance:
-        drawn.direction = draw_guide(scene, hit.point, pick[2] / chance, u, changes_only)
+        drawn.direction = draw_guide(scene.guides, scene.sky, hit.point, pick[2] / chance, u, changes_only)
     else:
         drawn = draw_reflected(surface, hit.normal, hit.geometric_normal, wo, pick[0], u)
     wi = drawn.direction
@@ -857,6 +795,7 @@ def finish_picture_kernel(
     encode_table: wp.array[wp.vec3],
     moments: Moments,
     count: wp.float32,
+    exposure: wp.float32,
     # Out:
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
@@ -895,7 +834,7 @@ def finish_picture_kernel(
         if count > 1.0:
             error[c] = wp.sqrt(wp.max(variance[c], 0.0) / (count * (count - 1.0)))
     error_out[i, j] = error
-    image_out[i, j] = encode(encode_table, radiance_out[i, j])
+    image_out[i, j] = encode(encode_table, exposure * radiance_out[i, j])
 
 
 # --- Launchers --------------------------------------------------------------------------------------------------------
@@ -970,6 +909,8 @@ def finish_picture(
     radiance_out: wp.array2d[wp.vec3],
     error_out: wp.array2d[wp.vec3],
     image_out: wp.array2d[wp.vec3ub],
+    *,
+    exposure: float = 1.0,
 ) -> None:
     """Write what the moments of ``count`` samples say.
 
@@ -981,7 +922,8 @@ def finish_picture(
         radiance_out: (H, W) linear radiance in camera values, not clipped.
         error_out: (H, W) its standard error, per channel.
         image_out: (H, W) encoded.
+        exposure: Factor on the radiance that is encoded.
     """
     outputs = [radiance_out, error_out, image_out]
-    inputs = [scene.radiance, encode_table, moments, float(count)]
+    inputs = [scene.radiance, encode_table, moments, float(count), exposure]
     launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)

@@ -236,6 +236,33 @@ def open_tab(browser: Any, url: str) -> Iterator[Callable[..., Tab]]:
             assert tab.errors == []
 
 
+def test_a_button_shows_the_difference_to_the_reference(open_tab: Callable[..., Tab], artefacts: Path) -> None:
+    """It holds the frame; colours, a scale and samples that grow; pressed again, and let go on, all of it is gone."""
+    tab = open_tab()
+    page = tab.page
+    page.click("#difference")
+    tab.until("warpAr.state.playing === false && warpAr.state.compare === 'difference'")
+    tab.until("warpAr.state.convergence?.samples >= 2", "the reference")
+    tab.until("!document.getElementById('difference-scale').hidden", "the scale")
+    assert page.inner_text("#difference-scale").split() == ["0", "20", "%"]
+    tab.until(
+        r"/\d+ samples, error [\d.]+ %, differs by [\d.]+ %/.test(document.getElementById('tag-right').textContent)"
+    )
+    page.evaluate("document.getElementById('split').value = 0")
+    page.locator("#split").dispatch_event("input")
+    colors = tab.pixels(320, 240, 200)
+    # Where nothing virtual reaches, nothing differs, and that is black; somewhere on the desk something does.
+    assert tab.pixels(40, 40).mean() < 6.0
+    assert colors.max() > 60.0
+    page.screenshot(path=artefacts / "difference.png")
+    samples = page.evaluate("warpAr.state.convergence.samples")
+    tab.until(f"warpAr.state.convergence.samples > {samples}", "more samples")
+    page.click("#difference")
+    tab.until("warpAr.state.compare === '' && document.getElementById('difference-scale').hidden")
+    page.click("#play")
+    tab.until("warpAr.state.playing && warpAr.state.convergence === null")
+
+
 def test_the_picture_is_the_frame_that_its_header_says(open_tab: Callable[..., Tab]) -> None:
     tab = open_tab()
     for _ in range(10):

@@ -50,6 +50,7 @@ from warp_ar.stages.request import LAYERS
 
 if TYPE_CHECKING:
     from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.accuracy.traced_frames import TracedFrames
     from warp_ar.output.report import RunLog
     from warp_ar.output.side_files import SideFiles
     from warp_ar.session import Session
@@ -113,6 +114,14 @@ def make_parser() -> argparse.ArgumentParser:
         action="store_true",
         help="with --output or --headless: first find the mirror ball by the desk that it mirrors, in some seconds",
     )
+    text = (
+        "with --output or --headless: frames by path tracing with N samples a pixel, in the light that --quality finds"
+    )
+    add("--samples", type=int, metavar="N", help=text)
+    text = (
+        "with --samples: stop at this relative standard error of what virtual objects and lights change, such as 0.05"
+    )
+    add("--error", type=float, metavar="E", help=text)
     _add_file_options(parser.add_argument_group("files"))
     _add_page_options(parser.add_argument_group("the page"))
     return parser
@@ -332,7 +341,7 @@ def _page_scene(options: argparse.Namespace) -> Scene:
     """
     from warp_ar.session import calibrated, with_light
 
-    for name in ("save_environment", "save_layers", "report"):
+    for name in ("save_environment", "save_layers", "report", "samples", "error"):
         if getattr(options, name) is not None:
             raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
     if options.refine_ball:
@@ -511,6 +520,10 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"--budget-ms {options.budget_ms:g}: expected milliseconds above 0")
     if options.budget_ms is not None and options.quality != AUTO:
         raise UsageError(f"--budget-ms {options.budget_ms:g} needs --quality {AUTO}")
+    if options.error is not None and options.samples is None:
+        raise UsageError(f"--error {options.error:g} needs --samples N, the most that a pixel may take")
+    if options.samples is not None and options.coding != "8bit":
+        raise UsageError(f"--coding {options.coding} with --samples: traced frames have 8 bits; expected --coding 8bit")
     if options.output is None and options.virtual_camera is None and not options.headless:
         return serve_page(options)
     return light_clip(options)
@@ -532,6 +545,7 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
     # Here, for they load Warp: the page is to be there before, and what is wrong with a scene is told before.
     _hurry_compilers(options.device)
     from warp_ar.accuracy.budget import AutoPipeline
+    from warp_ar.accuracy.traced_frames import TracedFrames
     from warp_ar.engine.layers import RADIANCE
     from warp_ar.output.report import RunLog, print_plan
     from warp_ar.output.side_files import SideFiles, parse_layers
@@ -558,6 +572,10 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         ball_seen = _quick_check(options, session.scene)
         for note in session.bracket_notes:
             say(note)
+        traced = None
+        if options.samples is not None:
+            traced = TracedFrames(session.pipeline, options.samples, options.error)  # type: ignore[arg-type]
+            session.ahead = False
         _compile(session, shown=not options.headless)
         loaded()
         source = session.source
@@ -581,7 +599,7 @@ def _light_clip(options: argparse.Namespace, loaded: Callable[[], None]) -> int:
         log, evidence = RunLog(session.pipeline), _Evidence(ball_seen=ball_seen)
         try:
             with handling(stop.handle, "SIGINT", "SIGTERM", "SIGHUP"), side, sink, camera:
-                _light_frames(options, session, log, (sink, camera), side, stop, evidence)
+                _light_frames(options, session, log, (sink, camera), side, stop, evidence, traced)
             if stop.code is None:
                 _check_run(log, session, evidence)
         except WarpArError as error:
@@ -630,8 +648,9 @@ def _light_frames(
     side: SideFiles,
     stop: _Stop,
     evidence: _Evidence,
+    traced: TracedFrames | None = None,
 ) -> None:
-    """Let frames flow until they end, or until a signal asks to stop."""
+    """Let frames flow until they end, or until a signal asks to stop; ``traced`` makes other pictures of them."""
     source, (sink, camera) = session.source, sinks
     total = (
         options.frames if options.loop or source.length is None else min(options.frames or source.length, source.length)
@@ -648,6 +667,8 @@ def _light_frames(
     with progress:
         for frame, result in itertools.islice(session, options.frames):
             image, decode_ms = result.image, session.decode_ms
+            if traced is not None:
+                image = traced(frame, result)
             evidence.add(frame.image, result)
             start = time.perf_counter()
             sink.write(image if options.coding == "8bit" else result.radiance)

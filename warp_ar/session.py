@@ -122,6 +122,8 @@ class Session(Closing):
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
         self.source: Source = _open_source(self.scene, source, loop)
+        self.ahead = True
+        """Whether frames may be begun before the one ahead of them is handed out, where that is possible."""
         self.decode_ms = 0.0
         """Milliseconds that the source took for its last frame."""
         self.ball_fits: tuple[BallFit | None, ...] = ()
@@ -218,7 +220,7 @@ class Session(Closing):
     def __iter__(self) -> Iterator[tuple[Frame, Result]]:
         pipeline = self.pipeline
         kept = pipeline.device.is_cpu or set(pipeline.plan.request.outputs) <= {"image", "pose"}
-        if self.source.live or not kept or not isinstance(pipeline, Pipeline):
+        if not self.ahead or self.source.live or not kept or not isinstance(pipeline, Pipeline):
             for frame in self._frames():
                 yield frame, self.pipeline(frame.deepest, time_seconds=frame.time, exposure_time=frame.exposure_time)
             return

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from warp_ar.accuracy.path_tracer import Image, PathTracer
+from warp_ar.accuracy.path_tracer import LIGHT_SAMPLES, Image, PathTracer
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SourceError, UsageError
 from warp_ar.input.sources import Source, open_source
 from warp_ar.light.captured import CapturedEmitter, Light, texel_solid_angles
-from warp_ar.scene import Pose, Scene
+from warp_ar.scene import Exposure, Pose, Scene
 from warp_ar.stages.quality import Quality
 
 
@@ -36,10 +36,25 @@ class KnownFrame:
     milliseconds: float
     """That its stages took."""
 
-    def tracer(self, *, device: str = "auto", size: tuple[int, int] | None = None, seed: int = 0) -> PathTracer:
+    def tracer(
+        self,
+        *,
+        device: str = "auto",
+        size: tuple[int, int] | None = None,
+        seed: int = 0,
+        light_samples: int = LIGHT_SAMPLES,
+    ) -> PathTracer:
         """A path tracer of this frame; arguments as those of ``PathTracer``."""
         return PathTracer(
-            self.scene, self.light, self.image, self.pose, device=device, size=size, seconds=self.seconds, seed=seed
+            self.scene,
+            self.light,
+            self.image,
+            self.pose,
+            device=device,
+            size=size,
+            seconds=self.seconds,
+            seed=seed,
+            light_samples=light_samples,
         )
 
 
@@ -115,9 +130,17 @@ def light_up_to(
             milliseconds = sum(timing.milliseconds for timing in result.stages.values())
             light, seconds = light_of(pipeline), frame.time - first
             return KnownFrame(
-                pipeline.scene, frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
+                exposed_scene(pipeline), frame.image.copy(), result.image, result.pose, light, seconds, milliseconds
             )
     raise SourceError(f"{frames.description} has no frame {number}; it ends before")
+
+
+def exposed_scene(pipeline: Pipeline) -> Scene:
+    """A pipeline's scene with the exposure that its last frame had, where it chooses that itself."""
+    scale = pipeline.arrays.get("expose_scale")
+    if scale is None:
+        return pipeline.scene
+    return dataclasses.replace(pipeline.scene, exposure=Exposure(float(scale.numpy()[0])))
 
 
 def light_of(pipeline: Pipeline) -> Light:

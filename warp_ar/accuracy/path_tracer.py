@@ -23,6 +23,7 @@ from warp_ar.errors import UsageError
 from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.launch import Rows
+from warp_ar.kernels.path_guides import make_guides
 from warp_ar.kernels.path_sampling import make_sky
 from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.light.captured import Light
@@ -58,7 +59,7 @@ class TracedPicture:
     error: FloatImage
     """Standard error of ``radiance``, (H, W, 3)."""
     image: Image
-    """The picture as the camera would have encoded it, (H, W, 3) RGB."""
+    """The picture as the camera would have encoded it at the scene's exposure, (H, W, 3) RGB."""
     samples: int
     """Per pixel."""
     seconds: float
@@ -100,6 +101,7 @@ class PathTracer:
         seconds: float = 0.0,
         seed: int = 0,
         reflectances: tuple[tuple[float, float, float], ...] | None = None,
+        light_samples: int = LIGHT_SAMPLES,
     ) -> None:
         """Put everything on the device.
 
@@ -116,6 +118,7 @@ class PathTracer:
             seconds: Since the first frame: where what is animated stands.
             seed: Of the random numbers, 0 or more.
             reflectances: RGB of each proxy, without a frame; 0.5 where left out.
+            light_samples: Per pixel, by which the reflectance of proxies is found; more than FIRST_LIGHT_SAMPLES.
 
         Raises:
             UsageError: The frame, the light, the seed or the reflectances do not fit.
@@ -127,7 +130,12 @@ class PathTracer:
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.device = resolve_device(device)
         self.seed, self.samples = seed, 0
+        self.light_samples = light_samples
+        scale = scene.exposure.scale
+        self.exposure = scale if isinstance(scale, float) else 1.0
         self._seconds = 0.0
+        self._parts: Iterator[bool] | None = None
+        self._compiled = False
         self._prepared = frame is None
         self._linear = None if frame is None else _linear_frame(frame, self.camera)
         self._trace = trace_config(scene)
@@ -161,6 +169,7 @@ class PathTracer:
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
         local.probes = wp.array(balls, dtype=structs.Probe, device=device)
         local.sky = make_sky(radiance, device, emitters)
+        local.guides = make_guides(objects, local.rays.materials.numpy(), balls, device)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
         integrate_dfg(local.dfg)
         rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
@@ -217,11 +226,15 @@ class PathTracer:
         with translating(self.device), wp.ScopedDevice(self.device):
             path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
         done = 0
-        for count in (FIRST_LIGHT_SAMPLES, LIGHT_SAMPLES - FIRST_LIGHT_SAMPLES):
+        for count in self._light_counts():
             self._add(path_tracer.IRRADIANCE, 0, count, done)
             done += count
             with translating(self.device), wp.ScopedDevice(self.device):
                 self._map_reflectance()
+
+    def _light_counts(self) -> tuple[int, int]:
+        """Samples of the two rounds in which reflectance is found."""
+        return FIRST_LIGHT_SAMPLES, self.light_samples - FIRST_LIGHT_SAMPLES
 
     def _map_reflectance(self) -> None:
         """Reflectance by the light that the moments hold, which then begin anew."""
@@ -245,11 +258,76 @@ class PathTracer:
         self.prepare()
         start = time.perf_counter()
         asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
-        self._add(asked, self.samples, count, LIGHT_SAMPLES + self.samples)
+        self._add(asked, self.samples, count, self.light_samples + self.samples)
         with exclusive(self.device):
             wp.synchronize_device(self.device)
         self.samples += count
         self._seconds += time.perf_counter() - start
+
+    def sample_for(self, seconds: float) -> bool:
+        """Add samples for about so long, in parts of a few rows; not to be mixed with ``sample``.
+
+        Between two passes over the picture, and after any number of them, it is what ``sample`` gives.
+
+        Returns:
+            Whether a pass over the whole picture has ended.
+        """
+        start, ended = time.perf_counter(), False
+        self._parts = self._parts or self._all_parts()
+        while True:
+            ended |= next(self._parts)
+            spent = time.perf_counter() - start
+            if spent >= seconds:
+                self._seconds += spent
+                return ended
+
+    def _all_parts(self) -> Iterator[bool]:
+        """All work in parts; True after the last one of a pass that added a sample to every pixel."""
+        if not self._prepared:
+            with translating(self.device), wp.ScopedDevice(self.device):
+                path_tracer.find_shown(self._trace, self._params, self._local, self._local.shown)
+            first = 0
+            for count in self._light_counts():
+                for k in range(count):
+                    for _ in self._pass(path_tracer.IRRADIANCE, k, first + k):
+                        yield False
+                first += count
+                with translating(self.device), wp.ScopedDevice(self.device):
+                    self._map_reflectance()
+            self._prepared = True
+        asked = path_tracer.WHOLE if self._linear is None else path_tracer.DIFFERENCE
+        while True:
+            for _ in self._pass(asked, self.samples, self.light_samples + self.samples):
+                yield False
+            self.samples += 1
+            yield True
+
+    def _pass(self, asked: int, done: int, number: int) -> Iterator[None]:
+        """Add one sample to every pixel: on CPU a band of rows for each core at a time, on CUDA all at once."""
+
+        def trace(rows: Rows | None) -> None:
+            path_tracer.trace_paths(
+                self._trace, self._params, self._local, self._moments,
+                asked=asked, seed=self.seed, first=number, done=done, count=1, rows=rows,
+            )  # fmt: skip
+
+        if not self.device.is_cpu:
+            with exclusive(self.device), wp.ScopedDevice(self.device):
+                trace(None)
+                wp.synchronize_device(self.device)
+            yield
+            return
+        height, cores = self.camera.height, usable_cores()
+        bands = [(row, min(row + BAND, height)) for row in range(0, height, BAND)]
+        if not self._compiled:
+            with translating(self.device):
+                trace(bands.pop(0))
+            self._compiled = True
+            yield
+        for start in range(0, len(bands), cores):
+            with ThreadPoolExecutor(cores, "warp_ar-paths") as pool:
+                list(pool.map(trace, bands[start : start + cores]))
+            yield
 
     def picture(self) -> TracedPicture:
         """What the samples so far give.
@@ -261,11 +339,18 @@ class PathTracer:
             raise UsageError("no samples yet: call sample() first")
         with exclusive(self.device):
             path_tracer.finish_picture(
-                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image
-            )
+                self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image,
+                exposure=self.exposure,
+            )  # fmt: skip
             radiance, error, image = (np.array(a.numpy()) for a in (self._radiance, self._error, self._image))
         relative = _relative_error(radiance, error, self._linear)
         return TracedPicture(radiance, error, image, self.samples, self._seconds, relative)
+
+    def shown(self) -> npt.NDArray[np.int32]:
+        """Index of the proxy that the frame shows in the middle of every pixel, -1 for none, (H, W)."""
+        self.prepare()
+        with exclusive(self.device):
+            return np.array(self._local.shown.numpy())
 
     def rays(self) -> int:
         """Rays that were traced for the samples so far."""

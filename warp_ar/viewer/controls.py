@@ -19,6 +19,10 @@ from warp_ar.viewer.history import History
 
 CAMERA: Final = "camera"
 """What a picture is compared with when it is not another preset."""
+TRACED: Final = "traced"
+DIFFERENCE: Final = "difference"
+CONVERGING: Final = (TRACED, DIFFERENCE)
+"""What a held picture is compared with: the reference, or how far from it the picture is, in colours."""
 
 Notify = Callable[[dict[str, Any]], None]
 """Takes a message for all viewers, on any thread."""
@@ -160,8 +164,9 @@ class Controls:
         Raises:
             UsageError: There is no such choice.
         """
-        if other not in ("", CAMERA, *PRESETS):
-            raise UsageError(f"compare with {other!r}; expected {CAMERA} or a preset: {', '.join(PRESETS)}")
+        if other not in ("", CAMERA, *CONVERGING, *PRESETS):
+            known = ", ".join((CAMERA, *CONVERGING))
+            raise UsageError(f"compare with {other!r}; expected {known} or a preset: {', '.join(PRESETS)}")
         with self.changed:
             self.compare = other
             self._touch()

@@ -23,7 +23,9 @@ from warp_ar.viewer import messages
 from warp_ar.viewer.browser_camera import BrowserCamera, Image, Pushed
 from warp_ar.viewer.budget import BudgetSetting
 from warp_ar.viewer.calibration import CalibrationSession
-from warp_ar.viewer.controls import Controls, Notify
+from warp_ar.viewer.controls import CONVERGING, Controls, Notify
+from warp_ar.viewer.convergence import Convergence
+from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.intrinsics import guessed_camera
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting
@@ -113,6 +115,8 @@ class FrameLoop:
         self._plan = 0
         self._light_time = self._notice_time = 0.0
         self._times: collections.deque[float] = collections.deque(maxlen=60)
+        self.convergence = Convergence()
+        """The reference of a held frame."""
         self.latest: Lit | None = None
         """The newest frame."""
         self.light: npt.NDArray[np.float32] | None = None
@@ -193,12 +197,53 @@ class FrameLoop:
                     lambda seen=seen, idle=idle: (  # type: ignore[misc]
                         controls.leaving or controls.edits != seen or (controls.playing and not idle)
                     ),
-                    timeout=_BUILDING_SECONDS if lighting.busy else None if idle else _STILL_SECONDS,
+                    timeout=self._rest(idle),
                 )
             if controls.watchers == 0 and recorder.count is None:
                 lighting.follow()  # what is being built is to be there when somebody comes
-            elif not controls.playing and not self._light_frame(frame, now):
+            elif not controls.playing and not (self._converge() or self._light_frame(frame, now)):
                 return False
+
+    def _rest(self, idle: bool) -> float | None:
+        """Seconds until a held frame is looked at again; None waits for somebody to come."""
+        if idle and not self._helpers.lighting.busy:
+            return None
+        if not idle and self._converges():
+            return 0.0
+        return _BUILDING_SECONDS if self._helpers.lighting.busy else _STILL_SECONDS
+
+    def _held(self) -> tuple[Wanted, int]:
+        """What a held picture is of; another one is dropped."""
+        return self._controls.wanted, self._plan
+
+    def _converges(self) -> bool:
+        """Whether samples are to be added to the reference of the held frame, which nothing has changed."""
+        controls, latest = self._controls, self.latest
+        asked = controls.compare in CONVERGING and not controls.playing and latest is not None and latest.plan != 0
+        return asked and not self._helpers.lighting.changing and self.convergence.wants(self._held())
+
+    def _converge(self) -> bool:
+        """Add a slice of samples, and hand out what they show; False where the frame is to be lit instead."""
+        latest = self.latest
+        if not self._converges() or latest is None:
+            return False
+        if self.convergence.step():
+            self._id += 1
+            other = self.convergence.other(self._held(), self._controls.compare)
+            self.latest = dataclasses.replace(latest, id=self._id, taken=time.monotonic(), stamp=None, other=other)
+            self._publish(self.latest)
+        return True
+
+    def _beside(self, pipeline: Pipeline, frame: Frame, result: Result, now: float) -> Image | None:
+        """What the picture is compared with."""
+        controls, lighting = self._controls, self._helpers.lighting
+        if controls.compare not in CONVERGING or controls.playing or lighting.changing:
+            self.convergence.drop()
+        if controls.compare not in CONVERGING:
+            return lighting.other(frame, now)
+        if not controls.playing and not lighting.changing:
+            self.convergence.begin(self._held(), pipeline, frame.image, result, now, lighting.builder)
+        return self.convergence.other(self._held(), controls.compare)
 
     def _light_frame(self, frame: Frame, now: float) -> bool:
         """Light one frame and hand it out; False to leave the source."""
@@ -246,7 +291,7 @@ class FrameLoop:
         light_ms = (time.perf_counter() - start) * 1e3
         self._base = now + 1.0 / PLAY_RATE
         self._lit += 1
-        other = self._helpers.lighting.other(frame, now)
+        other = self._beside(pipeline, frame, result, now)
         self._look_at_light(pipeline)
         self._watch_cost(pipeline, frame, result, light_ms)
         stages = tuple((name, round(t.milliseconds, 3), t.skipped) for name, t in result.stages.items())

@@ -33,7 +33,8 @@ connection.addEventListener("hello", ({ detail }) => {
   const group = document.createElement("optgroup");
   group.label = "another preset";
   group.append(...detail.presets.map((name) => new Option(`Split: ${name}`, name)));
-  $("compare").replaceChildren(new Option("Split: off", ""), new Option("Split: camera", "camera"), group);
+  const traced = [new Option("Split: path tracing", "traced"), new Option("Split: difference to it", "difference")];
+  $("compare").replaceChildren(new Option("Split: off", ""), new Option("Split: camera", "camera"), ...traced, group);
   quality.presets = detail.presets;
 });
 
@@ -206,12 +207,25 @@ function download(name) {
   link.click();
 }
 
+/** What is right of the divider; of path tracing, how far it is. */
+function rightTag() {
+  const { compare, convergence } = state;
+  if (compare !== "traced" && compare !== "difference") return state.compare_ready ? compare : `${compare} …`;
+  const name = compare === "traced" ? "path tracing" : "difference to path tracing";
+  if (state.playing) return `${name}: hold the frame`;
+  if (!convergence) return `${name} …`;
+  return `${name}: ${convergence.samples} samples, error ${convergence.error.toFixed(1)} %, differs by ${convergence.difference.toFixed(2)} %`;
+}
+
 function showSplit() {
   const on = !!state.compare;
   $("split").hidden = $("divider").hidden = $("tag-left").hidden = $("tag-right").hidden = !on;
   $("divider").style.left = `${100 * view.split}%`;
   $("tag-left").textContent = scene?.quality ?? "";
-  $("tag-right").textContent = state.compare_ready ? state.compare : `${state.compare} …`;
+  $("tag-right").textContent = rightTag();
+  $("difference").setAttribute("aria-pressed", String(state.compare === "difference"));
+  $("difference-scale").hidden = state.compare !== "difference" || !state.convergence;
+  if (state.convergence) $("difference-scale").lastElementChild.textContent = `${state.convergence.scale.toFixed(0)} %`;
   view.draw();
 }
 
@@ -273,6 +287,11 @@ tabs.forEach((tab, index) => {
 openTab(tabs[0]);
 
 $("scene-name").addEventListener("change", (event) => connection.send("scene", { name: event.target.value }));
+$("difference").addEventListener("click", () => {
+  const on = state.compare !== "difference";
+  if (on) connection.send("play", { on: false });
+  connection.send("compare", { other: on ? "difference" : "" });
+});
 $("compare").addEventListener("change", (event) => connection.send("compare", { other: event.target.value }));
 $("split").addEventListener("input", (event) => {
   view.split = event.target.value / 1000;

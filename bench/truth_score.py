@@ -1,0 +1,92 @@
+"""Cases of truth by path tracing in their true light: what is left when light, pose and transport are right.
+
+    python -m bench.truth_score CASE ... [--versions object,light,both] [--frames 0,6,11] [--samples N] [--device D]
+
+CASE is a folder with ``case.json``, ``camera``, ``env`` and a folder and a scene file of each version. The pictures
+have the frames' own size, for the truth was clipped there: a highlight that clips is dimmer after averaging down. One
+JSON line per case and version; ``kept`` is the mean FLIP to the truth where the truth differs from the camera's frame,
+over that of the frame itself; ``noise`` is the same between the halves of the samples.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from bench.common import commit
+from bench.judge import encoded_by
+from warp_ar.accuracy.metrics import changed_region, flip_map
+from warp_ar.accuracy.path_tracer import PathTracer
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Pose, load_scene
+
+Image = npt.NDArray[np.uint8]
+
+
+def read_image(path: Path) -> Image | None:
+    """An RGB picture, if it is there."""
+    image = cv2.imread(str(path))
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def score(case: Path, version: str, frame: int, samples: int, device: str) -> dict[str, float] | None:
+    """Errors of one frame; None if the case has no such frame."""
+    truth = read_image(case / version / f"{frame:04d}.png")
+    camera = read_image(case / "camera" / f"{frame:04d}.png")
+    if truth is None or camera is None:
+        return None
+    scene = load_scene(case / f"scene_{version}.toml")
+    about = json.loads((case / "case.json").read_text())
+    entry = about["poses"][frame]
+    light = np.maximum(np.load(case / "env" / f"{frame:04d}.npy").astype(np.float32), 0.0)
+    pose = Pose(np.array(entry["R"]), np.array(entry["t"]))
+    rate = scene.source.fps if scene.source is not None and scene.source.fps is not None else 30.0
+    halves = []
+    for seed in (0, 1):
+        tracer = PathTracer(scene, light, camera, pose, device=device, seconds=frame / rate, seed=seed)
+        tracer.sample(max(samples // 2, 1))
+        halves.append(tracer.picture())
+    table = decode_table(scene.camera.transfer)
+    traced = encoded_by(0.5 * (halves[0].radiance + halves[1].radiance), table)
+    region = changed_region(camera, truth)
+    nothing = float(flip_map(truth, camera)[region].mean())
+    return {
+        "nothing": nothing,
+        "kept": float(flip_map(truth, traced)[region].mean()) / nothing,
+        "noise": float(flip_map(halves[0].image, halves[1].image)[region].mean()) / nothing,
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.truth_score", description="Truth against the reference.")
+    parser.add_argument("cases", nargs="+", metavar="CASE")
+    parser.add_argument("--versions", default="object,light,both")
+    parser.add_argument("--frames", default="0,6,11")
+    parser.add_argument("--samples", type=int, default=512)
+    parser.add_argument("--device", default="auto")
+    options = parser.parse_args()
+    for name in options.cases:
+        for version in options.versions.split(","):
+            start = time.perf_counter()
+            frames = [int(number) for number in options.frames.split(",")]
+            found = [score(Path(name), version, frame, options.samples, options.device) for frame in frames]
+            rows = [row for row in found if row is not None]
+            if not rows:
+                continue
+            means: dict[str, Any] = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
+            about = {"case": Path(name).name, "version": version, **means, "samples": options.samples}
+            about |= {"seconds": round(time.perf_counter() - start, 1), "commit": commit()}
+            print(json.dumps(about), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
