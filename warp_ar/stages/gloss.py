@@ -32,7 +32,7 @@ class Gloss(Stage):
         bound=2e-3,
         cause="edges of what is mirrored fall to either side; 1e-7 of an angle in narrow highlights",
         measured=1e-6,
-        rows=(6, 8, 13, 17),
+        rows=(6, 8, 17),
     )
 
     @classmethod
