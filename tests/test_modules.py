@@ -82,7 +82,6 @@ def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path)
     device = resolve_device("cpu")
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     kernels = [usual_kernel, quick_kernel]
-    headers = modules._Headers({modules._flags(kernel.module) for kernel in kernels})
 
     def names() -> set[str]:
         from warp._src.context import runtime
@@ -90,17 +89,19 @@ def test_headers_serve_flags_that_differ_in_those_of_llvm(monkeypatch, tmp_path)
         return {path.name for path in Path(runtime.get_clang_pch_dir()).glob("*.pch")}
 
     def compile_both() -> list[set[str]]:
+        headers = modules._Headers({modules._flags(kernel.module) for kernel in kernels})
         seen = []
         for kernel in kernels:
             with headers.shared(modules._flags(kernel.module)):
                 seen.append(names())
                 modules._load(kernel.module, device)
                 seen.append(names())
+        headers.close()
         return seen
 
-    with ThreadPoolExecutor(1) as thread:  # with headers of its own: none
+    # With headers of its own, none, whatever this one has compiled before.
+    with ThreadPoolExecutor(1) as thread:
         before, first, second, after = thread.submit(compile_both).result()
-    headers.close()
     assert (len(before), len(first), len(second)) == (0, 1, 2)
     assert after == second
     values = wp.zeros(1, dtype=wp.float32, device="cpu")

@@ -306,7 +306,7 @@ def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
             eye = np.array(one.center) + distance * rng.normal(size=3)
             target = rng.normal(size=3) * 0.2 if index % 5 else 3.0 * eye - 2.0 * np.array(one.center)
             pose = look(eye, target)
-            rect, mask = screen_rect(host.ball_outline(), pose, camera), seen(balls, pose, camera)
+            rect, mask = screen_rect(host.mirror_outline(), pose, camera), seen(balls, pose, camera)
             inside = np.zeros_like(mask)
             inside[rect[0] : rect[1], rect[2] : rect[3]] = True
             assert not (mask & ~inside).any(), (eye, rect)
@@ -319,7 +319,7 @@ def test_ball_rect_holds_every_pixel_of_every_ball(device, camera):
             # The ball in its box seen from a corner, and a pixel on every side of a few.
             assert np.median(wasted) < 5.0
     host = HostScene(scenes.Scene(camera), wp.get_device(device))
-    assert screen_rect(host.ball_outline(), look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), camera) == EMPTY
+    assert screen_rect(host.mirror_outline(), look((0.0, -2.0, 0.1), (0.0, 0.0, 0.0)), camera) == EMPTY
 
 
 def test_nothing_in_front_gives_no_rectangle(device):

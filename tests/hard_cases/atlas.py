@@ -213,7 +213,7 @@ ELSEWHERE: dict[str, tuple[tuple[int, str, str], ...]] = {
     "test_tracking.py::test_found_held_lost_found": ((15, TRACK, "*"),),
     "test_pipeline.py::test_lost_marker_passes_the_frame_and_keeps_the_light": ((15, PIPELINE, "*"),),
     "test_sources.py::test_grey_alpha_and_16_bit_become_rgb": ((16, SOURCE, "*"),),
-    "test_sources.py::test_float_image_is_an_error": ((16, SOURCE, "*"),),
+    "test_sources.py::test_image_of_32_bit_numbers_is_an_error": ((16, SOURCE, "*"),),
     "test_sources.py::test_damaged_image_is_named_after_the_frames_before_it": ((16, SOURCE, "*"),),
     "test_sources.py::test_size_that_changes_is_named": ((16, SOURCE, "*"),),
     "test_sources.py::test_empty_and_foreign_files": ((16, SOURCE, "*"),),

@@ -417,7 +417,9 @@ class Pipeline(Closing):
         """What of a frame is more than 8 bits, None where there is no such, and its 8-bit codes."""
         if not self.plan.request.linear:
             if isinstance(image, np.ndarray) and image.dtype != np.uint8 and image.dtype.kind in "uf":
-                raise UsageError(f"frame is {image.dtype}; expected uint8, or a pipeline made with linear=True")
+                width, height = self.size
+                right = f"uint8 RGB ({height}, {width}, 3), or a pipeline made with linear=True"
+                raise UsageError(f"frame is {image.dtype} {image.shape}; expected {right}")
             return None, image
         transfer = str(self.camera.transfer)
         if isinstance(image, np.ndarray) and image.dtype == np.uint8:
