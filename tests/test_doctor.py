@@ -12,7 +12,7 @@ import pytest
 
 from tests.printed_card import PrintedCard
 from tests.rendered_room import look_at
-from warp_ar import doctor, live
+from warp_ar import doctor, live_start
 from warp_ar.errors import SceneError
 from warp_ar.input import checkup
 from warp_ar.input.check_ball import check_balls
@@ -309,8 +309,8 @@ def lives_line(scene, monkeypatch, source=None):
         return found
 
     monkeypatch.setattr(checkup, "check_up", look)
-    monkeypatch.setattr(live, "say", said.append)
-    live._quick_check(argparse.Namespace(scene="my_desk", source=source), scene)
+    monkeypatch.setattr(live_start, "say", said.append)
+    live_start.say_quick_check(argparse.Namespace(scene="my_desk", source=source), scene)
     return said, names
 
 

@@ -1,0 +1,136 @@
+"""``python -m warp_ar.live`` as a page: its scene, its address, and serving it until somebody ends it."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import functools
+import gc
+import os
+import secrets
+import signal
+import sys
+import threading
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warp_ar.command_line import EXIT_DONE, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_USAGE, Terminated, loading, say
+from warp_ar.errors import UsageError, WarpArError, printable
+from warp_ar.live_start import hurry_compilers, say_quick_check
+from warp_ar.scene import Scene, load_scene
+
+if TYPE_CHECKING:
+    from warp_ar.viewer.address import Address
+
+DEFAULT_PORT = 8720
+PORT_TRIES = 20
+
+
+def _page_scene(options: argparse.Namespace) -> Scene:
+    """The scene of a page.
+
+    Raises:
+        UsageError: An option is for files only, or has an impossible value.
+    """
+    from warp_ar.session import calibrated, with_light
+
+    for name in ("save_environment", "save_layers", "report", "samples", "error"):
+        if getattr(options, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} needs --headless or --output: the page saves on its own")
+    if options.refine_ball:
+        raise UsageError("--refine-ball needs --headless or --output; before the page, run warp_ar.calibrate ball")
+    if options.port is not None and not 0 <= options.port <= 65535:
+        raise UsageError(f"--port {options.port}: expected a port, 0 to 65535; 0 takes a free one")
+    if options.token is not None and not (options.token.isascii() and options.token.isalnum()):
+        raise UsageError("--token: expected letters and digits, for it stands in an address")
+    scene = load_scene(options.scene)
+    if options.calibration is not None:
+        scene = calibrated(scene, options.calibration, options.source)
+    return scene if options.light is None else with_light(scene, options.light)
+
+
+def _page_address(options: argparse.Namespace) -> Address:
+    """Where the page is served, and with which token and certificate."""
+    from warp_ar.viewer.address import EVERYWHERE, LOOPBACK, Address, own_address
+    from warp_ar.viewer.shared_light import check_origin
+    from warp_ar.viewer.tls import load_context, make_context
+
+    known = options.token is not None or options.host in LOOPBACK
+    tls = None
+    if options.tls is True:
+        tls = make_context((options.host in EVERYWHERE and own_address()) or options.host)
+    elif options.tls is not None:
+        tls = load_context(Path(options.tls))
+    port = DEFAULT_PORT if options.port is None else options.port
+    origins = tuple(map(check_origin, options.allow_origin))
+    return Address(options.host, port, options.token if known else secrets.token_hex(16), tls, origins)
+
+
+def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any) -> Any:
+    """The host of a page that is served already, on its own thread: it loads Warp and all that uses it."""
+    with loading():
+        from warp_ar.device import bound_arenas
+
+        hurry_compilers(options.device)
+        from warp_ar.viewer.host import Host
+
+        bound_arenas()
+    # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
+    gc.collect()
+    gc.freeze()
+    return Host(
+        scene,
+        source=options.source,
+        device=options.device,
+        quality=options.quality,
+        budget_ms=options.budget_ms,
+        frames=options.frames,
+        **callbacks,
+    )
+
+
+def serve_page(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C, or until ``--frames`` have been lit."""
+    # Here, for what only writes files should not wait for a web server to load.
+    from warp_ar.viewer.address import LOOPBACK
+    from warp_ar.viewer.server import Server
+
+    scene = _page_scene(options)
+    address = _page_address(options)
+    # Beside the page, which does not wait for it.
+    threading.Thread(target=say_quick_check, args=(options, scene), daemon=True).start()
+
+    def ready(address: Address) -> None:
+        print(f"warp_ar: {printable(scene.name)} is at {address.url} (Ctrl-C ends it)", flush=True)
+        if (outside := address.outside_url) is not None:
+            print(f"warp_ar: from other machines, {outside}", flush=True)
+        if not options.no_browser and options.host in LOOPBACK and _has_display():
+            webbrowser.open(address.url)
+
+    # A shell that starts this in the background has it ignore the signal; here it is the only way to end.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    server = Server(functools.partial(_make_page_host, options, scene), address)
+    code = EXIT_DONE
+    try:
+        asyncio.run(server.serve(ready, tries=PORT_TRIES if options.port is None else 1))
+    except KeyboardInterrupt as error:
+        code = EXIT_TERMINATED if isinstance(error, Terminated) else EXIT_INTERRUPTED
+    except WarpArError as error:
+        if server.ended:
+            raise
+        say(error)
+        code = EXIT_USAGE
+    if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
+        # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
+        # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary
+        # folders gone by now.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _has_display() -> bool:
+    """Whether a browser can open a window here."""
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
