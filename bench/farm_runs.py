@@ -121,7 +121,8 @@ def work(
         limit: Seconds after which it is interrupted.
         steady: The same, counted from when as many jobs as there are workers have been done; None: to its end.
     """
-    environment = dict(os.environ, PYTHONPATH=str(ROOT))
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    environment = dict(os.environ, PYTHONPATH=path)
     if gpus and device != "cpu":
         environment["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, gpus))
     command = [sys.executable, "-m", "warp_ar.farm", "resume", str(folder), "--workers", str(workers)]

@@ -70,6 +70,9 @@ LEAST_FACING = wp.constant(wp.float32(0.05))
 # where all of a triangle is seen nearly alike anyway. Above, it is nearly a half space.
 LEAST_SOLID_ANGLE = wp.constant(wp.float32(1.0e-2))
 MOST_SOLID_ANGLE = wp.constant(wp.float32(6.2))
+# Of a triangle's size. A point that is no higher is on the light: where it lies, inside or beside the triangle and over
+# which side, is rounding, and neighbours could both take it for theirs.
+LEAST_HEIGHT = wp.constant(wp.float32(1.0e-6))
 # What of the way to a light is looked at for what hides it: the light itself must not.
 NEARLY = wp.constant(wp.float32(1.0 - 1.0e-4))
 # Steps of the sequence whose points fill a square evenly for any number of them: powers of 1 / the plastic number.
@@ -216,7 +219,7 @@ def draw_on_triangle(
         return sample
     normal = across / doubled
     height = -wp.dot(normal, p)  # of the point over the triangle's plane
-    if (front and height <= 0.0) or height == 0.0:
+    if (front and height <= 0.0) or wp.abs(height) <= LEAST_HEIGHT * wp.sqrt(doubled):
         return sample
     angle = solid_angle(wp.normalize(p), wp.normalize(q), wp.normalize(r))
     weights = wp.vec2(0.0, 0.0)

@@ -83,8 +83,9 @@ def test_measured_costs_cover_every_method_but_brute_force(frames: Frames, devic
     scales = costs.scales["environment_height"]
     assert all(own.keys() <= {"irradiance", "unwrap"} for own in scales.values())
     assert all(scale == 1.0 for scale in scales["64"].values())
-    # Sixteen times the texels of the base, a quarter: no machine is as noisy as that.
-    assert scales["256"]["unwrap"] > scales["32"]["unwrap"]
+    # Sixteen times the texels of the base, a quarter: no processor is as noisy as that. A GPU has all of them at once.
+    if device == "cpu":
+        assert scales["256"]["unwrap"] > scales["32"]["unwrap"]
 
 
 def test_what_shared_settings_do_multiplies():
