@@ -75,6 +75,7 @@ SCENES: dict[str, tuple[str, Callable[[Scene], Scene]]] = {
     "camera.square": ("fy 5 % off", lambda s: _camera(s, fy=1.05)),
     "camera.center": ("20 % of the width off", lambda s: _camera(s, cx=1.4)),
     "camera.edges": ("fy 10 % off", lambda s: _camera(s, fy=1.1)),
+    "marker.board": ("24 mm taken for 80", lambda s: _marker(s, size=0.08 * 80 / 24)),
     "card.white": ("0.3 for 0.85", lambda s: _marker(s, white=0.3)),
     "card.print": ("printed at 97 %", lambda s: _marker(s, size=0.08 / 0.97)),
     "proxy.edges": ("a box 20 mm off", lambda s: _proxy(s, 0.02)),

@@ -15,17 +15,19 @@ from tests.rendered_room import look_at
 from warp_ar import doctor, live_start
 from warp_ar.errors import SceneError
 from warp_ar.input import checkup
+from warp_ar.input.card import draw_card
 from warp_ar.input.check_ball import check_balls
-from warp_ar.input.check_pictures import Look, check_pictures, take_look
+from warp_ar.input.check_pictures import Look, board_instead, check_pictures, take_look
 from warp_ar.input.check_print import check_print
 from warp_ar.input.check_proxies import check_proxies
 from warp_ar.input.check_scene import check_scene
 from warp_ar.input.checkup import check_up
 from warp_ar.input.finding import Finding, fault_errors, worst_first
+from warp_ar.input.markers import find_dictionary
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.source import Frame
 from warp_ar.input.sources import open_source
-from warp_ar.scene import Camera, Pose, Scene, SourceSpec, load_scene, loads_scene
+from warp_ar.scene import Camera, CharucoBoard, Marker, Pose, Scene, SourceSpec, load_scene, loads_scene
 from warp_ar.scene.amend import amend_scene
 
 FRAMES = 96
@@ -412,6 +414,58 @@ def test_lives_line_names_a_print_that_is_not_true(monkeypatch):
 def test_live_says_nothing_of_a_right_set_up(clip, change, monkeypatch, looks):
     frames = [RIGHT[change](image, k) for k, image in enumerate(looks[clip].images)]
     assert lives_words(load_scene(clip), frames, monkeypatch) == ([], [])
+
+
+@pytest.fixture(scope="module")
+def card_frames():
+    """The printed card from three sides, and the camera."""
+    camera = Camera(640, 480, 600.0, 600.0, 321.0, 238.0)
+    card = PrintedCard(np.random.default_rng(0), paper="a4")
+    eyes = ((0.12 * (k - 1), -0.42, 0.5 + 0.04 * k) for k in range(3))
+    views = [Pose(*look_at(np.array(eye), np.array([0.0, 0.02, 0.0]))) for eye in eyes]
+    return camera, [card.photograph(camera, p, 0.7, lambda linear: np.clip(linear, 0, 1) ** (1 / 2.2)) for p in views]
+
+
+@pytest.mark.parametrize("number", [0, 7, 9])
+def test_card_is_recognised_where_a_single_marker_is_expected(number, monkeypatch, card_frames):
+    """The card holds markers 0 to 9: any of them would be followed at the wrong scale."""
+    camera, frames = card_frames
+    scene = dataclasses.replace(marker(load_scene("desk"), id=number), camera=camera)
+    see(frames, monkeypatch)
+    (found,) = [f for f in check_up(scene, "camera.mp4") if f.name not in {"camera.guessed"}]
+    assert found.name == "marker.board"
+    assert f"single marker of 80 mm, id {number}" in found.text
+    assert f'board = "{SHEET.board}"' in found.remedy
+    assert 0.0 < found.error < 1.0
+    said, names = lives_words(scene, frames, monkeypatch)
+    assert names == ["marker.board"]
+    assert [line.startswith(found.text) for line in said] == [True]
+    assert board_instead(SHEET, frames) is None
+
+
+def test_card_beside_a_single_marker_is_no_fault(card_frames):
+    """Neither one that the card does not have, nor the single marker itself with others around it."""
+    camera, frames = card_frames
+    scene = dataclasses.replace(load_scene("desk"), camera=camera)
+    assert board_instead(dataclasses.replace(scene.marker, id=40), frames) is None
+    other = dataclasses.replace(scene.marker, dictionary="DICT_6X6_250")
+    assert board_instead(other, frames) is None
+    # A second marker 0, larger than the card's.
+    image = frames[0].copy()
+    assert board_instead(scene.marker, [image]) is not None
+    pattern = cv2.aruco.generateImageMarker(find_dictionary("DICT_4X4_50"), 0, 90)
+    image[10:124, 10:124] = 230
+    image[22:112, 22:112] = pattern[..., None]
+    assert board_instead(scene.marker, [image]) is None
+
+
+def test_board_of_unknown_lengths_is_recognised():
+    board = CharucoBoard(6, 5, 0.03, 0.02)
+    image = draw_card(Marker(dictionary="DICT_4X4_50", board=board), 3000.0)
+    found = board_instead(load_scene("desk").marker, [cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)])
+    assert found is not None
+    assert "charuco 6x5" in found.text
+    assert 'board = "charuco 6x5 SQUARE MARKER"' in found.remedy
 
 
 def test_results_are_written_and_comments_stay(tmp_path):

@@ -29,6 +29,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.printed_card import PrintedCard
+from tests.rendered_room import look_at
 from tests.test_budget import even_costs
 from tests.test_pipeline import make_scene
 from warp_ar import live
@@ -40,6 +42,7 @@ from warp_ar.errors import SceneError, UsageError, WarpArError
 from warp_ar.input.card import card_size, draw_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import Synthetic, open_source
+from warp_ar.input.tracking import TrackState
 from warp_ar.light.captured import Light as CapturedMap
 from warp_ar.output.sinks import read_environment
 from warp_ar.scene import (
@@ -50,6 +53,7 @@ from warp_ar.scene import (
     Marker,
     MirrorMaterial,
     PhongMaterial,
+    Pose,
     Scene,
     SourceSpec,
     bundled_scenes,
@@ -64,6 +68,7 @@ from warp_ar.viewer import budget as budget_setting
 from warp_ar.viewer import edits, protocol
 from warp_ar.viewer.address import Address, own_address
 from warp_ar.viewer.budget import BudgetSetting
+from warp_ar.viewer.calibration import CalibrationSession
 from warp_ar.viewer.controls import Controls, Feed
 from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.edits import Wanted
@@ -906,6 +911,73 @@ def test_the_browsers_camera_is_the_source_until_it_leaves(tmp_path: Path) -> No
         assert host.camera_size("me") == SIZE
         host.leave_camera("me")
         running.until(lambda: len(running.frames) > start + 2 and running.frames[-1].stamp is None)
+
+
+def test_the_card_is_not_taken_for_a_single_marker() -> None:
+    """One of the card's markers is the scene's own: it is followed at a wrong scale, and that is said until mended."""
+    size = (480, 360)
+    views = list(rendered(Camera(*size, 430.0, 430.0, 243.0, 176.0, (0.0, 0.0, 0.0, 0.0)), 3, seed=5, marker=SHEET))
+    with Running(page_scene()) as running:
+        running.edit(type="camera", width=size[0], height=size[1])
+
+        def shown() -> dict[str, str] | None:
+            running.host.push(protocol.Picture(1, 1000.0, encode_jpeg(views[0])), "me")
+            time.sleep(0.1)
+            missing: dict[str, str] | None = running.host.state_message()["missing"]
+            return missing
+
+        missing = running.until(shown)
+        assert missing["name"] == "marker.board"
+        assert "single marker" in missing["text"]
+        running.edit(type="card", radius=0.03, ruler=0.1)
+        running.until(lambda: shown() is None and running.frames[-1].state is TrackState.TRACKED)
+        for _ in range(8):
+            assert shown() is None
+
+
+def test_a_calibration_that_tells_too_little_is_not_used() -> None:
+    """The same words as the command has; the views stay, and others that are added make it good."""
+    used: list[Camera] = []
+    truth = Camera(480, 360, 430.0, 430.0, 243.0, 176.0, (0.0, 0.0, 0.0, 0.0))
+    with ThreadPoolExecutor(1) as helper:
+        session = CalibrationSession(helper, lambda message: None, used.append)
+        session.step("start")
+
+        def show(images: list[np.ndarray]) -> None:
+            for image in images:
+                session._looked = 0.0  # not slower than frames come
+                session.look(image)
+                helper.submit(lambda: None).result()
+
+        show(alike_views(truth, 25.0))
+        count = session.message()["views"]
+        assert count >= 4
+        with pytest.raises(UsageError, match=r"degrees only.*nothing is used"):
+            session.step("finish")
+        assert used == []
+        assert session.message()["report"] is None
+        with pytest.raises(UsageError, match="no camera was calibrated"):
+            session.camera_file()
+        assert session.message()["on"]
+        assert session.message()["views"] == count
+        show(list(rendered(truth, 14, seed=5, marker=SHEET)))
+        session.step("finish")
+    assert used[0].fx == pytest.approx(truth.fx, rel=CALIBRATED_ERROR)
+
+
+def alike_views(camera: Camera, slant: float) -> list[np.ndarray]:
+    """The printed card, always tilted as much, in degrees, turned around its normal."""
+    card = PrintedCard(np.random.default_rng(2))
+    images = []
+    for k in range(7):
+        turn = -math.pi / 2 + 0.35 * (k - 3)
+        ahead = np.array(
+            [math.sin(math.radians(slant)) * math.cos(turn), math.sin(math.radians(slant)) * math.sin(turn)]
+        )
+        eye = np.array([*(0.4 * ahead), 0.4 * math.cos(math.radians(slant))])
+        pose = Pose(*look_at(eye, np.zeros(3)))
+        images.append(card.photograph(camera, pose, 0.7, lambda linear: np.clip(linear, 0, 1) ** (1 / 2.2)))
+    return images
 
 
 def test_a_camera_is_calibrated_while_it_is_lit(tmp_path: Path) -> None:

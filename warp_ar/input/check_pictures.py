@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.input.board_finder import find_markers
+from warp_ar.input.board_finder import KNOWN, find_markers, recognise_board
 from warp_ar.input.finding import Finding
 from warp_ar.input.marker_pattern import Pattern, make_pattern, printed_cells
 from warp_ar.input.markers import MarkerDetector, find_dictionary
@@ -52,6 +52,10 @@ FOCAL: Final = 0.02
 """Share of the focal length below which the card's perspective does not contradict it: 0.015 on right set-ups."""
 FOCAL_VIEWS: Final = 10
 """Frames in which it is looked for."""
+BOARD_VIEWS: Final = 4
+"""Frames in which a board is looked for where a single marker is expected: a hand or an edge may hide some of it."""
+BOARD_MARKERS: Final = 5
+"""Markers of the dictionary in a picture below which no board is looked for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +103,10 @@ def check_pictures(scene: Scene, look: Look) -> list[Finding]:
         return [Finding("source.empty", "the source has no frames", "check [source]")]
     if not look.views:
         return [why_unseen(scene.marker, look)]
+    # One of a board's markers taken for a single one gives a wrong scale: all else follows from that.
+    views = [image for image, _ in look.views]
+    if (board := board_instead(scene.marker, views[:: -(-len(views) // BOARD_VIEWS)])) is not None:
+        return [board]
     found = []
     share = len(look.views) / len(look.images)
     if share < RARE:
@@ -154,6 +162,8 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
         return Finding("picture.clipped", "the picture is overexposed: most of it clips", "set a shorter exposure")
     if _is_blurred(image):
         return Finding("picture.blurred", "the picture is blurred", "focus on the card, and keep the camera still")
+    if (board := board_instead(marker, [image])) is not None:
+        return board
     name, seen = find_markers(image)
     if seen:
         numbers = ", ".join(str(n) for n in sorted({d.id for d in seen})[:6])
@@ -162,6 +172,40 @@ def why_unseen(marker: Marker, look: Look) -> Finding:
     whole = "the whole card with its white margin" if marker.board else "the whole black square with its white margin"
     text = f"no {wanted} in {len(look.images)} frames; {whole} must be in the picture"
     return Finding("marker.unseen", text, "show all of it, flat, sharp and lit; check [marker]")
+
+
+def board_instead(marker: Marker, images: Sequence[Image]) -> Finding | None:
+    """The finding that pictures show a board of which the scene expects one marker, taken to be of another size.
+
+    Args:
+        marker: What the scene expects.
+        images: RGB pictures, uint8 (h, w, 3).
+
+    Returns:
+        None where the scene expects a board, and where no picture shows one with the marker's number.
+    """
+    if marker.board is not None:
+        return None
+    detector = MarkerDetector(marker.dictionary)
+    for image in images:
+        # Reading one dictionary takes milliseconds, recognising a layout reads all of them.
+        if len(detector.detect(_gray(image))) < BOARD_MARKERS:
+            continue
+        seen = recognise_board(image)
+        if seen is None or seen.board is None or marker.id >= seen.board.marker_count:
+            continue
+        known = seen in KNOWN
+        what = "the printed card" if seen == KNOWN[0] else "a printed board"
+        name = str(seen.board) if known else " ".join(str(seen.board).split()[:2])
+        text = (
+            f"{what} is in the picture ({seen.dictionary}, {name}), though the scene expects a single marker of "
+            f"{1e3 * marker.size:g} mm, id {marker.id}: it is one of the board's, and all lengths would be wrong"
+        )
+        lengths = name if known else f"{name} SQUARE MARKER"
+        remedy = f'write board = "{lengths}" into [marker] in place of id and size'
+        more = "" if known else ", the lengths of a square and a marker in metres"
+        return Finding("marker.board", text, f"{remedy}{more}; or take the board away and show the marker alone")
+    return None
 
 
 def _is_blurred(image: Image) -> bool:

@@ -89,6 +89,8 @@ def check_look(scene: Scene, look: Look, views: int = 4) -> list[Finding]:
 
 def _check_look(scene: Scene, look: Look, views: int, before: list[Finding]) -> list[Finding]:
     found = check_pictures(scene, look)
+    if any(finding.name == "marker.board" for finding in found):
+        return found  # poses of the wrong scale say nothing about prints, proxies and balls
     few = look.views[:: max(1, -(-len(look.views) // FEW_VIEWS))]
     found += [*check_print(scene.marker, look.camera, few), *check_proxies(scene, look.camera, few)]
     # Where the scene's own numbers cannot be, a picture says nothing more about them.

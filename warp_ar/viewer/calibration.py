@@ -45,13 +45,18 @@ class CalibrationSession:
         """Start, stop or finish.
 
         Raises:
-            WarpArError: There is nothing to finish, or too little was seen.
+            WarpArError: There is nothing to finish, or what was seen tells too little: looking goes on.
         """
         if name == "finish":
             if self._views is None:
                 raise UsageError("nothing was looked at yet: start the calibration first")
-            self._report = self._views.solve()
-            self._use(self._report.camera)
+            report = self._views.solve()
+            if report.doubt:
+                # The views stay, for more of them to be added.
+                views = len(report.view_errors)
+                raise UsageError(f"{report.doubt}, in {views} views: nothing is used. Show the card from other sides")
+            self._report = report
+            self._use(report.camera)
         self._views = BoardViews() if name == "start" else None
         self._notify(self.message())
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from warp_ar.errors import UsageError, WarpArError
 from warp_ar.input.ball_measure import measure_ball
-from warp_ar.input.check_pictures import Look, look_at, why_unseen
+from warp_ar.input.check_pictures import Look, board_instead, look_at, why_unseen
 from warp_ar.input.checkup import check_look
 from warp_ar.input.finding import Finding
 from warp_ar.input.grey_response import measure_grey_response
@@ -68,7 +68,7 @@ class SetupChecks:
         self._measured: dict[str, str] = {}
         self._failed: str | None = None
         self.missing: Finding | None = None
-        """Why the marker is not seen, in words; None while it is."""
+        """Why the marker is not seen, or that it is one of a board's, in words; None while all is right."""
 
     def note(self, image: Image, state: TrackState | None, now: float) -> None:
         """Take notice of a frame.
@@ -83,15 +83,20 @@ class SetupChecks:
         if self._of is None or of != self._of:
             self._of = of
             self._frames.clear()
-            self._seen, self.missing = now, None
+            self._seen, self._looked, self.missing = now, -math.inf, None
         if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
             self._frames.append((image, now))
         self._begin()
         if state in (None, TrackState.TRACKED):
-            self._seen, self.missing = now, None
-        elif now - self._seen > LOST_SECONDS and now - self._looked > AGAIN_SECONDS and not self._is_busy:
+            self._seen = now
+            # A single marker that is seen may be one of a board's, which is looked at below.
+            if self.missing is not None and self.missing.name != "marker.board":
+                self.missing = None
+        doubtful = state is TrackState.TRACKED and self._controls.wanted.scene.marker.board is None
+        due = doubtful or now - self._seen > LOST_SECONDS
+        if due and now - self._looked > AGAIN_SECONDS and not self._is_busy:
             self._looked = now
-            self._busy = self._helper.submit(self._say_why)
+            self._busy = self._helper.submit(self._say_why, doubtful)
 
     @property
     def _is_busy(self) -> bool:
@@ -103,11 +108,17 @@ class SetupChecks:
         camera = self._controls.camera_of(feed, wanted).scaled_to(width, height)
         return dataclasses.replace(wanted.scene, camera=camera), camera
 
-    def _say_why(self) -> None:
+    def _say_why(self, seen: bool) -> None:
+        """Say why the marker is not seen; of one that is seen, whether it belongs to a board."""
         try:
             scene, camera = self._shown()
-            look = look_at(scene.marker, camera, list(self._frames)[-4:])
-            self.missing = None if look.views else why_unseen(scene.marker, look)
+            of, newest = self._of, list(self._frames)[-4:]
+            missing = board_instead(scene.marker, [image for image, _ in newest[::-1]])
+            if missing is None and not seen:
+                look = look_at(scene.marker, camera, newest)
+                missing = None if look.views else why_unseen(scene.marker, look)
+            if of is self._of:  # else the marker or the source has changed meanwhile
+                self.missing = missing
         except (WarpArError, IndexError):
             self.missing = None  # the source has changed meanwhile
 

@@ -68,7 +68,7 @@ export class SetupPanel {
     const seen = this.#frame?.state;
     const what = this.#scene?.marker.board ? "the whole card" : "the whole black square of the marker";
     const words = missing
-      ? `${sentence(missing.text)} ${missing.name === "marker.other" ? "Press “Use the card with these sizes” if it is the printed card." : sentence(missing.remedy)}`
+      ? `${sentence(missing.text)} ${["marker.other", "marker.board"].includes(missing.name) ? "Press “Use the card with these sizes” if it is the printed card." : sentence(missing.remedy)}`
       : seen === "tracked"
         ? "The marker is seen. Go on with the camera."
         : seen
