@@ -339,10 +339,38 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
 
 
 @functools.cache
+def make_respond(method: str) -> wp.Function:
+    """``respond(matter, wi, n_dot_l) -> float32``: how a point responds to a light, by one of ``METHODS``, ``READINGS``.
+
+    The one place where equations (1), (2) and (4) meet a light: at points, and on what emits. ``flat`` reads no matter.
+    """
+    reading = READINGS.get(method)
+
+    @wp.func(module="unique")
+    def respond(matter: Matter, wi: wp.vec3, n_dot_l: wp.float32) -> wp.float32:
+        response = n_dot_l
+        if wp.static(method != "flat"):
+            alpha = wp.dot(wi, matter.key)
+            if wp.static(reading is not None):
+                if wp.static(reading is not None and reading.weighted):
+                    alpha = alpha * matter.directionality
+                if wp.static(reading is not None and reading.blend == "shader"):
+                    response = shader_response(n_dot_l, matter.m, alpha)
+                else:
+                    response = text_response(n_dot_l, matter.m, alpha)
+            elif wp.static(method == "relief"):
+                response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
+            else:
+                response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
+        return response
+
+    return respond
+
+
+@functools.cache
 def make_area_response(config: RelightConfig) -> wp.Function:
     """``area_response(scene, receiver, hit, matter, turn) -> vec3``: sum of E_v visible response over what emits."""
-    method, reading = config.method, READINGS.get(config.method)
-    is_lit = make_shadow(config.trace)
+    is_lit, respond = make_shadow(config.trace), make_respond(config.method)
     area_count, area_sample = make_area_count(config.area_samples), make_area_sample(config.area_samples)
 
     @wp.func(module="unique")
@@ -362,21 +390,7 @@ def make_area_response(config: RelightConfig) -> wp.Function:
             if wp.static(config.probes):
                 if meets_probe(receiver.probes, hit.point, area.wi, area.distance):
                     continue
-            response = n_dot_l
-            if wp.static(method != "flat"):
-                alpha = wp.dot(area.wi, matter.key)
-                if wp.static(reading is not None):
-                    if wp.static(reading is not None and reading.weighted):
-                        alpha = alpha * matter.directionality
-                    if wp.static(reading is not None and reading.blend == "shader"):
-                        response = shader_response(n_dot_l, matter.m, alpha)
-                    else:
-                        response = text_response(n_dot_l, matter.m, alpha)
-                elif wp.static(method == "relief"):
-                    response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
-                else:
-                    response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
-            total += response * area.irradiance_normal
+            total += respond(matter, area.wi, n_dot_l) * area.irradiance_normal
         return total
 
     return area_response
@@ -391,8 +405,7 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
     """
     is_lit = make_shadow(config.trace)
     visible_share = make_visible_share(config.trace) if config.soft else None
-    find_matter = make_find_matter(config)
-    method, reading = config.method, READINGS.get(config.method)
+    find_matter, respond = make_find_matter(config), make_respond(config.method)
     area_response = make_area_response(config) if config.area_samples > 0 else None
 
     @wp.func(module="unique")
@@ -433,27 +446,14 @@ def make_direct_lighting(config: RelightConfig) -> wp.Function:
                     result.visibility |= bit
                     continue
             result.visibility |= _LIT
-            response = n_dot_l
-            if wp.static(method != "flat"):
+            if wp.static(config.method != "flat"):
                 if not known:
                     known = True
                     matter = find_matter(scene, receiver, hit, row, col, mirror)
-                alpha = wp.dot(light.wi, matter.key)
-                if wp.static(reading is not None):
-                    if wp.static(reading is not None and reading.weighted):
-                        alpha = alpha * matter.directionality
-                    if wp.static(reading is not None and reading.blend == "shader"):
-                        response = shader_response(n_dot_l, matter.m, alpha)
-                    else:
-                        response = text_response(n_dot_l, matter.m, alpha)
-                elif wp.static(method == "relief"):
-                    response = n_dot_l * relief_factor(matter.m, alpha * matter.directionality)
-                else:
-                    response = n_dot_l * turned_relief(matter.m, alpha, matter.directionality)
-            added += visible * response * light.irradiance_normal
+            added += visible * respond(matter, light.wi, n_dot_l) * light.irradiance_normal
         if wp.static(config.area_samples > 0):
             if scene.area_lights.shape[0] > 0:
-                if wp.static(method != "flat"):
+                if wp.static(config.method != "flat"):
                     if not known:
                         known = True
                         matter = find_matter(scene, receiver, hit, row, col, mirror)
