@@ -7,8 +7,8 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import color, mirror_ball
+from warp_ar.kernels.receiver import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.relight import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     DIRECTIONAL,

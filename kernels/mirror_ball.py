@@ -23,8 +23,9 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.receiver import Receiver, RelightConfig
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
-from warp_ar.kernels.relight import Receiver, RelightConfig, make_direct_lighting
+from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene

@@ -71,8 +71,8 @@ from warp_ar.kernels.path_sampling import (
     sky_radiance,
     surface_density,
 )
+from warp_ar.kernels.receiver import reflectance_of
 from warp_ar.kernels.reflect import make_find_in_frame
-from warp_ar.kernels.relight import reflectance_of
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import face_viewer
 from warp_ar.kernels.shadow import has_penumbra, sample_light

@@ -37,13 +37,8 @@ from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
-from warp_ar.kernels.relight import (
-    DEFAULT_REFLECTANCE,
-    Receiver,
-    ReceiverCells,
-    RelightConfig,
-    make_direct_lighting,
-)
+from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig
+from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
 from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
 from warp_ar.kernels.visibility import (
