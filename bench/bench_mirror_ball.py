@@ -24,7 +24,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.stages.mirror_ball import SAMPLES
 
 H, W, FOCAL = 480, 640, 600.0

@@ -21,7 +21,7 @@ from warp_ar.device import usable_cores
 from warp_ar.kernels import path_tracer
 from warp_ar.kernels.launch import launch_rows
 from warp_ar.kernels.structs import FrameParams
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")

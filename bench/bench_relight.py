@@ -29,7 +29,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 
 H, W = 480, 640
 

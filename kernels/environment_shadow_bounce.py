@@ -40,8 +40,9 @@ from warp_ar.kernels.reflect import (
     make_shade_unoccluded,
 )
 from warp_ar.kernels.sampling import frame_from_normal, sample_cosine_hemisphere, uniform_from_bits
-from warp_ar.kernels.structs import SPHERE, FrameParams, Picture, RayScene, Shape
-from warp_ar.kernels.visibility import FAR, Hit, make_trace, offset_origin
+from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.structs import SPHERE, FrameParams, Hit, Picture, RayScene, Shape
+from warp_ar.kernels.trace import make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

@@ -53,16 +53,10 @@ from warp_ar.kernels.sampling import (
 )
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import make_sample_light, make_visible_share, tile_turn
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import FrameParams, Hit, Light, Picture, Probe, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    TraceConfig,
-    inside_rect,
-    make_sample_direction,
-    make_trace,
-    meets_probe,
-    offset_origin,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace, meets_probe, offset_origin
+from warp_ar.kernels.visibility import inside_rect, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

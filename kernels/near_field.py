@@ -64,16 +64,10 @@ from warp_ar.kernels.sampling import (
     sample_ggx_visible,
     sample_phong_lobe,
 )
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Picture, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    VisibleObjects,
-    inside_rect,
-    make_primary,
-    make_sample_direction,
-    make_trace,
-    offset_origin,
-)
+from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.visibility import VisibleObjects, inside_rect, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

@@ -76,8 +76,9 @@ from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.shade import face_viewer
 from warp_ar.kernels.shadow import has_penumbra, sample_light
-from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Light, Picture, Probe, RayScene
-from warp_ar.kernels.visibility import FAR, ROUNDING, Hit, TraceConfig, intersect_sphere, make_trace, offset_origin
+from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
+from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Hit, Light, Picture, Probe, RayScene
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

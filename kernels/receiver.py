@@ -39,9 +39,11 @@ from warp_ar.kernels.color import decode, luminance
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.structs import Emitter, KeyLight, Picture, Probe, RayScene
+from warp_ar.kernels.shapes import surface_key
+from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean, intensity
-from warp_ar.kernels.visibility import Hit, TraceConfig, check_edge_samples, surface_key
+from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.visibility import check_edge_samples
 
 wp.set_module_options({"enable_backward": False})
 

@@ -40,16 +40,10 @@ from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
 from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig
 from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
+from warp_ar.kernels.shapes import intersect_sphere, surface_key
 from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import (
-    TraceConfig,
-    inside_rect,
-    intersect_sphere,
-    make_trace,
-    make_visible_proxy,
-    offset_origin,
-    surface_key,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
 

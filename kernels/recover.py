@@ -40,9 +40,10 @@ from warp_ar.kernels.latlong import (
     texel_solid_angle,
 )
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.shapes import FAR, ROUNDING
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.unwrap import reflecting_normal
-from warp_ar.kernels.visibility import FAR, ROUNDING, TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

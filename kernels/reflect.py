@@ -29,11 +29,12 @@ from warp_ar.kernels.structs import (
     PHONG,
     Emitter,
     FrameParams,
+    Hit,
     Picture,
     Probe,
     RayScene,
 )
-from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace, meets_probe
+from warp_ar.kernels.trace import TraceConfig, make_trace, meets_probe
 
 wp.set_module_options({"enable_backward": False})
 

@@ -37,16 +37,10 @@ from warp_ar.kernels.receiver import (
     make_respond,
 )
 from warp_ar.kernels.shadow import LightSample, has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
-from warp_ar.kernels.structs import FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    Hit,
-    inside_rect,
-    make_sample_direction,
-    make_trace,
-    meets_probe,
-    surface_key,
-)
+from warp_ar.kernels.shapes import FAR, surface_key
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
+from warp_ar.kernels.trace import make_trace, meets_probe
+from warp_ar.kernels.visibility import inside_rect, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

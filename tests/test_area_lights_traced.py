@@ -17,8 +17,9 @@ from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import LightSample, make_shadow, tile_turn
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Light, RayScene
-from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
+from warp_ar.kernels.trace import TraceConfig, make_trace
 from warp_ar.scene import (
     AreaLight,
     Camera,

@@ -46,7 +46,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 from warp_ar.stages.features import find_features
 from warp_ar.stages.mirror_ball import SAMPLES, mirror_config

@@ -21,12 +21,14 @@ from warp_ar.kernels.structs import (
     SPHERE,
     TEXTURES,
     FrameParams,
+    Hit,
     Material,
     RayScene,
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import Hit, TraceConfig, VisibleObjects, make_visible, trace_pixels
+from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.visibility import VisibleObjects, make_visible, trace_pixels
 from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request

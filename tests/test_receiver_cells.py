@@ -35,7 +35,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
 from warp_ar.scene.ray_scene import HostScene, proxies_face
@@ -88,9 +88,7 @@ class View:
     ):
         kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
         trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
-        self.relight = RelightConfig(
-            "reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms
-        )
+        self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
         self.config = receiver_cells.CellConfig(self.relight)
         self.size = size
         self.params = records(

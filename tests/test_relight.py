@@ -33,7 +33,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 
 H, W = 48, 64
 # Points on the desk are computed in float32, 1e-7 of a metre or so; lights are decimetres away and 1/d^2 doubles that.
@@ -148,9 +148,7 @@ def run_edges(
         (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
     )
     kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
-    config = RelightConfig(
-        "reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples
-    )
+    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples)
     place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
     params = records(FrameParams, place)
     scene = RayScene()

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from tests.hard_cases.generators import directions, frames
 from tests.hard_cases.rig import METHODS, SIZE, LoneStage, assert_finite, solid_angles
-from warp_ar.kernels import irradiance, latlong, materials, prefilter, sampling, visibility
+from warp_ar.kernels import irradiance, latlong, materials, prefilter, sampling
+from warp_ar.kernels.shapes import sphere_uv
 from warp_ar.scene import Pose
 
 FURNACE = 5e-4
@@ -125,7 +126,7 @@ def evaluate_kernel(
     level_out[i] = prefilter.sample_levels(levels, d, 1.5, height)
     irradiance_out[i] = irradiance.sh_irradiance(sh, d)
     frame_out[i] = sampling.frame_from_normal(d)
-    uv_out[i] = visibility.sphere_uv(d)
+    uv_out[i] = sphere_uv(d)
     # Light, view and normal along one line, exactly and an ulp beside it.
     n = wp.normalize(d)
     lobes_out[i] = wp.vec3(

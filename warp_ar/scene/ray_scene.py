@@ -19,7 +19,7 @@ import warp as wp
 from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.area_lights import emits, make_area_table
 from warp_ar.scene.geometry import Mesh, rotation_matrix
@@ -41,7 +41,7 @@ from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 FloatArray = npt.NDArray[np.float64]
 
 BOX_MARGIN: Final = 2.0**-18
-"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
+"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/shapes.py``."""
 
 BVH_CONSTRUCTOR: Final = "sah"
 """On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""

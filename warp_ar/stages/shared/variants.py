@@ -16,7 +16,7 @@ from warp_ar.kernels.composite import CompositeConfig
 from warp_ar.kernels.receiver import RelightConfig
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.kernels.shade import ShadeConfig
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.stages.features import Features
 
 VARIABLE: Final = "WARP_AR_KERNELS"
