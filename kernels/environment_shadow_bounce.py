@@ -25,8 +25,8 @@ import warp as wp
 
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import make_surface, reflect
-from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,

@@ -39,8 +39,8 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import ggx_lobe, reflect, schlick
-from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.sampling import (
     frame_from_normal,

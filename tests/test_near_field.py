@@ -12,7 +12,7 @@ from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import near_field, shade
-from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     LAMBERT,

@@ -13,8 +13,8 @@ import warp as wp
 from tests.gltf_files import SQUARE_UVS, Gltf
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
-from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
 from warp_ar.kernels.trace import make_trace
 from warp_ar.scene import (

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.test_relight import H, W, records, shape
-from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import (
     DistantLight,
     DistantLightConfig,

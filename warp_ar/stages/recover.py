@@ -13,6 +13,8 @@ import warp as wp
 
 from warp_ar.kernels import change
 from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
@@ -104,7 +106,7 @@ class Recover(Stage):
         """The map, the two sides of the equations, and what readers have seen."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
-        cells = kernels.cell_shape(*shape)
+        cells = cell_shape(*shape)
         self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
         return {
@@ -112,8 +114,8 @@ class Recover(Stage):
             **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "emitters"},
             "recover_recovered": ArraySpec(cells, wp.vec3),
             "recover_missing": ArraySpec(shape, wp.vec3),
-            "recover_cells": ArraySpec(cells, kernels.Cell),
-            "recover_cells_now": ArraySpec(cells, kernels.Cell),
+            "recover_cells": ArraySpec(cells, Cell),
+            "recover_cells_now": ArraySpec(cells, Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
             "recover_observations": ArraySpec((points,), kernels.Observation),
             "recover_traced": ArraySpec((points,), wp.int32),
@@ -165,13 +167,13 @@ class Recover(Stage):
 
     def _weigh(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.weigh_boundaries(
+        weigh_boundaries(
             arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
         )
 
     def _condense(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.condense_cells(
+        condense_cells(
             arrays["filled_radiance"],
             arrays["environment_confidence"],
             arrays["environment_clipped"],
@@ -214,7 +216,7 @@ class Recover(Stage):
 
     def _add(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.add_recovered(
+        add_recovered(
             arrays["filled_radiance"],
             arrays["environment_confidence"],
             arrays["recover_missing"],
