@@ -140,8 +140,8 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
 
 
 @functools.cache
-def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Kernels for the given kinds of proxy: observe, transfer, emitters."""
+def make_observe_surfaces_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``observe_surfaces`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
@@ -202,6 +202,54 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     seen.deviation[channel] = wp.sqrt(wp.max(squares[channel], 0.0) / count)
         observations_out[index] = seen
 
+    return observe_surfaces_kernel
+
+
+def observe_surfaces(
+    frame: wp.array,
+    decode_table: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    points: wp.array,
+    observations_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Measure what the frame shows of surface points.
+
+    Args:
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
+        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P): they hide surfaces.
+        scene: Its proxies hide surfaces as well.
+        points: ``SurfacePoint`` (n).
+        observations_out: ``Observation`` (n).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_observe_surfaces_kernel(proxies),
+        observations_out.shape,
+        [frame, decode_table, params, probes, scene, points],
+        [observations_out],
+        rows=rows,
+        device=observations_out.device,
+    )
+
+
+# Visibility. From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size,
+# the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex mirror
+# does; that is kept apart, for real balls scatter some of it. Where a proxy is in the way, its radiance is what the
+# ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left for
+# what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+@functools.cache
+def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``trace_transfer`` for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_transfer_kernel(
         # In:
@@ -246,6 +294,53 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
 
+    return trace_transfer_kernel
+
+
+def trace_transfer(
+    points: wp.array,
+    observations: wp.array,
+    cells: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    traced_out: wp.array,
+    transfer_out: wp.array,
+    mirrored_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
+
+    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
+
+    Args:
+        points: ``SurfacePoint`` (n).
+        observations: ``Observation`` (n): points that the camera does not see are left out.
+        cells: ``Cell`` (rows, columns): middles and solid angles.
+        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
+        scene: Its proxies hide the environment.
+        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
+        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
+        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_trace_transfer_kernel(proxies),
+        points.shape,
+        [points, observations, cells, probes, scene],
+        [traced_out, transfer_out, mirrored_out],
+        rows=rows,
+        device=transfer_out.device,
+    )
+
+
+@functools.cache
+def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``trace_emitters`` for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_emitters_kernel(
         # In:
@@ -285,81 +380,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 given += beam * mirrored_irradiance(probes[k], point, wp.normalize(from_ball))
         transfer_out[row, index] = given
 
-    return observe_surfaces_kernel, trace_transfer_kernel, trace_emitters_kernel
-
-
-def observe_surfaces(
-    frame: wp.array,
-    decode_table: wp.array,
-    params: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    points: wp.array,
-    observations_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Measure what the frame shows of surface points.
-
-    Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
-        decode_table: Linear value of each code, ``wp.vec3`` (256).
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P): they hide surfaces.
-        scene: Its proxies hide surfaces as well.
-        points: ``SurfacePoint`` (n).
-        observations_out: ``Observation`` (n).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_kernels(proxies)[0],
-        observations_out.shape,
-        [frame, decode_table, params, probes, scene, points],
-        [observations_out],
-        rows=rows,
-        device=observations_out.device,
-    )
-
-
-def trace_transfer(
-    points: wp.array,
-    observations: wp.array,
-    cells: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    traced_out: wp.array,
-    transfer_out: wp.array,
-    mirrored_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
-
-    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
-
-    Args:
-        points: ``SurfacePoint`` (n).
-        observations: ``Observation`` (n): points that the camera does not see are left out.
-        cells: ``Cell`` (rows, columns): middles and solid angles.
-        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
-        scene: Its proxies hide the environment.
-        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
-        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
-        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_kernels(proxies)[1],
-        points.shape,
-        [points, observations, cells, probes, scene],
-        [traced_out, transfer_out, mirrored_out],
-        rows=rows,
-        device=transfer_out.device,
-    )
+    return trace_emitters_kernel
 
 
 def trace_emitters(
@@ -388,7 +409,7 @@ def trace_emitters(
         stream: CUDA stream; None means the device's current one.
     """
     launch_rows(
-        make_kernels(proxies)[2],
+        make_trace_emitters_kernel(proxies),
         transfer_out.shape,
         [points, observations, emitters, probes, scene],
         [transfer_out],

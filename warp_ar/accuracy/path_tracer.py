@@ -1,8 +1,8 @@
 """The picture of a frame by path tracing: progressive, with a standard error for every pixel.
 
-``kernels/path_tracer.py`` says what it sums. It knows the scene, the light of the environment and one frame with its
-pose, as the pipeline does, and approximates nothing else: with enough samples it is what the pipeline's methods are to
-be judged by.
+``kernels/path_tracer.py`` and ``path_following.py`` say what it sums. It knows the scene, the light of the environment
+and one frame with its pose, as the pipeline does, and approximates nothing else: with enough samples it is what the
+pipeline's methods are to be judged by.
 """
 
 from __future__ import annotations

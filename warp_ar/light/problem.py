@@ -64,7 +64,7 @@ class Problem:
         """Set up both sides.
 
         Args:
-            cells: Records of ``kernels.recover.Cell``, (rows, columns).
+            cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
             transfer: From ``trace_transfer``, straight, (n, rows * columns).
             mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).

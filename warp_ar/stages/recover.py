@@ -234,7 +234,7 @@ class Recover(Stage):
 
     def host_kernels(self) -> tuple[Any, ...]:
         """Of the solver: irradiance from emitters, at whatever places it tries."""
-        return (kernels.make_kernels(self._proxies)[2],) if self.method == "shading" else ()
+        return (kernels.make_trace_emitters_kernel(self._proxies),) if self.method == "shading" else ()
 
     def begin(self) -> None:
         """Decide whether an estimate is begun in this frame, and whether one takes effect."""
