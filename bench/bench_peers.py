@@ -25,7 +25,7 @@ from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
 from warp_ar.kernels.wide_bvh import walk_closest
-from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}

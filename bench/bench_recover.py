@@ -19,7 +19,8 @@ from warp_ar.light import recovery
 from warp_ar.light.config import Kind
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene import load_scene
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 HEIGHTS = (64, 128)
 

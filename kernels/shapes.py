@@ -129,7 +129,7 @@ def enter_mesh(half: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.float32
 # No ray may slip through the shared edge of two triangles. Warp's own test of a triangle is watertight [WBW13], its
 # test of a node's box is not: it neither widens the interval by the rounding of its products [Ize13] nor leaves a
 # margin around triangles, and so loses rays that run through edges which are box faces as well.
-# ``warp_ar.scene.ray_scene.make_ray_mesh`` therefore builds the BVH over boxes that are larger by 2^-18 of the mesh's
+# ``warp_ar.scene.ray_mesh.make_ray_mesh`` therefore builds the BVH over boxes that are larger by 2^-18 of the mesh's
 # radius than their triangles. That margin covers the rounding 2 * 3 * 2^-24 * |box - origin| of a slab's two bounds, if
 # the origin is near; ``intersect_mesh`` first moves it to the mesh's bounding sphere, after which |box - origin| is at
 # most two radii.

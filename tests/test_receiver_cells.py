@@ -38,7 +38,8 @@ from warp_ar.kernels.structs import (
 from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.ray_scene import HostScene, proxies_face
+from warp_ar.scene.kinds import proxies_face
+from warp_ar.scene.ray_scene import HostScene
 
 SIZE_OF_FRAME = (48, 64)
 FOCAL = 60.0

@@ -30,7 +30,8 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.problem import mirroring_points
 from warp_ar.scene import Pose, Proxy, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover

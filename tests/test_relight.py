@@ -616,8 +616,9 @@ def test_nearer_to_the_truth_method_by_method(device, shared):
     import cv2
 
     from warp_ar.scene import load_scene
+    from warp_ar.scene.kinds import trace_config
     from warp_ar.scene.pixel_rays import pixel_rays
-    from warp_ar.scene.ray_scene import HostScene, trace_config
+    from warp_ar.scene.ray_scene import HostScene
 
     case = shared / "truth" / "gold_torus_interior"
     scene = load_scene(case / "scene_light.toml")

@@ -30,8 +30,9 @@ from warp_ar.kernels.path_vertices import LocalScene
 from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene
+from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.pixel_rays import pixel_rays
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 FloatImage = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]

@@ -19,7 +19,7 @@ from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
 from warp_ar.light.surfaces import find_surfaces
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies

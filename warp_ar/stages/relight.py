@@ -15,7 +15,7 @@ from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.launch import count_partials
 from warp_ar.kernels.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warp_ar.kernels.receiver import RelightConfig
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.features import LOCAL, Features
 
 
