@@ -274,7 +274,7 @@ MUTATIONS = (
     Mutation(
         13,
         "the BVH's boxes are not enlarged: rays slip through shared edges",
-        "warp_ar/scene/ray_scene.py",
+        "warp_ar/scene/ray_mesh.py",
         "2.0**-18",
         "0.0",
         f"{HARD}test_rows13_14_rays.py::test_the_20480_triangle_sphere_never_leaks",

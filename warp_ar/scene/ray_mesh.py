@@ -15,8 +15,9 @@ from warp_ar import scene as scenes
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.object_materials import file_mesh
-from warp_ar.scene.ray_scene import FloatArray
 from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
+
+FloatArray = npt.NDArray[np.float64]
 
 BOX_MARGIN: Final = 2.0**-18
 """How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/shapes.py``."""

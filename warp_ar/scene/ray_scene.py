@@ -24,7 +24,15 @@ from warp_ar.scene.kinds import light_kind, material_model, shape_kind
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.object_materials import is_detailed, look_of, mesh_of
 from warp_ar.scene.pose import Pose
-from warp_ar.scene.ray_mesh import RayMesh, make_mesh, make_ray_mesh, mesh_key, shared_ray_mesh, texture_density
+from warp_ar.scene.ray_mesh import (
+    FloatArray,
+    RayMesh,
+    make_mesh,
+    make_ray_mesh,
+    mesh_key,
+    shared_ray_mesh,
+    texture_density,
+)
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
 from warp_ar.scene.texture_codes import DECODE
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
