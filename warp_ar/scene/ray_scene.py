@@ -37,7 +37,6 @@ from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, b
 from warp_ar.scene.texture_codes import DECODE
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 
-FloatArray = npt.NDArray[np.float64]
 _ALPHA: Final = {"opaque": structs.OPAQUE, "mask": structs.MASKED, "blend": structs.BLENDED}
 _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
