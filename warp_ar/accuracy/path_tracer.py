@@ -149,12 +149,16 @@ class PathTracer:
             self._local = self._make_local(_environment(light), _near_emitters(light), seconds)
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
-            shape = (self.camera.height, self.camera.width)
-            self._moments = make_moments(shape, self.device)
-            self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
-            self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
-            self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
-            self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
+            self._allocate()
+
+    def _allocate(self) -> None:
+        """Moments of no samples, and what a picture of them is written to."""
+        shape = (self.camera.height, self.camera.width)
+        self._moments = make_moments(shape, self.device)
+        self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+        self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
+        self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
+        self._encode = wp.array(encode_table(self.camera.transfer), dtype=wp.vec3, device=self.device)
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
         """The scene as paths meet it."""
