@@ -175,16 +175,15 @@ class Pipeline(Closing):
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
         form = outputs, self.bracket.ratios, synchronous, emitters, linear
         self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
-        self._start_over()
         with translating(self.device), wp.ScopedDevice(self.device):
-            follows = self._follows_gain(follows_camera) and not exposures  # several exposures tell it themselves
-            self._build(follows, bands=bands, profile=profile, culling=culling)
+            self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)
 
-    def _follows_gain(self, follows_camera: bool | None) -> bool:
-        """Whether a drift of the camera's gain is followed: the paper takes all frames as the camera saw them."""
+    def _follows_gain(self, follows_camera: bool | None, exposures: Sequence[float]) -> bool:
+        """Whether a drift of the camera's gain is followed."""
         if follows_camera is None:
             follows_camera = self.scene.source is not None and self.scene.source.metering == "automatic"
-        return follows_camera and self.quality.method("recover") != "clipped"
+        # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+        return follows_camera and self.quality.method("recover") != "clipped" and not exposures
 
     def _start_over(self) -> None:
         """What frames leave behind for the next one: nothing as yet."""
@@ -202,6 +201,7 @@ class Pipeline(Closing):
 
     def _build(self, follows: bool, *, bands: int | None, profile: bool, culling: bool) -> None:
         """Allocate what the plan calls for, and wire its stages."""
+        self._start_over()
         self._borrowed = Borrowed(self.device)
         self._arrays = Arrays()
         self._light = CarriedLight(self._arrays, wanted="environment" in self.plan.request.outputs)
