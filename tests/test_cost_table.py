@@ -10,7 +10,6 @@ from warp_ar.accuracy.cost_table import (
     SETTINGS,
     MethodCost,
     choose,
-    choose_for_error,
     chosen,
     pareto_front,
     pareto_optimal,
@@ -89,11 +88,6 @@ def test_choice_is_the_best_of_all(seed):
             assert choice.error == pytest.approx(min(fitting), abs=EXACT)
         else:
             assert choice.milliseconds == pytest.approx(min(cost for cost, _ in every), abs=EXACT)
-    for error in (0.0, 4.0, 11.0):
-        choice = choose_for_error(front, error)
-        fitting = [cost for cost, own in every if own <= error]
-        if fitting:
-            assert choice.milliseconds == pytest.approx(min(fitting), abs=EXACT)
 
 
 @pytest.mark.parametrize("seed", range(8))

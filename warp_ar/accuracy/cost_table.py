@@ -224,11 +224,6 @@ def choose(front: Sequence[Choice], budget_ms: float) -> Choice:
     return fitting[-1] if fitting else front[0]
 
 
-def choose_for_error(front: Sequence[Choice], error: float) -> Choice:
-    """Cheapest of a ``Pareto front`` that errs no more; the most exact if none does."""
-    return next((choice for choice in front if choice.error <= error), front[-1])
-
-
 def load_errors() -> dict[str, dict[str, float]]:
     """Error of every method of every setting, from the cost table that comes with the package."""
     text = importlib.resources.files("warp_ar.accuracy").joinpath(COST_TABLE).read_text(encoding="utf-8")

@@ -101,7 +101,6 @@ class Scheduler:
         """Why stages can change no pixel of this frame."""
         self._passes = {stage.name: passes for stage, passes in self._stages}
         self._readers = _find_readers([stage for stage, _ in self._stages])
-        self._order = {stage.name: index for index, (stage, _) in enumerate(self._stages)}
         # Stages that decide per frame what they do: their passes are part of a frame's pattern.
         self._changing = {stage.name for stage, passes in self._stages if any(step.enabled for step in passes)}
 

@@ -123,10 +123,6 @@ class ProcessPool:
         for worker in range(self.size):
             self._workers.append(self._start(worker))
 
-    def pids(self) -> list[int]:
-        """Processes of the workers."""
-        return [process.pid for process, _ in self._workers]
-
     def _start(self, worker: int) -> tuple[Any, Any]:
         mine, theirs = self._spawn.Pipe()
         context = dataclasses.replace(self._context, device=self.names[worker], worker=worker)

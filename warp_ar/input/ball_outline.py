@@ -1,4 +1,4 @@
-"""Where a mirror ball stands: by the receiver that it mirrors, else by its outline."""
+"""Where a mirror ball stands, by its outline alone: what holds where it mirrors nothing that is known."""
 
 from __future__ import annotations
 
@@ -12,16 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
-from warp_ar.input.ball import fit_ball
-from warp_ar.scene import Camera, Pose, Probe, Proxy
+from warp_ar.scene import Camera, Pose
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _SEARCH = 10
 """Millimetres around the rough centre in which the ball is looked for."""
-_MOST_FRAMES = 6
-"""Frames that the mirrored receiver is compared in: more cost seconds each, and add little."""
 _BLUR = 0.9
 """Pixels: standard deviation of the blur under which the ball's rim is looked for."""
 _RIM_POINTS = 96
@@ -35,11 +32,9 @@ class BallReport:
     center: tuple[float, float, float]
     """Centre in the marker's frame, metres."""
     contrast: float
-    """Contrast across its outline against that just outside, or share of samples that agree: 0 nothing there, 1 all."""
+    """Contrast across its outline against that just outside: 0 nothing there, 1 all."""
     views: int
     """Frames that were used."""
-    deviation: float | None = None
-    """Standard deviation in metres along the worst axis, where the mirrored receiver told; None: the outline alone."""
 
 
 def outline_ball(camera: Camera, pose: Pose, center: Array, radius: float) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -71,36 +66,6 @@ def outline_ball(camera: Camera, pose: Pose, center: Array, radius: float) -> tu
     outward = np.sign(((pixels - pixels.mean(0)) * normal).sum(1))
     above = (rim - c) @ pose.rotation[:, 2] > 0
     return pixels, normal * outward[:, None], above
-
-
-def locate_ball(
-    views: Sequence[tuple[Image, Pose]],
-    camera: Camera,
-    probe: Probe,
-    proxies: Sequence[Proxy] = (),
-    others: Sequence[Probe] = (),
-) -> BallReport:
-    """Centre of a mirror ball from frames with known poses: by the receiver that it mirrors, else by its outline.
-
-    On path-traced desks the mirrored receiver gives the centre within 0.2 to 0.7 mm where the height is right, and
-    within 1.7 mm where that is off by 1.5.
-
-    Args:
-        views: RGB frames with ``camera_from_world``.
-        camera: The camera.
-        probe: The ball; its centre within 10 mm.
-        proxies: What stands on the receiver.
-        others: Other balls.
-
-    Raises:
-        UsageError: The ball is in too few frames to see its outline.
-    """
-    few = views[:: -(-len(views) // _MOST_FRAMES)]
-    fit = fit_ball(few, camera, probe, proxies, others, search=1e-3 * _SEARCH)
-    if fit is None or not fit.is_good:
-        return outline_search(views, camera, probe.center, probe.radius)
-    x, y, z = (float(v) for v in fit.center)
-    return BallReport((x, y, z), 1.0 - fit.error, len(few), fit.deviation)
 
 
 def outline_search(

@@ -25,9 +25,6 @@ COLOR_SPACES: Final[dict[str, Chromaticities]] = {
 }
 """Chromaticities of red, green, blue and white, x and y each; ACEScg's are AP1 (ACES S-2014-004)."""
 
-GREY_CARD: Final = 0.18
-"""Reflectance of a grey card."""
-
 _CONFIG = "ocio://cg-config-latest"
 _NAMES = {"rec709": "Linear Rec.709 (sRGB)", "acescg": "ACEScg"}
 
