@@ -30,7 +30,7 @@ from warp_ar.kernels.guards import safe_radiance
 from warp_ar.kernels.latlong import texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows, launch_tiles, tile_kernel
 from warp_ar.kernels.lobes import LARGE_LEVELS, Lobe, LobeSamples, last_lobe, locate_texel, mixed_texels
-from warp_ar.kernels.pyramid import sample_packed, sample_packed_smooth
+from warp_ar.kernels.pyramid import last_mip, sample_mips, sample_packed, sample_packed_smooth
 
 wp.set_module_options({"enable_backward": False})
 
@@ -120,9 +120,7 @@ def sample_lobes_kernel(
         return
     h = height >> wp.max(level - 2, 0)
     w = 2 * height >> wp.max(level - 2, 0)
-    last = wp.int32(0)
-    while (height >> (last + 1)) > 0:
-        last += 1
+    last = last_mip(height, 2 * height)
     # By symmetry about z a texel's samples are those of longitude 0, turned by the texel's own: its column is added to
     # theirs.
     theta = PI * (wp.float32(at[1]) + 0.5) / wp.float32(h)
@@ -139,22 +137,7 @@ def sample_lobes_kernel(
             v = wp.atan2(wp.sqrt(x * x + local[1] * local[1]), z) / PI
             u = wp.atan2(local[1], x) / (2.0 * PI) + turn
             u = u - wp.floor(u)
-            mip = wp.min(local[3], wp.float32(last))
-            fine = wp.min(wp.int32(mip), wp.max(last - 1, 0))
-            fraction = mip - wp.float32(fine)
-            offset = wp.int32(0)
-            for m in range(fine):
-                offset += (height >> m) * (2 * height >> m)
-            mh = height >> fine
-            mw = 2 * height >> fine
-            value = sample_packed(pyramid, offset, mh, mw, v * wp.float32(mh), u * wp.float32(mw))
-            if fraction > 0.0:
-                offset += mh * mw
-                mh = height >> (fine + 1)
-                mw = 2 * height >> (fine + 1)
-                coarse = sample_packed(pyramid, offset, mh, mw, v * wp.float32(mh), u * wp.float32(mw))
-                value = value * (1.0 - fraction) + coarse * fraction
-            total += value * weight
+            total += sample_mips(pyramid, v, u, local[3], last, height, 2 * height) * weight
     levels_out[index] = total
 
 

@@ -32,7 +32,7 @@ import math
 import warp as wp
 
 from warp_ar.kernels.guards import safe_radiance
-from warp_ar.kernels.latlong import latlong_from_direction, wrap_texel
+from warp_ar.kernels.latlong import wrap_texel
 from warp_ar.kernels.launch import Rows, is_last_block, launch, launch_rows, launch_tiles, wait_for_block
 
 wp.set_module_options({"enable_backward": False})
@@ -132,14 +132,36 @@ def sample_packed_smooth(
 
 
 @wp.func
-def sample_pyramid(
-    levels: wp.array[wp.vec3], direction: wp.vec3, level: wp.float32, height: wp.int32, width: wp.int32
-) -> wp.vec3:
-    """Trilinear sample of a pyramid of a (height, width) map; ``level`` is clamped to those that exist."""
+def last_mip(height: wp.int32, width: wp.int32) -> wp.int32:
+    """Number of the last level of a pyramid."""
     size = wp.min(height, width)
     last = wp.int32(0)
     while (size >> (last + 1)) > 0:
         last += 1
+    return last
+
+
+@wp.func
+def sample_mips(
+    levels: wp.array[wp.vec3],
+    v: wp.float32,
+    u: wp.float32,
+    level: wp.float32,
+    last: wp.int32,
+    height: wp.int32,
+    width: wp.int32,
+) -> wp.vec3:
+    """Trilinear sample of the pyramid of a (height, width) map.
+
+    Args:
+        levels: Packed levels.
+        v: Row over the map's height.
+        u: Column over the map's width.
+        level: With its fraction; clamped to those that exist.
+        last: From ``last_mip``: asked for once where many samples are taken.
+        height: Rows of level 0.
+        width: Columns of level 0.
+    """
     clamped = wp.clamp(level, 0.0, wp.float32(last))
     below = wp.min(wp.int32(clamped), wp.max(last - 1, 0))
     fraction = clamped - wp.float32(below)
@@ -148,9 +170,6 @@ def sample_pyramid(
         offset += (height >> l) * (width >> l)
     h = height >> below
     w = width >> below
-    at = latlong_from_direction(direction, height, width)
-    v = at[0] / wp.float32(height)
-    u = at[1] / wp.float32(width)
     fine = sample_packed(levels, offset, h, w, v * wp.float32(h), u * wp.float32(w))
     if fraction == 0.0:
         return fine

@@ -127,26 +127,6 @@ def sample_cosine_hemisphere(u: wp.vec2) -> wp.vec3:
 
 
 @wp.func
-def sample_cone(u: wp.vec2, half_angle: wp.float32) -> wp.vec3:
-    """Uniform direction within ``half_angle`` (radians) of +z; pdf ``cone_pdf(half_angle)``.
-
-    1 - cos theta = u (1 - cos half_angle) is kept as versine: a sun of a quarter of a degree loses no digits.
-    """
-    s = wp.sin(0.5 * half_angle)
-    versine = u[0] * 2.0 * s * s
-    sin_theta = wp.sqrt(versine * (2.0 - versine))
-    phi = 2.0 * PI * u[1]
-    return wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), 1.0 - versine)
-
-
-@wp.func
-def cone_pdf(half_angle: wp.float32) -> wp.float32:
-    """1 / solid angle of a cone; a cone of no width counts as one of 1e-4 rad."""
-    s = wp.sin(0.5 * wp.max(half_angle, 1.0e-4))
-    return 1.0 / (4.0 * PI * s * s)
-
-
-@wp.func
 def sample_phong_lobe(u: wp.vec2, exponent: wp.float32) -> wp.vec3:
     """Direction with pdf (n + 1) / (2 pi) cos^n theta about +z.
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from tests.reference import pyramid as reference
 from warp_ar.kernels import guards, pyramid
-from warp_ar.kernels.latlong import direction_from_latlong
+from warp_ar.kernels.latlong import direction_from_latlong, latlong_from_direction
 
 # Float32: sums of a few texels per level, a dozen levels at most, relative to the largest value around.
 ROUNDING = 3e-6
@@ -36,7 +36,11 @@ def sample_kernel(
 ):
     i = wp.tid()
     d = direction_from_latlong(coordinates[i][0], coordinates[i][1], height, width)
-    out[i] = pyramid.sample_pyramid(levels, d, level, height, width)
+    at = latlong_from_direction(d, height, width)
+    last = pyramid.last_mip(height, width)
+    out[i] = pyramid.sample_mips(
+        levels, at[0] / wp.float32(height), at[1] / wp.float32(width), level, last, height, width
+    )
 
 
 @wp.kernel(enable_backward=False)
