@@ -117,6 +117,7 @@ class Pipeline(Closing):
         follows_camera: bool | None = None,
         culling: bool = True,
         linear: bool = False,
+        real_time: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -142,6 +143,8 @@ class Pipeline(Closing):
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
             linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. The mirror ball is
                 read, and the plate among the layers kept, at that depth; markers and surfaces are seen in 8 bits.
+            real_time: Whether no frame waits for light that is estimated beside the frames, by a process of its own: it
+                takes effect when it is there, so pictures of two runs may differ for some frames. For live cameras.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -164,7 +167,8 @@ class Pipeline(Closing):
         """Which exposures are merged, and which is shown."""
         ratios = self.bracket.ratios
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
-        request = Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters, linear)
+        ways = {"synchronous": synchronous, "emitters": emitters, "linear": linear, "real_time": real_time}
+        request = Request(self.scene, self.quality, self.size, outputs, ratios, **ways)
         self.plan = make_plan(request)
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
