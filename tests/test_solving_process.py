@@ -154,6 +154,7 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
         return solver, solve_by(solver, sides, trace)
 
     monkeypatch.setattr(recover.POOL, "solve", slow)
+    monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
     with (
         Pipeline(scene, device="cpu") as usual,
         Pipeline(scene, device="cpu", real_time=True) as live,

@@ -238,6 +238,7 @@ def serve() -> None:
         write_message(target, "ready")
         while True:
             solver, sides, traced = read_message(source)
+            answer: tuple[str, Any]
             try:
                 answer = "solved", (solver, solve_by(solver, sides, trace if traced else None))
             except (EOFError, OSError):
