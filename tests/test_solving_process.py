@@ -10,9 +10,11 @@ import time
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from warp_ar import Pipeline
 from warp_ar.input.sources import open_source
+from warp_ar.light.solver import ONE_BLAS_THREAD
 from warp_ar.light.solving_process import SolvingPool, SolvingProcess, read_message, solve_by, write_message
 from warp_ar.scene import load_scene
 from warp_ar.stages import recover
@@ -172,3 +174,26 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
         live(frames[-1].image, time_seconds=frames[-1].time + 0.05)
         assert stage._progress.pending is None or stage._progress.pending is not pending
         assert stage._progress.took > 0.0
+
+
+def test_every_thread_solves_with_one_thread_of_blas():
+    """Whichever thread asks first, whichever leaves last: sums in another order would be another picture."""
+    before = [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"]
+    seen: list[list[int]] = []
+    barrier = threading.Barrier(3)
+
+    def solve(alone: bool) -> None:
+        with ONE_BLAS_THREAD:
+            if not alone:
+                barrier.wait(30.0)
+            seen.append([entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"])
+
+    for alone in (True, True, False):
+        threads = [threading.Thread(target=solve, args=(alone,)) for _ in range(1 if alone else 3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
+    assert len(seen) == 5
+    assert all(entry == [1] * len(before) for entry in seen)
+    assert [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"] == before
