@@ -164,7 +164,12 @@ class Session(Closing):
             check_linear(str(target.scene.camera.transfer))
         source.keeps_depth = linear
         self._switcher = PipelineSwitcher(
-            device=device, keep=1, profile=False, synchronous=not source.live, linear=linear
+            device=device,
+            keep=1,
+            profile=False,
+            synchronous=not source.live,
+            linear=linear,
+            real_time=source.live,
         )
         return self._switcher.open(target)
 

@@ -134,6 +134,7 @@ class Pipeline(Closing):
         follows_camera: bool | None = None,
         culling: bool = True,
         linear: bool = False,
+        real_time: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -159,6 +160,8 @@ class Pipeline(Closing):
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
             linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. The mirror ball is
                 read, and the plate among the layers kept, at that depth; markers and surfaces are seen in 8 bits.
+            real_time: Whether no frame waits for light that is estimated beside the frames, by a process of its own: it
+                takes effect when it is there, so pictures of two runs may differ for some frames. For live cameras.
 
         Raises:
             UsageError: An argument that cannot be used.
@@ -173,7 +176,7 @@ class Pipeline(Closing):
         self.size = (self.camera.width, self.camera.height)
         self.bracket = plan_bracket(exposures, shown)
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
-        form = outputs, self.bracket.ratios, synchronous, emitters, linear
+        form = outputs, self.bracket.ratios, synchronous, emitters, linear, real_time
         self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
         with translating(self.device), wp.ScopedDevice(self.device):
             self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)

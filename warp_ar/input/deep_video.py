@@ -48,7 +48,8 @@ def depth_of(context: Any) -> str:
     Args:
         context: PyAV's, of the stream's codec.
     """
-    bits = 0 if context.format is None else context.format.components[0].bits
+    components = () if context.format is None else context.format.components
+    bits = components[0].bits if components else 0  # pictures that stay on a decoding unit say nothing of theirs
     if not 8 <= bits <= 16:
         return ""  # floats, and what has no picture yet
     if context.color_trc in (ColorTrc.SMPTE2084, ColorTrc.ARIB_STD_B67):

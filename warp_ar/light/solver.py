@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ class OneBlasThread:
     """NumPy's BLAS on one thread: products here take microseconds, and waking threads for them more.
 
     The number belongs to the process. Where several solvers are at work the first sets it, the last sets it back.
+    ``threadpoolctl`` lets only that thread change it which changed it first, so one thread does it for all.
     """
 
     def __init__(self) -> None:
@@ -26,17 +28,28 @@ class OneBlasThread:
         """What finds the libraries; to look for them takes as long as four fits."""
         return ThreadpoolController()
 
+    @functools.cached_property
+    def _setter(self) -> ThreadPoolExecutor:
+        return ThreadPoolExecutor(1, "warp_ar-blas")
+
+    def _set(self) -> None:
+        self._limit = self._controller.limit(limits=1, user_api="blas")
+        self._limit.__enter__()
+
+    def _reset(self) -> None:
+        self._limit.__exit__(None, None, None)
+
     def __enter__(self) -> None:
         with self._lock:
             if self._inside == 0:
-                self._limit = self._controller.limit(limits=1, user_api="blas")
+                self._setter.submit(self._set).result()
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                self._limit.restore_original_limits()
+                self._setter.submit(self._reset).result()
 
 
 ONE_BLAS_THREAD = OneBlasThread()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, ClassVar
@@ -18,6 +19,7 @@ from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
+from warp_ar.light.solving_process import POOL, solve_by
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
@@ -33,7 +35,9 @@ emitter."""
 LATENCY = 0.1
 """Seconds, by the frames' clock, after which an estimate takes effect, unless the request is to wait for it: it is
 solved for beside them. They are fixed, so that the same frames give the same pictures; where it is not solved for in
-time, the frame waits."""
+time, the frame waits, unless the request is for real time."""
+REST = 3.0
+"""In real time: time between two estimates, over that which the last one took, at least."""
 MOST_EMITTERS = CONFIG.search.candidates * len(CONFIG.search.distances)
 
 
@@ -44,8 +48,10 @@ class _Progress:
     solver: recovery.Recovery
     estimate: recovery.Estimate | None = None
     """The one that took effect last."""
-    pending: Future[_Solution | None] | None = None
-    """The one that is being solved for; it becomes None where the last still holds."""
+    pending: Future[_Solved] | None = None
+    """The one that is being solved for."""
+    took: float = 0.0
+    """Seconds of the last one."""
     frames: int = 0
     waited: int = 0
     """Frames since the last estimate was begun."""
@@ -62,6 +68,16 @@ class _Solution:
     estimate: recovery.Estimate
     cells: npt.NDArray[Any]
     """What it was estimated from: records of ``Cell``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Solved:
+    solution: _Solution | None
+    """None where the last still holds."""
+    solver: recovery.Recovery
+    """With what it learnt."""
+    seconds: float
+    """What it took."""
 
 
 class Recover(Stage):
@@ -244,7 +260,13 @@ class Recover(Stage):
         rested, now.rested = now.rested, False
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
-        self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and (rested or now.waited >= EVERY_FRAME))
+        interval = EVERY_SECONDS
+        if self.request.real_time:
+            self._arrives = self._arrives and now.pending is not None and now.pending.done()
+            interval = max(interval, (1.0 + REST) * now.took)
+        self._asks = now.frames <= EVERY_FRAME or (since > interval and (rested or now.waited >= EVERY_FRAME))
+        if self.request.real_time and now.pending is not None and not self._arrives:
+            self._asks = False
         if self._asks:
             now.waited, now.last = 0, seconds
 
@@ -260,7 +282,10 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.gain = self._arrays["gain"]()
-        now.pending = self._worker.submit(self._solve, now.solver)
+        if self.request.real_time:
+            POOL.prepare()
+        aside = self.request.real_time and not self._at_once()
+        now.pending = self._worker.submit(self._solve, now.solver, aside)
         if self._at_once():
             self._take(None)
 
@@ -268,21 +293,26 @@ class Recover(Stage):
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
         return self.request.synchronous or self._progress.frames <= EVERY_FRAME
 
-    def _solve(self, solver: recovery.Recovery) -> _Solution | None:
-        """In the worker. Nothing writes the equations before this is done: it takes effect before the next begins."""
-        sides = self._equations.fetched()
+    def _solve(self, solver: recovery.Recovery, aside: bool) -> _Solved:
+        """In the worker, or, if ``aside``, in a process beside it.
+
+        Nothing writes the equations before this is done: it takes effect before the next begins.
+        """
+        begin, sides = time.perf_counter(), self._equations.fetched()
         cells = sides["recover_cells_now"]
-        if solver.rests(cells, sides["recover_observations"]):
-            return None
-        estimate = solver.update(
+        given = (
             cells,
             sides["recover_transfer"],
             sides["recover_mirrored"],
             sides["recover_observations"],
-            self._trace,
             sides["params"]["camera_position"][0].astype(float),
         )
-        return _Solution(estimate, cells)
+        if aside:
+            solver, estimate = POOL.solve(solver, given, self._trace)
+        else:
+            estimate = solve_by(solver, given, self._trace)
+        solution = None if estimate is None else _Solution(estimate, cells)
+        return _Solved(solution, solver, time.perf_counter() - begin)
 
     def _trace(self, emitters: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """Irradiance from emitters, (n, q); in the worker."""
@@ -310,7 +340,9 @@ class Recover(Stage):
         """Let what was solved for take effect."""
         now = self._progress
         assert now.pending is not None
-        solution, now.pending = now.pending.result(), None
+        solved, now.pending = now.pending.result(), None
+        now.solver, now.took = solved.solver, solved.seconds
+        solution = solved.solution
         self._news = solution is not None
         if solution is None:
             return

@@ -64,6 +64,9 @@ class Request:
     """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
     linear: bool = False
     """Whether frames come as linear radiance too, of more than 8 bits."""
+    real_time: bool = False
+    """Whether no frame waits for what is estimated beside it, however long that takes: pictures of two runs may
+    differ by when it takes effect."""
 
     @property
     def resources(self) -> tuple[str, ...]:

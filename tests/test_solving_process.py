@@ -1,0 +1,199 @@
+"""Estimates in a process of their own: the same as here, and a process that dies costs nothing but time."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import pickle
+import threading
+import time
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from warp_ar import Pipeline
+from warp_ar.input.sources import open_source
+from warp_ar.light.solver import ONE_BLAS_THREAD
+from warp_ar.light.solving_process import SolvingPool, SolvingProcess, read_message, solve_by, write_message
+from warp_ar.scene import load_scene
+from warp_ar.stages import recover
+
+
+class Doubler:
+    """Solves by doubling what it is given and what it traces; counts how often."""
+
+    def __init__(self, fails: bool = False) -> None:
+        self.count, self.fails = 0, fails
+
+    def rests(self, cells, observations) -> bool:
+        return bool(observations.sum() == 0.0)
+
+    def update(self, cells, transfer, mirrored, observations, trace, camera):
+        if self.fails:
+            raise ValueError("no solution")
+        self.count += 1
+        return 2.0 * cells + trace(camera), self.count
+
+
+def sides(observed: float = 1.0):
+    return np.arange(4.0), np.ones((3, 200_000), np.float32), np.zeros(0), np.full(2, observed), np.array([1.0, 2, 3])
+
+
+def trace(emitters):
+    return float(emitters.sum())
+
+
+@pytest.fixture
+def process():
+    found = SolvingProcess()
+    deadline = time.monotonic() + 60.0
+    while not found.ready and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert found.ready
+    yield found
+    found.close()
+
+
+def test_messages_hold_values_and_arrays():
+    values = {"a": np.arange(12.0).reshape(3, 4), "b": ("text", None), "c": np.zeros((0, 3))}
+    stream = io.BytesIO()
+    write_message(stream, values)
+    stream.seek(0)
+    found = read_message(stream)
+    np.testing.assert_array_equal(found["a"], values["a"])
+    assert found["b"] == values["b"]
+    assert found["c"].shape == (0, 3)
+    assert found["a"].flags.writeable
+    with pytest.raises(EOFError):
+        read_message(stream)
+
+
+def test_process_solves_traces_by_the_caller_and_learns(process):
+    solver = Doubler()
+    for count in (1, 2, 3):
+        solver, (values, said) = process.solve(solver, sides(), trace)
+        np.testing.assert_array_equal(values, 2.0 * np.arange(4.0) + 6.0)
+        assert said == count == solver.count
+    solver, nothing = process.solve(solver, sides(0.0), trace)
+    assert nothing is None
+    assert solver.count == 3
+
+
+def test_errors_come_back_and_the_process_goes_on(process):
+    with pytest.raises(ValueError, match="no solution"):
+        process.solve(Doubler(fails=True), sides(), trace)
+    assert process.solve(Doubler(), sides(), trace)[1][1] == 1
+
+
+def test_pool_solves_here_until_a_process_is_ready_and_when_it_dies():
+    pool = SolvingPool(1)
+    try:
+        solver = Doubler()
+        solved, _ = pool.solve(solver, sides(), trace)
+        assert solved is solver  # nothing could be ready at once
+        deadline = time.monotonic() + 60.0
+        while solved is solver and time.monotonic() < deadline:
+            solved, _ = pool.solve(solver, sides(), trace)
+        assert solved is not solver
+        pool._all[0]._process.kill()
+        pool._all[0]._process.wait()
+        again, (_, count) = pool.solve(solved, sides(), trace)
+        assert again is solved
+        assert count == solved.count
+        assert not pool._all
+    finally:
+        pool.close()
+    assert pool.solve(Doubler(), sides(), trace)[1][1] == 1
+
+
+def test_estimates_of_a_process_are_those_made_here(process, monkeypatch):
+    """Of `desk`: the same equations, solved in both, to the bit; and frames that do not wait show them in the end."""
+    given = []
+
+    def noting(solver, sides, trace):
+        kept = pickle.dumps((solver, sides), 5)
+        traced = []
+
+        def listening(emitters):
+            traced.append((emitters.copy(), trace(emitters)))
+            return traced[-1][1]
+
+        found = solve_by(solver, sides, listening)
+        given.append((kept, traced, found))
+        return found
+
+    monkeypatch.setattr(recover, "solve_by", noting)
+    scene = load_scene("desk")
+    with open_source(scene.source.path) as source, Pipeline(scene, device="cpu") as pipeline:
+        for frame in itertools.islice(source, 2):
+            pipeline(frame.image, time_seconds=frame.time)
+    assert len(given) == 2
+    for kept, traced, found in given:
+        answers = iter(traced)
+
+        def replay(emitters, answers=answers):
+            asked, answer = next(answers)
+            np.testing.assert_array_equal(emitters, asked)
+            return answer
+
+        _, solved = process.solve(*pickle.loads(kept), replay)
+        np.testing.assert_array_equal(solved.recovered, found.recovered)
+        assert solved.method == found.method
+        assert solved.factor == found.factor
+        assert len(solved.emitters) == len(found.emitters)
+
+
+def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
+    """The first frames wait in both ways; then none waits for a solution that never comes, and none is lost."""
+    scene = load_scene("desk")
+    with open_source(scene.source.path) as source:
+        frames = list(itertools.islice(source, 12))
+    held = threading.Event()
+
+    def slow(solver, sides, trace):
+        assert held.wait(60.0)
+        return solver, solve_by(solver, sides, trace)
+
+    monkeypatch.setattr(recover.POOL, "solve", slow)
+    monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
+    with (
+        Pipeline(scene, device="cpu") as usual,
+        Pipeline(scene, device="cpu", real_time=True) as live,
+    ):
+        for frame in frames[: recover.EVERY_FRAME]:
+            expected = usual(frame.image, time_seconds=frame.time).image
+            np.testing.assert_array_equal(live(frame.image, time_seconds=frame.time).image, expected)
+        stage = live.scheduler.stage("recover")
+        for frame in frames[recover.EVERY_FRAME :]:
+            live(frame.image, time_seconds=frame.time)  # the estimate is held: this returns all the same
+        assert stage._progress.pending is not None
+        pending = stage._progress.pending
+        held.set()
+        pending.result(60.0)
+        live(frames[-1].image, time_seconds=frames[-1].time + 0.05)
+        assert stage._progress.pending is None or stage._progress.pending is not pending
+        assert stage._progress.took > 0.0
+
+
+def test_every_thread_solves_with_one_thread_of_blas():
+    """Whichever thread asks first, whichever leaves last: sums in another order would be another picture."""
+    before = [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"]
+    seen: list[list[int]] = []
+    barrier = threading.Barrier(3)
+
+    def solve(alone: bool) -> None:
+        with ONE_BLAS_THREAD:
+            if not alone:
+                barrier.wait(30.0)
+            seen.append([entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"])
+
+    for alone in (True, True, False):
+        threads = [threading.Thread(target=solve, args=(alone,)) for _ in range(1 if alone else 3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60.0)
+    assert len(seen) == 5
+    assert all(entry == [1] * len(before) for entry in seen)
+    assert [entry["num_threads"] for entry in threadpool_info() if entry["user_api"] == "blas"] == before
