@@ -73,11 +73,30 @@ def with_light(scene: Scene, light: str | Path) -> Scene:
     return dataclasses.replace(scene, captured=dataclasses.replace(spec, file=Path(light).resolve()))
 
 
+def _chosen_scene(
+    scene: Scene | str | Path, source: str | int | Path | None, calibration: str | Path | None, light: str | Path | None
+) -> Scene:
+    """The scene with the camera and the light that are given instead of its own."""
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    if calibration is not None:
+        scene = calibrated(scene, calibration, source)
+    return scene if light is None else with_light(scene, light)
+
+
 class Session(Closing):
     """Opens a scene's source and lights its frames one after another.
 
     Iterating gives ``(frame, result)`` pairs. Use it in a ``with`` statement, so that devices and threads are let go.
     """
+
+    ahead = True
+    """Whether frames may be begun before the one ahead of them is handed out, where that is possible."""
+    decode_ms = 0.0
+    """Milliseconds that the source took for its last frame."""
+    ball_fits: tuple[BallFit | None, ...] = ()
+    """Where ``refine_ball`` found the mirror balls; None for one that it did not find."""
+    bracket_notes: tuple[str, ...] = ()
+    """What of the source's exposures is not merged, and why, one line each."""
 
     def __init__(
         self,
@@ -114,37 +133,24 @@ class Session(Closing):
             SourceError: The source cannot be opened.
             UsageError: Any other argument cannot be used.
         """
-        self.scene = scene if isinstance(scene, Scene) else load_scene(scene)
-        if calibration is not None:
-            self.scene = calibrated(self.scene, calibration, source)
-        if light is not None:
-            self.scene = with_light(self.scene, light)
+        self.scene = _chosen_scene(scene, source, calibration, light)
         if budget_ms is not None and quality != AUTO:
             raise UsageError(f"a budget of {budget_ms:g} ms needs the quality {AUTO!r}, not {quality!r}")
+        shown = self.scene.source.shown if source is None and self.scene.source is not None else None
         self.source: Source = _open_source(self.scene, source, loop)
-        self.ahead = True
-        """Whether frames may be begun before the one ahead of them is handed out, where that is possible."""
-        self.decode_ms = 0.0
-        """Milliseconds that the source took for its last frame."""
-        self.ball_fits: tuple[BallFit | None, ...] = ()
         self.pipeline: Pipeline | AutoPipeline
         self._switcher: PipelineSwitcher | None = None
-        own = self.scene.source if source is None else None
-        self.bracket_notes: tuple[str, ...] = ()
-        """What of the source's exposures is not merged, and why, one line each."""
-        shown = own.shown if own is not None else None
         try:
             if refine_ball:
                 self.scene, self.ball_fits = refine_balls(self.scene, self.source)
             size, exposures = self.source.size, self.source.exposures
             self.bracket_notes = plan_bracket(exposures, shown).notes
+            given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
-                given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
                 self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
             else:
-                target = Target(self.scene, resolve_quality(quality), size, outputs, exposures, shown)
-                self.pipeline = self._open(target, device)
+                self.pipeline = self._open(Target(self.scene, resolve_quality(quality), **given), device)
         except BaseException:
             self.source.close()
             raise

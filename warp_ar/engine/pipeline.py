@@ -30,14 +30,14 @@ from warp_ar.engine.scheduler import Scheduler, StageTiming
 from warp_ar.engine.short_frames import ShortFrames
 from warp_ar.engine.transfer import Image
 from warp_ar.errors import UsageError
-from warp_ar.input.exposures import brightened, find_exposure, plan_bracket
+from warp_ar.input.exposures import BracketPlan, brightened, find_exposure, plan_bracket
 from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.finite import check_finite
-from warp_ar.scene.ray_scene import skeleton
+from warp_ar.scene.kinds import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
@@ -94,11 +94,28 @@ def _read_scene(scene: object) -> Scene:
     return scene
 
 
+def _check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
+    """The outputs, expanded, of frames that can be lit.
+
+    Raises:
+        UsageError: An exposure is none, an output is unknown, or frames of several exposures are linear.
+    """
+    for exposure in exposures:
+        _check_number("exposures", exposure, above=0.0)
+    check_outputs(outputs)
+    if linear and exposures:
+        raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
+    return expand_outputs(outputs)
+
+
 class Pipeline(Closing):
     """Lights frames: call it with one frame after another of one camera.
 
     Arrays are allocated here, never while frames run.
     """
+
+    bracket: BracketPlan
+    """Which exposures are merged, and which is shown."""
 
     def __init__(
         self,
@@ -148,24 +165,28 @@ class Pipeline(Closing):
             SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
         scene = _read_scene(scene)
-        for exposure in exposures:
-            _check_number("exposures", exposure, above=0.0)
-        check_outputs(outputs)
-        outputs = expand_outputs(outputs)
-        if linear and exposures:
-            raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
+        outputs = _check_frames(exposures, outputs, linear)
         self._closed, self._process = False, os.getpid()
-        self.device = resolve_device(device)
+        self.device, self.quality = resolve_device(device), resolve_quality(quality)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
         self.scene = dataclasses.replace(scene, camera=self.camera)
         self.size = (self.camera.width, self.camera.height)
-        self.quality = resolve_quality(quality)
         self.bracket = plan_bracket(exposures, shown)
-        """Which exposures are merged, and which is shown."""
-        ratios = self.bracket.ratios
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
-        request = Request(self.scene, self.quality, self.size, outputs, ratios, synchronous, emitters, linear)
-        self.plan = make_plan(request)
+        form = outputs, self.bracket.ratios, synchronous, emitters, linear
+        self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
+        with translating(self.device), wp.ScopedDevice(self.device):
+            self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)
+
+    def _follows_gain(self, follows_camera: bool | None, exposures: Sequence[float]) -> bool:
+        """Whether a drift of the camera's gain is followed."""
+        if follows_camera is None:
+            follows_camera = self.scene.source is not None and self.scene.source.metering == "automatic"
+        # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
+        return follows_camera and self.quality.method("recover") != "clipped" and not exposures
+
+    def _start_over(self) -> None:
+        """What frames leave behind for the next one: nothing as yet."""
         tracked = self.plan.needs("pose") and self.scene.pose is None
         self._tracker = Tracker(self.scene.marker, self.camera) if tracked else None
         self._own_markers = OwnMarkers(self.scene, self.camera)
@@ -175,30 +196,20 @@ class Pipeline(Closing):
         self._lit_time = 0.0
         self._index = 0
         self._shown: Any = None
-        self._borrowed = Borrowed(self.device)
-        self._arrays = Arrays()
-        self._light = CarriedLight(self._arrays, wanted="environment" in outputs)
-        self._short: ShortFrames | None = None
         self._renderer: ThreadPoolExecutor | None = None
         self._ahead: collections.deque[Future[Rendered]] = collections.deque()
-        with translating(self.device), wp.ScopedDevice(self.device):
-            # Frames of several exposures tell their gain themselves; the paper takes all as the camera saw it.
-            if follows_camera is None:
-                follows_camera = scene.source is not None and scene.source.metering == "automatic"
-            follows = follows_camera and self.quality.method("recover") != "clipped" and not exposures
-            self.inputs = FrameInputs(
-                self.scene,
-                self.camera,
-                self._arrays,
-                self.device,
-                follows_gain=follows,
-                linear=self.plan.needs("linear_frame"),
-            )
-            self._scheduler = Scheduler(
-                self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling
-            )
-            if self.plan.needs("short_frames"):
-                self._short = ShortFrames(self.plan.features, self._arrays, self.device)
+
+    def _build(self, follows: bool, *, bands: int | None, profile: bool, culling: bool) -> None:
+        """Allocate what the plan calls for, and wire its stages."""
+        self._start_over()
+        self._borrowed = Borrowed(self.device)
+        self._arrays = Arrays()
+        self._light = CarriedLight(self._arrays, wanted="environment" in self.plan.request.outputs)
+        deep = self.plan.needs("linear_frame")
+        self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows, linear=deep)
+        self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling)
+        short = self.plan.needs("short_frames")
+        self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None
 
     def close(self) -> None:
         """Stop the worker threads; arrays go when the last result that refers to them does."""

@@ -35,65 +35,85 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
     Returns:
         The text. A camera read from a calibration file is written as its numbers.
     """
-    base = None if folder is None else Path(folder).resolve()
+    writer = _Writer(None if folder is None else Path(folder).resolve())
+    lines = [f"schema = {scene.schema}", f"name = {writer.value(scene.name)}"]
+    lines += [*writer.frames(scene), *writer.physical(scene), *writer.virtual(scene)]
+    lines += ["", "[exposure]", *writer.table(scene.exposure, ("scale",))]
+    return "\n".join(lines) + "\n"
 
-    def value(item: Any) -> str:
-        return _value(item, base)
 
-    def table(item: Any, keys: Iterable[str]) -> list[str]:
+class _Writer:
+    """Lines of a scene file, section by section."""
+
+    def __init__(self, base: Path | None) -> None:
+        self.base = base
+
+    def value(self, item: Any) -> str:
+        return _value(item, self.base)
+
+    def table(self, item: Any, keys: Iterable[str]) -> list[str]:
         """Lines of the keys that have a value."""
         entries = ((key, getattr(item, key)) for key in keys)
-        return [f"{key} = {value(entry)}" for key, entry in entries if entry is not None]
+        return [f"{key} = {self.value(entry)}" for key, entry in entries if entry is not None]
 
-    def animation(item: Object | Light) -> list[str]:
+    def animation(self, item: Object | Light) -> list[str]:
         if item.animate is None:
             return []
         fields = {key: getattr(item.animate, key) for key in keys_of(Animation)}
-        return [f"animate = {value({key: entry for key, entry in fields.items() if entry is not None})}"]
+        return [f"animate = {self.value({key: entry for key, entry in fields.items() if entry is not None})}"]
 
-    def own_marker(item: Object | Light | Proxy | Probe) -> list[str]:
+    def own_marker(self, item: Object | Light | Proxy | Probe) -> list[str]:
         if item.marker is None:
             return []
         own = item.marker
         fields = {"id": own.id, "size": own.size} if own.board is None else {"board": own.board}
-        return [f"marker = {value({'dictionary': own.dictionary, **fields})}"]
+        return [f"marker = {self.value({'dictionary': own.dictionary, **fields})}"]
 
-    lines = [f"schema = {scene.schema}", f"name = {value(scene.name)}"]
-    guessed = scene.camera.field_of_view is not None
-    lines += ["", "[camera]", *table(scene.camera, (*(("field_of_view",) if guessed else INTRINSICS), "transfer"))]
-    if scene.source is not None:
-        lines += ["", "[source]", *table(scene.source, keys_of(SourceSpec))]
-    keys = ("dictionary", "id", "size", "white") if scene.marker.board is None else ("dictionary", "board", "white")
-    if scene.has_marker:
-        lines += ["", "[marker]", *table(scene.marker, keys)]
-    if scene.pose is not None:
-        lines += ["", "[pose]", *_pose_lines(scene.pose, value)]
-    for probe in scene.probes:
-        lines += ["", "[[probe]]", *table(probe, ("center", "radius", "reflectance")), *own_marker(probe)]
-    for proxy in scene.proxies:
-        lines += ["", "[[proxy]]", *table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
-        lines += own_marker(proxy)
-        if proxy.material is not None:
-            lines += ["", "[proxy.material]", *table(proxy.material, keys_of(ProxyMaterial))]
-    for item in scene.objects:
-        if item.mesh is not None:
-            raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
-        model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
-        lines += ["", "[[object]]", *table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
-        lines += [*animation(item), *own_marker(item)]
-        lines += [
-            "",
-            "[object.material]",
-            f"model = {value(model)}",
-            *table(item.material, keys_of(type(item.material))),
-        ]
-    for light in scene.lights:
-        lines += ["", "[[light]]", *table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
-        lines += [*animation(light), *own_marker(light)]
-    if scene.captured is not None:
-        lines += ["", "[[light]]", *table(scene.captured, keys_of(CapturedLight))]
-    lines += ["", "[exposure]", *table(scene.exposure, ("scale",))]
-    return "\n".join(lines) + "\n"
+    def frames(self, scene: Scene) -> list[str]:
+        """Camera, source, marker and pose."""
+        guessed = scene.camera.field_of_view is not None
+        own = ("field_of_view",) if guessed else INTRINSICS
+        lines = ["", "[camera]", *self.table(scene.camera, (*own, "transfer"))]
+        if scene.source is not None:
+            lines += ["", "[source]", *self.table(scene.source, keys_of(SourceSpec))]
+        keys: tuple[str, ...] = ("dictionary", "id", "size", "white")
+        if scene.marker.board is not None:
+            keys = ("dictionary", "board", "white")
+        if scene.has_marker:
+            lines += ["", "[marker]", *self.table(scene.marker, keys)]
+        if scene.pose is not None:
+            lines += ["", "[pose]", *_pose_lines(scene.pose, self.value)]
+        return lines
+
+    def physical(self, scene: Scene) -> list[str]:
+        """Mirror balls and proxies."""
+        lines: list[str] = []
+        for probe in scene.probes:
+            lines += ["", "[[probe]]", *self.table(probe, ("center", "radius", "reflectance")), *self.own_marker(probe)]
+        for proxy in scene.proxies:
+            lines += ["", "[[proxy]]", *self.table(proxy, ("shape", "at", "rotate", *PROXY_KEYS[proxy.shape]))]
+            lines += self.own_marker(proxy)
+            if proxy.material is not None:
+                lines += ["", "[proxy.material]", *self.table(proxy.material, keys_of(ProxyMaterial))]
+        return lines
+
+    def virtual(self, scene: Scene) -> list[str]:
+        """Objects and lights, the captured one last."""
+        lines: list[str] = []
+        for item in scene.objects:
+            if item.mesh is not None:
+                raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
+            model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
+            lines += ["", "[[object]]", *self.table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
+            lines += [*self.animation(item), *self.own_marker(item)]
+            keys = keys_of(type(item.material))
+            lines += ["", "[object.material]", f"model = {self.value(model)}", *self.table(item.material, keys)]
+        for light in scene.lights:
+            lines += ["", "[[light]]", *self.table(light, ("kind", *LIGHT_KEYS[light.kind], "color", "intensity"))]
+            lines += [*self.animation(light), *self.own_marker(light)]
+        if scene.captured is not None:
+            lines += ["", "[[light]]", *self.table(scene.captured, keys_of(CapturedLight))]
+        return lines
 
 
 def _value(item: Any, base: Path | None) -> str:

@@ -12,7 +12,6 @@ import contextlib
 import dataclasses
 import functools
 import hmac
-import importlib.resources
 import json
 import socket
 import threading
@@ -30,9 +29,9 @@ from warp_ar.scene import bundled_scenes
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import protocol
 from warp_ar.viewer.address import LOOPBACK, Address, listen
-from warp_ar.viewer.dropped import MOST_BYTES
 from warp_ar.viewer.encoding import encode_jpeg, encode_light
 from warp_ar.viewer.gate import HEADER_SECONDS, Gate
+from warp_ar.viewer.page_files import PageFiles
 from warp_ar.viewer.shared_light import SharedLight
 
 if TYPE_CHECKING:
@@ -53,18 +52,10 @@ MESSAGES_PER_SECOND: Final = 240.0
 CONNECTIONS_PER_SECOND: Final = 50.0
 """From one address; each takes about a millisecond."""
 _MOST_ADDRESSES: Final = 256
-DROP_SECONDS: Final = 60.0
-"""How long a dropped file may be on its way."""
 BYTES_PER_SECOND: Final = 8e6
 """Thirty pictures a second of a camera at 1920x1080."""
 LARGEST_MESSAGE: Final = protocol.MAX_PICTURE + 64
 
-_TYPES: Final = {
-    "html": "text/html; charset=utf-8",
-    "css": "text/css; charset=utf-8",
-    "js": "text/javascript; charset=utf-8",
-    "svg": "image/svg+xml",
-}
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:; "
     "media-src 'self' blob:; connect-src 'self' ws: wss:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -127,15 +118,11 @@ class Server:
         self._arrivals: dict[str, protocol.Bucket] = {}
         self._waiting = 0
         self._encode_ms = 0.0
-        self._taking = False
         self._encoder = ThreadPoolExecutor(1, "warp-ar-encode")
         self._hands = ThreadPoolExecutor(2, "warp-ar-page")
         self._ending = False
         self.failed: BaseException | None = None
         """What ended the frames, if it was an error."""
-        # Read once: no request's path ever becomes a file's.
-        folder = importlib.resources.files("warp_ar.viewer") / "static"
-        self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
         self._make_host = make_host
         self._host: Host | None = None
         self._starting: asyncio.Future[Host] | None = None
@@ -143,17 +130,10 @@ class Server:
         """Whether all threads of the frames have ended; False when ``serve`` was not to wait for them."""
         self.gate = Gate(own_headers(), header_seconds=header_seconds)
         self.app = web.Application(client_max_size=1024, middlewares=[self._guard])
+        PageFiles(self)
         SharedLight(self)
         self.app.on_response_prepare.append(self._add_headers)
-        self.app.add_routes(
-            [
-                web.get("/", self._page),
-                web.get("/static/{name}", self._file),
-                web.get("/download/{name}", self._download),
-                web.get("/live", self._live),
-                web.post("/drop/{name}", self._drop_file),
-            ]
-        )
+        self.app.add_routes([web.get("/live", self._live)])
 
     # ------------------------------------------------------------------------------------------------------- admission
 
@@ -199,68 +179,6 @@ class Server:
         if origin in self.address.origins and request.path.startswith("/light"):
             allowed = {"Access-Control-Allow-Origin": str(origin), "Vary": "Origin"}
             response.headers.update({**allowed, "Cross-Origin-Resource-Policy": "cross-origin"})
-
-    # ------------------------------------------------------------------------------------------------------------ files
-
-    async def _page(self, request: web.Request) -> web.Response:
-        return web.Response(body=self._static["index.html"], headers={"Content-Type": _TYPES["html"]})
-
-    async def _file(self, request: web.Request) -> web.Response:
-        name = request.match_info["name"]
-        if name not in self._static:
-            raise web.HTTPNotFound(text="no such file\n")
-        return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
-
-    async def _download(self, request: web.Request) -> web.Response:
-        host = await self._started()
-        makers: dict[str, tuple[str, Callable[[], bytes]]] = {
-            "frame.png": ("image/png", host.snapshot),
-            "environment.exr": ("image/x-exr", host.environment_exr),
-            "scene.toml": ("application/toml", lambda: host.scene_toml(full_paths=self.address.loopback).encode()),
-            "scene.zip": ("application/zip", host.scene_bundle),
-            "recording.mp4": ("video/mp4", host.recording),
-            "camera.yml": ("application/yaml", host.camera_file),
-            "response.txt": ("text/plain", host.response_file),
-            "card-a4.pdf": ("application/pdf", lambda: host.card("a4")),
-            "card-letter.pdf": ("application/pdf", lambda: host.card("letter")),
-        }
-        name = request.match_info["name"]
-        if name not in makers:
-            raise web.HTTPNotFound(text="no such download\n")
-        kind, make = makers[name]
-        try:
-            body = await self._aside(make)
-        except WarpArError as error:
-            raise web.HTTPConflict(text=f"{error}\n") from error
-        headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
-        return web.Response(body=body, headers=headers)
-
-    async def _drop_file(self, request: web.Request) -> web.Response:
-        """Take a file that was dropped onto the picture; its answer says in words what became of it."""
-        host = await self._started()
-        name = request.match_info["name"]
-        if self._taking:
-            return web.Response(status=429, text="another file is being taken: wait until it is there\n")
-        self._taking = True
-        try:
-            # Its own bound, for all other requests have none worth the name; and not for ever.
-            async with asyncio.timeout(DROP_SECONDS):
-                parts, size = [], 0
-                async for part in request.content.iter_chunked(1 << 16):
-                    size += len(part)
-                    if size > MOST_BYTES:
-                        refused = web.Response(status=413, text=f"{size:,} bytes and more; {MOST_BYTES:,} are taken\n")
-                        refused.force_close()
-                        return refused
-                    parts.append(part)
-            words = await self._aside(host.drop, name, b"".join(parts))
-        except TimeoutError:
-            return web.Response(status=408, text="the file took too long\n")
-        except WarpArError as error:
-            return web.Response(status=422, text=f"{error}\n")
-        finally:
-            self._taking = False
-        return web.Response(text=f"{words}\n")
 
     # ---------------------------------------------------------------------------------------------------------- frames
 

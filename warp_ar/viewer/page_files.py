@@ -1,0 +1,108 @@
+"""Files of the page's server: the page itself, what can be downloaded from it, and what is dropped onto it."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.resources
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from aiohttp import web
+
+from warp_ar.errors import WarpArError
+from warp_ar.viewer.dropped import MOST_BYTES
+
+if TYPE_CHECKING:
+    from warp_ar.viewer.server import Server
+
+DROP_SECONDS: Final = 60.0
+"""How long a dropped file may be on its way."""
+_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+
+
+class PageFiles:
+    """The routes of one server."""
+
+    def __init__(self, server: Server) -> None:
+        """Add them to the server's application."""
+        self._server = server
+        self._taking = False
+        # Read once: no request's path ever becomes a file's.
+        folder = importlib.resources.files("warp_ar.viewer") / "static"
+        self._static = {item.name: item.read_bytes() for item in folder.iterdir() if item.name.split(".")[-1] in _TYPES}
+        server.app.add_routes(
+            [
+                web.get("/", self._page),
+                web.get("/static/{name}", self._file),
+                web.get("/download/{name}", self._download),
+                web.post("/drop/{name}", self._drop_file),
+            ]
+        )
+
+    async def _page(self, request: web.Request) -> web.Response:
+        return web.Response(body=self._static["index.html"], headers={"Content-Type": _TYPES["html"]})
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name = request.match_info["name"]
+        if name not in self._static:
+            raise web.HTTPNotFound(text="no such file\n")
+        return web.Response(body=self._static[name], headers={"Content-Type": _TYPES[name.split(".")[-1]]})
+
+    async def _download(self, request: web.Request) -> web.Response:
+        host = await self._server._started()
+        makers: dict[str, tuple[str, Callable[[], bytes]]] = {
+            "frame.png": ("image/png", host.snapshot),
+            "environment.exr": ("image/x-exr", host.environment_exr),
+            "scene.toml": (
+                "application/toml",
+                lambda: host.scene_toml(full_paths=self._server.address.loopback).encode(),
+            ),
+            "scene.zip": ("application/zip", host.scene_bundle),
+            "recording.mp4": ("video/mp4", host.recording),
+            "camera.yml": ("application/yaml", host.camera_file),
+            "response.txt": ("text/plain", host.response_file),
+            "card-a4.pdf": ("application/pdf", lambda: host.card("a4")),
+            "card-letter.pdf": ("application/pdf", lambda: host.card("letter")),
+        }
+        name = request.match_info["name"]
+        if name not in makers:
+            raise web.HTTPNotFound(text="no such download\n")
+        kind, make = makers[name]
+        try:
+            body = await self._server._aside(make)
+        except WarpArError as error:
+            raise web.HTTPConflict(text=f"{error}\n") from error
+        headers = {"Content-Type": kind, "Content-Disposition": f'attachment; filename="{name}"'}
+        return web.Response(body=body, headers=headers)
+
+    async def _drop_file(self, request: web.Request) -> web.Response:
+        """Take a file that was dropped onto the picture; its answer says in words what became of it."""
+        host = await self._server._started()
+        name = request.match_info["name"]
+        if self._taking:
+            return web.Response(status=429, text="another file is being taken: wait until it is there\n")
+        self._taking = True
+        try:
+            # Its own bound, for all other requests have none worth the name; and not for ever.
+            async with asyncio.timeout(DROP_SECONDS):
+                parts, size = [], 0
+                async for part in request.content.iter_chunked(1 << 16):
+                    size += len(part)
+                    if size > MOST_BYTES:
+                        refused = web.Response(status=413, text=f"{size:,} bytes and more; {MOST_BYTES:,} are taken\n")
+                        refused.force_close()
+                        return refused
+                    parts.append(part)
+            words = await self._server._aside(host.drop, name, b"".join(parts))
+        except TimeoutError:
+            return web.Response(status=408, text="the file took too long\n")
+        except WarpArError as error:
+            return web.Response(status=422, text=f"{error}\n")
+        finally:
+            self._taking = False
+        return web.Response(text=f"{words}\n")
