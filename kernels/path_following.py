@@ -43,11 +43,11 @@ from warp_ar.kernels.path_vertices import (
     LocalScene,
     Vertex,
     from_viewer,
+    is_glossy,
     make_find_vertex,
     make_hidden_by_physical,
     make_look_up_material,
     make_see_in_frame,
-    is_glossy,
     polished,
 )
 from warp_ar.kernels.shadow import has_penumbra, sample_light

@@ -18,7 +18,16 @@ from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.path_following import Carried, make_follow_path
 from warp_ar.kernels.path_picture import Moments, add_sample
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
-from warp_ar.kernels.path_vertices import BALL, NOTHING, OBJECT, PROXY, LocalScene, is_glossy, is_turned, make_find_vertex
+from warp_ar.kernels.path_vertices import (
+    BALL,
+    NOTHING,
+    OBJECT,
+    PROXY,
+    LocalScene,
+    is_glossy,
+    is_turned,
+    make_find_vertex,
+)
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.trace import TraceConfig
@@ -89,7 +98,9 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
                         of_lobe = key
                         if lobe == 1:
                             of_lobe.seed = ~key.seed
-                        one = follow_path(params[0], scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe)
+                        one = follow_path(
+                            params[0], scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe
+                        )
                         carried.rays += one.rays
                         if lobe == 0:
                             g = one.radiance

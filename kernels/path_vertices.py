@@ -17,7 +17,17 @@ from warp_ar.kernels.path_sampling import ALL_MODELS, Sky
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.shade import face_viewer
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
-from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, FrameParams, Hit, Light, Picture, Probe, RayScene
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    METALLIC_ROUGHNESS,
+    MIRROR,
+    FrameParams,
+    Hit,
+    Light,
+    Picture,
+    Probe,
+    RayScene,
+)
 from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})

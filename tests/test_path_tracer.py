@@ -339,8 +339,14 @@ def gloss_albedo(reflectance: float, roughness: float, cosine: float) -> float:
     half = wi + wo
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     spread = alpha**2 / (math.pi * (half[..., 2] ** 2 * (alpha**2 - 1.0) + 1.0) ** 2)
-    shadowing = 2.0 * z * cosine / (
-        cosine * np.sqrt(alpha**2 + (1.0 - alpha**2) * z**2) + z * math.sqrt(alpha**2 + (1.0 - alpha**2) * cosine**2)
+    shadowing = (
+        2.0
+        * z
+        * cosine
+        / (
+            cosine * np.sqrt(alpha**2 + (1.0 - alpha**2) * z**2)
+            + z * math.sqrt(alpha**2 + (1.0 - alpha**2) * cosine**2)
+        )
     )
     fresnel = reflectance + (1.0 - reflectance) * (1.0 - half @ wo) ** 5
     return float((spread * shadowing * fresnel / (4.0 * z * cosine) * z).mean() * 2.0 * math.pi)

@@ -10,12 +10,12 @@ taken. What newly shown settings take too much is theirs; all else that differs 
 that were timed cost what they took; others what the costs say, times the ratio in which the timed settings that are
 most like them departed from it.
 
-**Steadiness.** Frames shall take ``LEAST`` to 1 budget. The median of the last frames counts, of as many of
-them as take the same (``WINDOWS``), once it is off by ``SURE`` of its standard errors: a great change is sure within nine
-frames, a small one within hundreds, and noise moves nothing. Frames that surely take more have the choice made anew, and so have those that
-surely take less, where something errs less for it; between the two nothing changes. Settings are held for
-``HELD_SECONDS``. A setting moves by one method at a time, and all move until they are where they were to go, or the
-budget is exceeded; of a mixed move that would not fit, what saves goes first.
+**Steadiness.** Frames shall take ``LEAST`` to 1 budget. The median of the last frames counts, of as many of them as
+take the same (``WINDOWS``), once it is off by ``SURE`` of its standard errors: a great change is sure within nine
+frames, a small one within hundreds, and noise moves nothing. Frames that surely take more have the choice made anew,
+and so have those that surely take less, where something errs less for it; between the two nothing changes. Settings
+are held for ``HELD_SECONDS``. A setting moves by one method at a time, and all move until they are where they were to
+go, or the budget is exceeded; of a mixed move that would not fit, what saves goes first.
 
 **Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
 frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
@@ -85,9 +85,8 @@ SETTLE = 2
 SURPRISE = 1.2
 """Ratio of what new settings take to what they took alone, up to which the difference may be theirs."""
 MEMORY = 60.0
-"""Seconds for which what settings took when they were shown is held against them, twice as long each time that they were
-left for it: a moment's load may have been in it.
-What they took alone is known for good."""
+"""Seconds for which what settings took when they were shown is held against them, twice as long each time that they
+were left for it: a moment's load may have been in it. What they took alone is known for good."""
 MOST_LEFT = 6
 """Times of which that is counted: an hour."""
 _KEPT_PIPELINES = 6
@@ -320,14 +319,18 @@ class Controller:
             if timed.shown is not None and now > timed.until:
                 timed.shown = self._predicted = None
         timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
-        surprise = math.inf if self._entry_factor is None else measured / (self._entry_factor * self._cost(self.settings))
-        believable = surprise < SURPRISE or (timed.alone is None and self._entry_factor is not None)
-        if over and believable and len(self._times) < WINDOWS[-1]:
-            timed.shown, timed.until = measured / self._entry_factor, now + MEMORY * 2.0**timed.left
+        before, cost = self._entry_factor, max(self._cost(self.settings), 1e-3)
+        if (
+            over
+            and before is not None
+            and (timed.alone is None or measured < SURPRISE * before * cost)
+            and len(self._times) < WINDOWS[-1]
+        ):
+            timed.shown, timed.until = measured / before, now + MEMORY * 2.0**timed.left
             timed.left = min(timed.left + 1, MOST_LEFT)
-            self._factor, self._predicted = self._entry_factor, None
+            self._factor, self._predicted = before, None
         else:
-            self._factor = max(measured, 1e-3) / max(self._cost(self.settings), 1e-3)
+            self._factor = max(measured, 1e-3) / cost
 
     def _change(self, settings: dict[str, str]) -> None:
         self._before, self.settings = self.settings, settings

@@ -89,7 +89,13 @@ SETTINGS: tuple[Setting, ...] = (
 )
 """All there are."""
 BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
-    "environment_height": {"48": ("32", "64", 5 / 12), "96": ("64", "128", 5 / 12), "160": ("128", "256", 9 / 48), "192": ("128", "256", 20 / 48), "224": ("128", "256", 33 / 48)},
+    "environment_height": {
+        "48": ("32", "64", 5 / 12),
+        "96": ("64", "128", 5 / 12),
+        "160": ("128", "256", 9 / 48),
+        "192": ("128", "256", 20 / 48),
+        "224": ("128", "256", 33 / 48),
+    },
     "edge_samples": {"9": ("4", "16", 5 / 12)},
     "prefilter": {"fis64": ("fis32", "fis128", 1 / 3), "fis96": ("fis32", "fis128", 2 / 3)},
     "environment_shadow": {
@@ -257,9 +263,9 @@ def load_errors() -> dict[str, dict[str, float]]:
 def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Errors of a cost table.
 
-    A method that it does not know errs as its place between two others says (``BETWEEN``), else as its next cheaper one.
-    Errors fall ever more slowly with work, as 1 - (1 - share)^2: where they were measured (shadows every eighth and sixth
-    pixel) they fall faster.
+    A method that it does not know errs as its place between two others says (``BETWEEN``), else as its next cheaper
+    one. Errors fall ever more slowly with work, as 1 - (1 - share)^2: where they were measured (shadows every eighth
+    and sixth pixel) they fall faster.
 
     Raises:
         UsageError: The list has no errors, or one that is no number.
