@@ -317,7 +317,7 @@ class Controller:
         """What frames took is what the settings cost times the load: find which of the two is not as it was thought."""
         for timed in self._timed.values():
             if timed.shown is not None and now > timed.until:
-                timed.shown = self._predicted = None
+                timed.shown, self._predicted = None, None
         timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
         before, cost = self._entry_factor, max(self._cost(self.settings), 1e-3)
         if (
