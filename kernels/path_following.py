@@ -43,13 +43,15 @@ from warp_ar.kernels.path_vertices import (
     LocalScene,
     Vertex,
     from_viewer,
+    is_glossy,
     make_find_vertex,
     make_hidden_by_physical,
     make_look_up_material,
     make_see_in_frame,
+    polished,
 )
 from warp_ar.kernels.shadow import has_penumbra, sample_light
-from warp_ar.kernels.structs import MIRROR, FrameParams, Hit
+from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Hit
 from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
@@ -231,10 +233,13 @@ def make_physical_radiance(trace: TraceConfig) -> wp.Function:
             if vertex.kind == PROXY:
                 seen = see_in_frame(params, scene, vertex.hit)
                 carried.rays += seen.rays
-                if seen.known:
+                # What a glossy surface sends the camera is not what it sends elsewhere.
+                if seen.known and not is_glossy(scene, vertex):
                     carried.radiance += wp.cw_mul(weight, seen.radiance)
                     return carried
                 reflectance = scene.proxy_reflectance[vertex.hit.shape]
+                if seen.known:
+                    reflectance = seen.reflectance
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
             surface = look_up_material(scene, vertex, wo, reflectance)
@@ -316,11 +321,11 @@ def make_virtual_light(trace: TraceConfig) -> wp.Function:
 # pixel that nothing virtual reaches, every path gives exactly 0.
 @functools.cache
 def make_follow_path(trace: TraceConfig) -> wp.Function:
-    """``follow_path(params, scene, first, direction, difference, white, only_light, key) -> Carried``.
+    """``follow_path(params, scene, first, direction, difference, white, lobe, only_light, key) -> Carried``.
 
     What leaves the vertex ``first`` against a unit ``direction``: all radiance, or the difference that virtual content
     makes. ``white``: the first surface is one, and what it sends without virtual content is found too; ``only_light``:
-    nothing else is.
+    nothing else is. ``lobe``: it is not white but the gloss of its proxy alone.
     """
     find_vertex, sky_light = make_find_vertex(trace), make_sky_light(trace)
     see_in_frame, look_up_material = make_see_in_frame(trace), make_look_up_material()
@@ -335,6 +340,7 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
         direction: wp.vec3,
         difference: wp.bool,
         white: wp.bool,
+        lobe: wp.bool,
         only_light: wp.bool,
         key: PathKey,
     ) -> Carried:
@@ -353,12 +359,19 @@ def make_follow_path(trace: TraceConfig) -> wp.Function:
                 reflectance = scene.proxy_reflectance[vertex.hit.shape]
                 if seen.known:
                     reflectance = seen.reflectance
-                    if not changes_only:
+                    if not changes_only and not is_glossy(scene, vertex):
                         carried.radiance += wp.cw_mul(weight, seen.radiance)
                         changes_only = True
             vertex = from_viewer(vertex, wo)
             hit = vertex.hit
-            surface = look_up_material(scene, vertex, wo, reflectance)
+            surface = Surface()
+            if is_white and lobe:
+                surface = polished(scene, vertex, wp.vec3(0.0, 0.0, 0.0))
+            elif is_white:
+                surface.model = wp.static(int(LAMBERT))
+                surface.diffuse = reflectance
+            else:
+                surface = look_up_material(scene, vertex, wo, reflectance)
             if not only_light:
                 carried.radiance += wp.cw_mul(weight, surface.emission)
             if surface.model != wp.static(int(MIRROR)):

@@ -85,25 +85,36 @@ def map_reflectance_kernel(
     radiance: wp.array2d[wp.vec3],
     shown: wp.array2d[wp.int32],
     light: wp.array2d[wp.vec3],
+    mirrored: wp.array2d[wp.vec3],
     proxies: wp.array2d[wp.float32],
     # Out:
+    matt_out: wp.array2d[wp.vec3],
     reflectance_out: wp.array2d[wp.vec3],
 ):
-    """Reflectance of every pixel that shows a proxy, from light averaged over its neighbours on the same one."""
+    """Reflectance of every pixel that shows a proxy, from light averaged over its neighbours on the same one.
+
+    What a glossy proxy mirrors there, averaged likewise, is no part of it; ``matt_out`` may be empty where none is.
+    """
     i, j = wp.tid()
     i += row_start
     reflectance = wp.vec3(0.0, 0.0, 0.0)
     own = shown[i, j]
     if own >= 0:
         total = wp.vec3(0.0, 0.0, 0.0)
+        seen = wp.vec3(0.0, 0.0, 0.0)
         count = float(0.0)
         for a in range(wp.max(i - SMOOTHED, 0), wp.min(i + SMOOTHED + 1, shown.shape[0])):
             for b in range(wp.max(j - SMOOTHED, 0), wp.min(j + SMOOTHED + 1, shown.shape[1])):
                 if shown[a, b] == own:
                     total += light[a, b]
+                    seen += mirrored[a, b]
                     count += proxies[a, b]
         if count > 0.0:
-            reflectance = reflectance_under(radiance[i, j], total / count)
+            left = radiance[i, j]
+            if matt_out.shape[0] > 0:
+                left = wp.max(left - seen / count, wp.vec3(0.0, 0.0, 0.0))
+                matt_out[i, j] = left
+            reflectance = reflectance_under(left, total / count)
     reflectance_out[i, j] = reflectance
 
 
@@ -174,10 +185,14 @@ def make_moments(shape: tuple[int, int], device: wp.DeviceLike) -> Moments:
 
 
 def map_reflectance(scene: LocalScene, moments: Moments, reflectance_out: wp.array2d[wp.vec3]) -> None:
-    """Write the reflectance of what every pixel shows, by moments of ``IRRADIANCE``; (H, W), 0 without a proxy."""
+    """Write the reflectance of what every pixel shows, by moments of ``IRRADIANCE``; (H, W), 0 without a proxy.
+
+    Where proxies are glossy ``scene.matt`` is written too.
+    """
     shape, device = reflectance_out.shape, reflectance_out.device
-    inputs = [scene.radiance, scene.shown, moments.light, moments.proxies]
-    launch_rows(map_reflectance_kernel, shape, inputs, [reflectance_out], rows=None, device=device)
+    inputs = [scene.radiance, scene.shown, moments.light, moments.change, moments.proxies]
+    outputs = [None if scene.gloss is None else scene.matt, reflectance_out]
+    launch_rows(map_reflectance_kernel, shape, inputs, outputs, rows=None, device=device)
 
 
 def finish_picture(
@@ -194,7 +209,7 @@ def finish_picture(
     """Write what the moments of ``count`` samples say.
 
     Args:
-        scene: Whose frame's radiance is read where proxies are shown.
+        scene: Whose frame is read where proxies are shown, without what they mirror.
         moments: (H, W).
         count: Samples per pixel.
         encode_table: Of ``color.encode_table``.
@@ -204,5 +219,5 @@ def finish_picture(
         exposure: Factor on the radiance that is encoded.
     """
     outputs = [radiance_out, error_out, image_out]
-    inputs = [scene.radiance, encode_table, moments, float(count), exposure]
+    inputs = [scene.matt, encode_table, moments, float(count), exposure]
     launch_rows(finish_picture_kernel, image_out.shape, inputs, outputs, rows=None, device=image_out.device)

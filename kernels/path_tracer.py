@@ -18,7 +18,16 @@ from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
 from warp_ar.kernels.path_following import Carried, make_follow_path
 from warp_ar.kernels.path_picture import Moments, add_sample
 from warp_ar.kernels.path_sampling import NO_DENSITY, PathKey, sky_radiance
-from warp_ar.kernels.path_vertices import BALL, NOTHING, OBJECT, PROXY, LocalScene, is_turned, make_find_vertex
+from warp_ar.kernels.path_vertices import (
+    BALL,
+    NOTHING,
+    OBJECT,
+    PROXY,
+    LocalScene,
+    is_glossy,
+    is_turned,
+    make_find_vertex,
+)
 from warp_ar.kernels.sampling import pcg3d_hash, uniform_from_bits
 from warp_ar.kernels.structs import FrameParams
 from warp_ar.kernels.trace import TraceConfig
@@ -73,23 +82,36 @@ def make_trace_paths_kernel(trace: TraceConfig) -> wp.Kernel:
                 if vertex.kind == NOTHING:
                     z = sky_radiance(scene.sky, direction, NO_DENSITY)
                 else:
-                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, key)
+                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, False, key)
                     z = carried.radiance
             elif vertex.kind == OBJECT:
                 if asked == wp.static(DIFFERENCE):
-                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, key)
+                    carried = follow_path(params[0], scene, vertex, direction, False, False, False, False, key)
                     z = carried.radiance
             else:
                 z = scene.radiance[i, j]
                 # A face that is seen from behind is not the surface that the camera sees.
                 if vertex.kind == PROXY and not is_turned(vertex, direction):
                     only_light = asked == wp.static(IRRADIANCE)
-                    carried = follow_path(params[0], scene, vertex, direction, True, True, only_light, key)
-                    g = carried.radiance
-                    e = carried.light
+                    lobes = wp.where(is_glossy(scene, vertex), 2, 1)
+                    for lobe in range(lobes):
+                        of_lobe = key
+                        if lobe == 1:
+                            of_lobe.seed = ~key.seed
+                        one = follow_path(
+                            params[0], scene, vertex, direction, True, True, lobe == 1, only_light, of_lobe
+                        )
+                        carried.rays += one.rays
+                        if lobe == 0:
+                            g = one.radiance
+                            e = one.light
+                        elif only_light:
+                            g = one.light  # what the frame shows mirrored
+                        else:
+                            z += one.radiance
                     shows = 1.0
                 elif vertex.kind == BALL and asked == wp.static(DIFFERENCE):
-                    carried = follow_path(params[0], scene, vertex, direction, True, False, False, key)
+                    carried = follow_path(params[0], scene, vertex, direction, True, False, False, False, key)
                     z += carried.radiance
             moments_out.rays[i, j] = moments_out.rays[i, j] + carried.rays + 1
             add_sample(i, j, wp.float32(done + k + 1), z, g, e, shows, moments_out)

@@ -17,7 +17,17 @@ from warp_ar.kernels.path_sampling import ALL_MODELS, Sky
 from warp_ar.kernels.reflect import make_find_in_frame
 from warp_ar.kernels.shade import face_viewer
 from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
-from warp_ar.kernels.structs import LAMBERT, MIRROR, FrameParams, Hit, Light, Picture, Probe, RayScene
+from warp_ar.kernels.structs import (
+    LAMBERT,
+    METALLIC_ROUGHNESS,
+    MIRROR,
+    FrameParams,
+    Hit,
+    Light,
+    Picture,
+    Probe,
+    RayScene,
+)
 from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -42,8 +52,10 @@ class LocalScene:
     guides: Guides
     dfg: wp.array2d[wp.vec2]  # of ``integrate_dfg``
     proxy_reflectance: wp.array[wp.vec3]  # of each proxy, where no pixel tells
+    gloss: wp.array[wp.vec4]  # of each proxy: F0 and perceptual roughness; empty: all are matt
     picture: Picture  # rays of pixels; of the frame only the size is read
     radiance: wp.array2d[wp.vec3]  # the frame, linear; empty: there is none
+    matt: wp.array2d[wp.vec3]  # the frame less what proxies mirror in it; ``radiance`` itself where none does
     reflectance: wp.array2d[wp.vec3]  # of what each pixel shows
     shown: wp.array2d[wp.int32]  # the proxy that each pixel shows, or -1
 
@@ -164,6 +176,29 @@ def make_see_in_frame(trace: TraceConfig) -> wp.Function:
     return see_in_frame
 
 
+@wp.func
+def is_glossy(scene: LocalScene, vertex: Vertex) -> wp.bool:
+    """Whether a vertex is on a proxy that mirrors."""
+    if vertex.kind != PROXY or scene.gloss.shape[0] == 0:
+        return False
+    values = scene.gloss[vertex.hit.shape]
+    return wp.max(values[0], wp.max(values[1], values[2])) > 0.0
+
+
+@wp.func
+def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
+    """A glossy proxy's surface: the lobe of ``gloss`` beside what is scattered."""
+    values = scene.gloss[vertex.hit.shape]
+    surface = Surface()
+    surface.model = wp.static(int(METALLIC_ROUGHNESS))
+    surface.diffuse = diffuse
+    surface.f0 = wp.vec3(values[0], values[1], values[2])
+    surface.reflectance = surface.f0
+    surface.gain = wp.vec3(1.0, 1.0, 1.0)
+    surface.roughness = values[3]
+    return surface
+
+
 @functools.cache
 def make_look_up_material() -> wp.Function:
     """``look_up_material(scene, vertex, wo, reflectance) -> Surface``: what a vertex is made of, seen from ``wo``.
@@ -182,6 +217,8 @@ def make_look_up_material() -> wp.Function:
         elif vertex.kind == BALL:
             surface.model = wp.static(int(MIRROR))
             surface.reflectance = scene.probes[vertex.index].reflectance
+        elif is_glossy(scene, vertex):
+            surface = polished(scene, vertex, reflectance)
         else:
             surface.model = wp.static(int(LAMBERT))
             surface.diffuse = reflectance

@@ -23,6 +23,7 @@ from warp_ar.scene import (
     Pose,
     Probe,
     Proxy,
+    ProxyMaterial,
     Scene,
 )
 from warp_ar.scene import Light as VirtualLight
@@ -322,6 +323,71 @@ def test_a_difference_to_a_frame_is_the_whole_scene(device: str) -> None:
             noise = np.sqrt((error[rows, columns] ** 2).sum(axis=(0, 1))) / 256
             # Where a pixel shows two surfaces, or the frame is read between its pixels, it is a mean.
             assert (np.abs(block) <= ERRORS * noise + 4e-3).all(), (rows, columns, block, noise)
+
+
+# --- Polished receivers -----------------------------------------------------------------------------------------------
+
+
+def gloss_albedo(reflectance: float, roughness: float, cosine: float) -> float:
+    """Share of a white sky that a GGX lobe sends to a viewer, in float64: midpoints over the hemisphere."""
+    alpha = roughness**2
+    count = 1200
+    z, phi = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(count) + 0.5) / count * 2.0 * math.pi)
+    sine = np.sqrt(1.0 - z**2)
+    wi = np.stack([sine * np.cos(phi), sine * np.sin(phi), z], -1)
+    wo = np.array([math.sqrt(1.0 - cosine**2), 0.0, cosine])
+    half = wi + wo
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    spread = alpha**2 / (math.pi * (half[..., 2] ** 2 * (alpha**2 - 1.0) + 1.0) ** 2)
+    shadowing = (
+        2.0
+        * z
+        * cosine
+        / (
+            cosine * np.sqrt(alpha**2 + (1.0 - alpha**2) * z**2)
+            + z * math.sqrt(alpha**2 + (1.0 - alpha**2) * cosine**2)
+        )
+    )
+    fresnel = reflectance + (1.0 - reflectance) * (1.0 - half @ wo) ** 5
+    return float((spread * shadowing * fresnel / (4.0 * z * cosine) * z).mean() * 2.0 * math.pi)
+
+
+def polish(scene: Scene, roughness: float, reflectance: float) -> Scene:
+    """A scene whose first proxy is polished."""
+    material = ProxyMaterial(roughness, (reflectance,) * 3)
+    return dataclasses.replace(
+        scene, proxies=(dataclasses.replace(scene.proxies[0], material=material), *scene.proxies[1:])
+    )
+
+
+@pytest.mark.parametrize(("roughness", "reflectance"), [(0.3, 0.2), (0.6, 1.0)])
+def test_a_polished_receiver_in_a_white_furnace(roughness: float, reflectance: float, device: str) -> None:
+    """It sends what it scatters and what its lobe sends, by an integral in float64."""
+    scene = dataclasses.replace(polish(desk(), roughness, reflectance), camera=Camera(8, 6, 400.0, 400.0, 3.5, 2.5))
+    picture = trace(scene, WHITE, DOWN, device, samples=512, reflectances=((0.3,) * 3,))
+    check(picture, 0.3 + gloss_albedo(reflectance, roughness, math.sqrt(0.5)), tolerance=1e-3)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.5])
+def test_a_difference_on_a_polished_receiver_is_the_whole_scene(roughness: float, device: str) -> None:
+    """Objects and lights are mirrored, what they hide is not, and shadows darken what is scattered alone."""
+    light = latlong_sky()
+    scenes = [polish(boxes(virtual), roughness, 0.4) for virtual in (False, True)]
+    frame = trace(scenes[0], light, ABOVE, device, reflectances=RHO, samples=512)
+    whole = trace(scenes[1], light, ABOVE, device, reflectances=RHO, samples=256, seed=1)
+    picture = trace(scenes[1], light, ABOVE, device, frame=frame.radiance, samples=128, seed=2)
+    off = picture.radiance - whole.radiance
+    matt = trace(boxes(True), light, ABOVE, device, frame=frame.radiance, samples=128, seed=2)
+    error = np.sqrt(picture.error**2 + whole.error**2 + frame.error**2)
+    for rows in (slice(0, 16), slice(16, 32)):
+        for columns in (slice(0, 16), slice(16, 32), slice(32, 48)):
+            block = off[rows, columns].mean(axis=(0, 1))
+            noise = np.sqrt((error[rows, columns] ** 2).sum(axis=(0, 1))) / 256
+            # As for a matt receiver; and what it mirrors is known from means over 5 x 5 pixels.
+            assert (np.abs(block) <= ERRORS * noise + 6e-3).all(), (rows, columns, block, noise)
+    # A matt receiver would be seen to be wrong.
+    missed = np.abs((matt.radiance - whole.radiance)[16:32, 16:32].mean(axis=(0, 1)))
+    assert missed.max() > 3.0 * np.abs(off[16:32, 16:32].mean(axis=(0, 1))).max()
 
 
 def mitsuba_scene(mi: Any, virtual: bool) -> Any:

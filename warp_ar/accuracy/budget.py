@@ -4,18 +4,18 @@
 so they are measured here (``warp_ar.accuracy.costs``), on the first frame that shows the marker.
 
 **Load.** A frame should take what its settings cost times a load, which is what frames took over what they should have
-taken. Costs and load are told apart by when they change: what differs just after other settings are shown is theirs,
-what differs later is the load's.
+taken. What newly shown settings take too much is theirs; all else that differs is the load's.
 
 **Choice.** The settings are the best of the Pareto front whose cost times the load is at most ``AIM`` budget. Settings
 that were timed cost what they took; others what the costs say, times the ratio in which the timed settings that are
 most like them departed from it.
 
-**Steadiness.** One band: frames that take more than the budget have the choice made anew, and so does room for what
-errs less within ``RAISE`` budget; between the two nothing changes. The median of ``WINDOW`` frames counts, or that of
-the last ``ALARM_WINDOW`` where it is far over the budget, and settings are held for ``HELD_SECONDS``. A setting moves
-by one method at a time, and all move until they are where they were to go, or the budget is exceeded; of a mixed move
-that would not fit, what saves goes first.
+**Steadiness.** Frames shall take ``LEAST`` to 1 budget. The median of the last frames counts, of as many of them as
+take the same (``WINDOWS``), once it is off by ``SURE`` of its standard errors: a great change is sure within nine
+frames, a small one within hundreds, and noise moves nothing. Frames that surely take more have the choice made anew,
+and so have those that surely take less, where something errs less for it; between the two nothing changes. Settings
+are held for ``HELD_SECONDS``. A setting moves by one method at a time, and all move until they are where they were to
+go, or the budget is exceeded; of a mixed move that would not fit, what saves goes first.
 
 **Switching.** Each set of methods has a pipeline of its own (``warp_ar.engine.switcher``). A new one lights a few
 frames that nobody sees: that loads its kernels, and tells what it costs. If that fits, it lights the next frame; if
@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-import statistics
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -64,25 +64,31 @@ from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
 
-AIM = 0.9
-"""Share of the budget that is planned for at first, and when there is too much to do."""
-RAISE = 0.7
-"""Share that what errs less must fit into before it is tried: apart from ``AIM``, so that noise moves nothing."""
-WINDOW = 27
-"""Frames whose median tells what a frame takes: within 3 % where times scatter by a tenth."""
-ALARM_WINDOW = 9
-"""Frames whose median is enough above ``ALARM``."""
-ALARM = 1.15
-"""Share of the budget that noise alone hardly gets the short window above."""
+AIM = 0.95
+"""Share of the budget that is planned for."""
+RAISE = 0.94
+"""Share that what errs less must fit into before it is tried: what noise kept from being chosen is not chosen later."""
+LEAST = 0.92
+"""Share that frames take at least, where something errs less for it; two hundredths of it are noise."""
+TRIAL = 0.98
+"""Share that new settings may take by their trial."""
+WINDOWS = (9, 27, 81, 243)
+"""Frames whose medians tell what a frame takes."""
+FIRST_WINDOW, RAISE_WINDOW = 27, 81
+"""Frames at least before the first choice, and before what errs less is tried."""
+SURE, SURE_AT_LAST = 5.0, 1.0
+"""Standard errors of a median by which it must be off; of the longest window's, to be over the budget."""
 HELD_SECONDS = 0.5
 """Shortest time for which settings are held."""
 SETTLE = 2
 """Frames after a change that are not counted."""
-SURPRISE = 1.15
-"""Ratio to what was expected of new settings from which on the difference is taken to be theirs."""
+SURPRISE = 1.2
+"""Ratio of what new settings take to what they took alone, up to which the difference may be theirs."""
 MEMORY = 60.0
-"""Seconds for which what settings took when they were shown is held against them: a moment's load may have been in it.
-What they took alone is known for good."""
+"""Seconds for which what settings took when they were shown is held against them, twice as long each time that they
+were left for it: a moment's load may have been in it. What they took alone is known for good."""
+MOST_LEFT = 6
+"""Times of which that is counted: an hour."""
 _KEPT_PIPELINES = 6
 
 T = TypeVar("T")
@@ -101,6 +107,8 @@ class _Timed:
     """Milliseconds, when they were shown last."""
     until: float = 0.0
     """When that is forgotten, seconds."""
+    left: int = 0
+    """How often they were left for taking too much."""
 
     @property
     def milliseconds(self) -> float | None:
@@ -143,9 +151,9 @@ class Controller:
         self._timed: dict[frozenset[tuple[str, str]], _Timed] = {}
         self._predicted: list[float] | None = None
         self._factor: float | None = None
-        self._times: collections.deque[float] = collections.deque(maxlen=WINDOW)
+        self._times: collections.deque[float] = collections.deque(maxlen=WINDOWS[-1])
         self._skip = SETTLE
-        self._new = False
+        self._entry_factor = None
         self._held_since = -HELD_SECONDS
         self._chosen = running is None
         self.fits = True
@@ -230,13 +238,13 @@ class Controller:
     def confirm(self) -> bool:
         """Whether the present settings may be shown, now that they have been timed; if not, those before are back."""
         # The first choice may be any: it must be the best still. Later ones lead to it by way of what saves something.
-        fits = self.expected_ms <= AIM * self.budget_ms
+        fits = self.expected_ms <= TRIAL * self.budget_ms
         saves = self.expected_ms < self.expected(self._before)
         if fits or (saves if self._chosen else dict(self._best(AIM).settings) == self.settings):
             self._chosen = True
             return True
         self.settings = self._target = self._before
-        self._new = False
+        self._entry_factor = None
         self.restart()
         return False
 
@@ -262,20 +270,16 @@ class Controller:
             self._skip -= 1
             return False
         self._times.append(milliseconds)
-        if len(self._times) < ALARM_WINDOW:
+        verdict = self._judge()
+        if verdict is None:
             return False
-        latest = statistics.median(list(self._times)[-ALARM_WINDOW:])
-        alarm = latest > ALARM * self.budget_ms
-        if len(self._times) < WINDOW and not alarm:
-            return False
-        self.measured_ms = latest if alarm else statistics.median(self._times)
-        self._tell_apart(self.measured_ms, now)
-        over = self.measured_ms > self.budget_ms
+        self.measured_ms, over, under = verdict
+        self._tell_apart(self.measured_ms, now, over)
         self.fits = not over
         if over or not self._chosen:
             self._target = dict(self._best(AIM).settings)
             self.fits = not over or self._saves(self._target)
-        elif self._target == self.settings and (better := self._best(RAISE)).error < self.expected_error:
+        elif under and self._target == self.settings and (better := self._best(RAISE)).error < self.expected_error:
             self._target = dict(better.settings)
         if self._chosen and now - self._held_since < HELD_SECONDS:
             return False
@@ -288,23 +292,49 @@ class Controller:
         self._change(dict(step))
         return True
 
-    def _tell_apart(self, measured: float, now: float) -> None:
+    def _judge(self) -> tuple[float, bool, bool] | None:
+        """What a frame takes in milliseconds, whether surely too much, whether surely too little; None: not known."""
+        times = np.array(self._times)
+        counts = [count for count in WINDOWS if count <= len(times)]
+        if not counts:
+            return None
+        # Of one frame, from its neighbours: 0.954 standard deviations lie between two of a normal distribution, in the
+        # median; a median's own is 1.253 / sqrt(n) of it.
+        scatter = float(np.median(np.abs(np.diff(times)))) / 0.954
+        count, median, doubt = 0, 0.0, math.inf
+        for longer in counts:
+            # The longest window that agrees with all shorter ones: a load that has just changed is not averaged away.
+            found = float(np.median(times[-longer:]))
+            if count and abs(found - median) > doubt:
+                break
+            count, median, doubt = longer, found, SURE * 1.253 * scatter / math.sqrt(longer)
+        over = median - (doubt if count < WINDOWS[-1] else doubt * SURE_AT_LAST / SURE) > self.budget_ms
+        if count < FIRST_WINDOW:
+            return (median, True, False) if over else None
+        return median, over, count >= RAISE_WINDOW and median + doubt < LEAST * self.budget_ms
+
+    def _tell_apart(self, measured: float, now: float, over: bool) -> None:
         """What frames took is what the settings cost times the load: find which of the two is not as it was thought."""
         for timed in self._timed.values():
             if timed.shown is not None and now > timed.until:
-                timed.shown = self._predicted = None
-        surprise = max(measured, 1e-3) / max(self.expected_ms, 1e-3)
-        if self._new and self._factor is not None and not 1.0 / SURPRISE < surprise < SURPRISE:
-            timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
-            timed.shown, timed.until = measured / self._factor, now + MEMORY
-            self._predicted = None
+                timed.shown, self._predicted = None, None
+        timed = self._timed.setdefault(frozenset(self.settings.items()), _Timed())
+        before, cost = self._entry_factor, max(self._cost(self.settings), 1e-3)
+        if (
+            over
+            and before is not None
+            and (timed.alone is None or measured < SURPRISE * before * cost)
+            and len(self._times) < WINDOWS[-1]
+        ):
+            timed.shown, timed.until = measured / before, now + MEMORY * 2.0**timed.left
+            timed.left = min(timed.left + 1, MOST_LEFT)
+            self._factor, self._predicted = before, None
         else:
-            self._factor = self.factor * surprise
-        self._new = False
+            self._factor = max(measured, 1e-3) / cost
 
     def _change(self, settings: dict[str, str]) -> None:
         self._before, self.settings = self.settings, settings
-        self._new = True
+        self._entry_factor = self._factor
         self.restart()
 
     def restart(self) -> None:
@@ -331,7 +361,7 @@ class Controller:
         # Where neither fits, what saves most goes first: not all that should save is known to.
         steps = [{**self.settings, **some} for some in (moves, savings)]
         steps += [{**self.settings, setting: method} for setting, method in savings.items()]
-        fitting = [step for step in steps[:2] if self.expected(step) <= AIM * self.budget_ms]
+        fitting = [step for step in steps[:2] if self.expected(step) <= TRIAL * self.budget_ms]
         best = fitting[0] if fitting else min(steps[1:], key=self._cost)
         return best if fitting or self._saves(best) else self.settings
 

@@ -47,6 +47,11 @@ class Setting:
     """Stages whose work it changes."""
 
     @property
+    def measured(self) -> tuple[str, ...]:
+        """Methods whose costs are to be measured: without brute force, and without those between two others."""
+        return tuple(method for method in self.methods if method not in ("brute_force", *BETWEEN.get(self.name, ())))
+
+    @property
     def converges(self) -> bool:
         """Whether its methods approximate one object, which the last of them gives; others are models of their own."""
         return self.name in _SHARED or any(stage.converges for stage in STAGES if stage.name == self.name)
@@ -76,13 +81,33 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, str]]] = {
 }
 _CHOICES = tuple(stage for stage in STAGES if len(stage.methods) > 1)
 SETTINGS: tuple[Setting, ...] = (
-    _shared("environment_height", "32", "64", "128", "256"),
-    _shared("edge_samples", "1", "4", "16"),
+    _shared("environment_height", "32", "48", "64", "96", "128", "160", "192", "224", "256"),
+    _shared("edge_samples", "1", "4", "9", "16"),
     _shared("light_shadow", "hard", "soft"),
     _shared("area_light", *AREA_SAMPLES),
     *(Setting(stage.name, tuple(stage.methods), (stage.name,)) for stage in _CHOICES),
 )
 """All there are."""
+BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
+    "environment_height": {
+        "48": ("32", "64", 5 / 12),
+        "96": ("64", "128", 5 / 12),
+        "160": ("128", "256", 9 / 48),
+        "192": ("128", "256", 20 / 48),
+        "224": ("128", "256", 33 / 48),
+    },
+    "edge_samples": {"9": ("4", "16", 5 / 12)},
+    "prefilter": {"fis64": ("fis32", "fis128", 1 / 3), "fis96": ("fis32", "fis128", 2 / 3)},
+    "environment_shadow": {
+        "coarse8": ("none", "coarse", 25 / 64),
+        "coarse6": ("none", "coarse", 25 / 36),
+        "bounce5": ("none", "bounce", 4 / 25),
+        "bounce4": ("none", "bounce", 4 / 16),
+        "bounce3": ("none", "bounce", 4 / 9),
+    },
+}
+"""Methods that do the same work as another one more or less often: by setting and method two others, and the share of
+the way from the first to the second at which the method's work lies."""
 WORDS: Mapping[str, tuple[str, Mapping[str, str]]] = {
     **_SHARED,
     **{stage.name: (stage.subject, stage.methods) for stage in _CHOICES},
@@ -231,7 +256,11 @@ def load_errors() -> dict[str, dict[str, float]]:
 
 
 def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Errors of a cost table; a method that it does not know is taken to err as its next cheaper one.
+    """Errors of a cost table.
+
+    A method that it does not know errs as its place between two others says (``BETWEEN``), else as its next cheaper
+    one. Errors fall ever more slowly with work, as 1 - (1 - share)^2: where they were measured (shadows every eighth
+    and sixth pixel) they fall faster.
 
     Raises:
         UsageError: The list has no errors, or one that is no number.
@@ -244,7 +273,12 @@ def read_errors(cost_table: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         own = listed.get(setting.name, {})
         found: dict[str, float] = {}
         last = 0.0
+        between = BETWEEN.get(setting.name, {})
         for method in setting.methods:
+            if method in between and method not in own and {between[method][0], between[method][1]} <= own.keys():
+                low, high, share = between[method]
+                found[method] = own[low] + (1.0 - (1.0 - share) ** 2) * (own[high] - own[low])
+                continue
             last = own.get(method, last)
             if not isinstance(last, (int, float)) or not math.isfinite(last) or last < 0.0:
                 raise UsageError(

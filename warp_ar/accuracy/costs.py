@@ -22,7 +22,7 @@ from typing import Any, cast
 
 import warp as wp
 
-from warp_ar.accuracy.cost_table import MethodCost, Scales, Setting, chosen, light_only, turn
+from warp_ar.accuracy.cost_table import BETWEEN, MethodCost, Scales, Setting, chosen, light_only, turn
 from warp_ar.engine.graph import Plan
 from warp_ar.engine.pipeline import DEFAULT_FRAME_INTERVAL, TRACK, Pipeline, Result
 from warp_ar.engine.switcher import let_go
@@ -128,7 +128,7 @@ def measure_steps(
     clock: Callable[[], float] | None = None,
 ) -> Generator[float, None, Costs]:
     """``measure_costs`` in small steps, for whoever has other objects to do; yields the share that is done."""
-    count, done = sum(len(setting.methods) for setting in settings) + 2, 2
+    count, done = sum(len(setting.measured) for setting in settings) + 2, 2
     timed = WORK if clock is None else clock
     passed = _time_stages(scene, image, pose, device, size, BASE, time.perf_counter)
     track = passed.pop(TRACK, 0.0)
@@ -145,14 +145,11 @@ def measure_steps(
         start = chosen(BASE, setting)
         times: dict[str, dict[str, float]] = {}
         spread = setting.name == NOW_AND_THEN
-        for method in setting.methods:
-            if method != "brute_force":
-                quality = turn(BASE, {setting.name: method})
-                known = method == start and not spread
-                times[method] = (
-                    base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
-                )
-                times[method].pop(TRACK, None)
+        for method in setting.measured:
+            quality = turn(BASE, {setting.name: method})
+            known = method == start and not spread
+            times[method] = base if known else _time_stages(scene, image, pose, device, size, quality, timed, spread)
+            times[method].pop(TRACK, None)
             done += 1
             yield done / count
         # Stages that run whatever the method is cost the same: what was measured of them is noise.
@@ -177,7 +174,30 @@ def measure_steps(
     for table in scales.values():
         for scale in table.values():
             scale.update({name: 1.0 + shares[name] * (ratio - 1.0) for name, ratio in scale.items()})
-    return Costs(track + pace * work, methods, scales, track, work)
+    return fill_between(Costs(track + pace * work, methods, scales, track, work))
+
+
+def fill_between(costs: Costs) -> Costs:
+    """``costs`` with methods of which others tell what they cost; a measured one stays."""
+
+    def filled(known: Mapping[str, Any], between: Mapping[str, tuple[str, str, float]], mix: Callable[..., Any]) -> Any:
+        found = {
+            method: mix(known[low], known[high], share)
+            for method, (low, high, share) in between.items()
+            if low in known and high in known
+        }
+        return {**found, **known}
+
+    def mix_scales(low: Mapping[str, float], high: Mapping[str, float], share: float) -> dict[str, float]:
+        return {name: _mix(low[name], high[name], share) for name in low if name in high}
+
+    methods = {name: filled(own, BETWEEN.get(name, {}), _mix) for name, own in costs.methods.items()}
+    scales = {name: filled(own, BETWEEN.get(name, {}), mix_scales) for name, own in costs.scales.items()}
+    return dataclasses.replace(costs, methods=methods, scales=scales)
+
+
+def _mix(low: float, high: float, share: float) -> float:
+    return low + share * (high - low)
 
 
 def _time_stages(

@@ -175,6 +175,12 @@ class PathTracer:
         for ball, probe in zip(balls, self.scene.probes, strict=True):
             ball["center"], ball["radius"], ball["reflectance"] = probe.center, probe.radius, probe.reflectance
         local.probes = wp.array(balls, dtype=structs.Probe, device=device)
+        if self.scene.has_gloss:
+            gloss = np.zeros((len(self.scene.proxies), 4), np.float32)
+            for record, proxy in zip(gloss, self.scene.proxies, strict=True):
+                if proxy.material is not None:
+                    record[:] = *proxy.material.reflectance, proxy.material.roughness
+            local.gloss = wp.array(gloss, dtype=wp.vec4, device=device)
         local.sky = make_sky(radiance, device, emitters)
         local.guides = make_guides(objects, local.rays.materials.numpy(), balls, device)
         local.dfg = wp.zeros((DFG_SIZE, DFG_SIZE), dtype=wp.vec2, device=device)
@@ -182,7 +188,9 @@ class PathTracer:
         rays = wp.array(pixel_rays(self.camera), dtype=wp.vec2, device=device)
         local.picture = structs.make_picture(wp.zeros(shape, dtype=wp.vec3ub, device=device), None, rays)
         if self._linear is not None:
-            local.radiance = wp.array(self._linear, dtype=wp.vec3, device=device)
+            local.radiance = local.matt = wp.array(self._linear, dtype=wp.vec3, device=device)
+            if self.scene.has_gloss:
+                local.matt = wp.array(self._linear, dtype=wp.vec3, device=device)
             local.reflectance = wp.zeros(shape, dtype=wp.vec3, device=device)
             local.shown = wp.full(shape, -1, dtype=wp.int32, device=device)
         return local

@@ -53,7 +53,12 @@ class Method:
 
 
 METHODS: Mapping[str, Method] = {
+    "coarse8": Method(32, 4, 8, "estimated"),
+    "coarse6": Method(32, 4, 6, "estimated"),
     "coarse": Method(32, 4, 5, "estimated"),
+    "bounce5": Method(64, 4, 5, "traced", 0.5),
+    "bounce4": Method(64, 4, 4, "traced", 0.5),
+    "bounce3": Method(64, 4, 3, "traced", 0.5),
     "bounce": Method(64, 4, 2, "traced", 0.5),
     "brute_force": Method(REFERENCE_SIZE[0] * REFERENCE_SIZE[1], 1, 1, "traced"),
 }
@@ -71,8 +76,13 @@ class EnvironmentShadow(Stage):
     name: ClassVar[str] = "environment_shadow"
     methods: ClassVar[Mapping[str, str]] = {
         "none": "none (the paper)",
-        "coarse": "32 rays per estimate, every fifth pixel, and an estimate of reflected light",
-        "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
+        "coarse8": "32 rays per estimate, every eighth pixel, and an estimate of reflected light",
+        "coarse6": "the same, every sixth pixel",
+        "coarse": "the same, every fifth pixel",
+        "bounce5": "64 rays, every fifth pixel, and reflected light by a ray for half of them",
+        "bounce4": "the same, every fourth pixel",
+        "bounce3": "the same, every third pixel",
+        "bounce": "the same, every second pixel",
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"

@@ -49,6 +49,8 @@ class Prefilter(Stage):
         "box_mip": "a pyramid of means over solid angles",
         "energy_mip": "a pyramid that keeps energy, mixed to fit the lobe",
         "fis32": "32 importance samples per texel",
+        "fis64": "64 importance samples per texel",
+        "fis96": "96 importance samples per texel",
         "fis128": "128 importance samples per texel",
         "brute_force": "every texel for every direction and width",
     }
