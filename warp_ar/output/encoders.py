@@ -94,9 +94,9 @@ def find_encoding(
 def _with_defaults(encoder: str, options: Mapping[str, str]) -> dict[str, str]:
     """Options of an encoder, the defaults among them; parameters of x264's and x265's own go behind those here.
 
-    x264's tree of macroblocks (`mbtree`), in its code for AVX-512, reads memory that nothing has written: at some sizes,
-    320x240 among them, the same pictures then give other bytes from run to run. Its other code does not, gives the same
-    bytes on all machines, and is as fast (docs/notes/2026-11-23-encoders.md).
+    x264's tree of macroblocks (`mbtree`), in its code for AVX-512, reads memory that nothing has written: at some
+    sizes, 320x240 among them, the same pictures then give other bytes from run to run. Its other code does not, gives
+    the same bytes whatever the processor, and is as fast (docs/notes/2026-11-23-encoders.md).
     """
     wanted = {**_DEFAULTS.get(encoder, {}), **options}
     key = {"libx264": "x264-params", "libx265": "x265-params"}.get(encoder)
