@@ -28,8 +28,8 @@ from bench.common import copy_bandwidth, measure, report
 from warp_ar.engine.pipeline import TRACK, Pipeline
 from warp_ar.input.sources import open_source
 from warp_ar.input.tracking import Tracker
+from warp_ar.kernels.shapes import intersect_mesh
 from warp_ar.kernels.structs import FrameParams, RayScene
-from warp_ar.kernels.visibility import intersect_mesh
 from warp_ar.output.sinks import open_sink
 from warp_ar.scene import Pose, Scene, bundled_scenes, load_scene
 from warp_ar.scene.shapes import torus_mesh

@@ -7,8 +7,8 @@ import warp as wp
 
 from bench.common import measure, report
 from warp_ar.kernels import color, mirror_ball
+from warp_ar.kernels.receiver import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.relight import Receiver, RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     DIRECTIONAL,
@@ -24,7 +24,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.stages.mirror_ball import SAMPLES
 
 H, W, FOCAL = 480, 640, 600.0

@@ -23,8 +23,9 @@ from bench.common import measure, paired_ratio, report
 from warp_ar.kernels import summed_area, unwrap
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.structs import FrameParams, Probe
+from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
 from warp_ar.kernels.wide_bvh import walk_closest
-from warp_ar.scene.ray_scene import make_ray_mesh
+from warp_ar.scene.ray_mesh import make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 
 SIZES = {"480p": (480, 640), "1080p": (1080, 1920), "4K": (2160, 3840)}
@@ -125,14 +126,14 @@ def bench_table_cuda(device: str) -> None:
         exact = values.cumsum(0, dtype=np.uint32).cumsum(1, dtype=np.uint32)
         frame = wp.array(np.repeat(values[..., None], 3, axis=2), dtype=wp.vec3ub, device=device)
         table = wp.zeros((height, width), wp.uint32, device=device)
-        scratch = [wp.zeros(s, wp.uint32, device=device) for s in summed_area.strip_shapes(height, width)]
-        summed_area.sum_area_by_strips(frame, *scratch, table)
+        scratch = [wp.zeros(s, wp.uint32, device=device) for s in strip_shapes(height, width)]
+        sum_area_by_strips(frame, *scratch, table)
         np.testing.assert_array_equal(table.numpy(), exact)
         # A plain copy that reads and writes as many bytes as the table must: 3 + 4 per pixel.
         half = height * width * 7 // 2
         source, target = (wp.zeros(half, wp.uint8, device=device) for _ in range(2))
         contenders = {
-            "strips": with_warp(functools.partial(summed_area.sum_area_by_strips, frame, *scratch, table), device),
+            "strips": with_warp(functools.partial(sum_area_by_strips, frame, *scratch, table), device),
             "copy": with_warp(functools.partial(wp.copy, target, source), device),
             "rows_columns": with_warp(functools.partial(summed_area.sum_area, frame, table), device),
         }

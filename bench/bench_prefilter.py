@@ -15,6 +15,17 @@ import warp as wp
 from bench.common import measure, report
 from bench.environments import environments
 from warp_ar.kernels import prefilter, pyramid
+from warp_ar.kernels.lobes import (
+    Lobe,
+    box_weights,
+    lobe_count,
+    lobe_offset,
+    lobe_rows,
+    lobe_size,
+    lobe_texels,
+    make_lobe_samples,
+    mip_weights,
+)
 
 HEIGHTS = {"cpu": (32, 64), "cuda": (32, 64, 128, 256)}
 RUNS = {"cpu": 30, "cuda": 200}
@@ -23,17 +34,17 @@ FEW_ROWS = 64
 SAMPLES = (8, 32, 128)
 
 
-def methods(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[str, tuple[Any, wp.array]]:
+def methods(environment: wp.array, lobe: Lobe, device: Any) -> dict[str, tuple[Any, wp.array]]:
     """Work and output of every method."""
     height = environment.shape[0]
 
     def levels() -> wp.array:
-        return wp.zeros(prefilter.lobe_texels(height), dtype=wp.vec3, device=device)
+        return wp.zeros(lobe_texels(height), dtype=wp.vec3, device=device)
 
     box = wp.zeros(pyramid.packed_texels(height, 2 * height), dtype=wp.vec3, device=device)
     blocks_done = wp.zeros(1, dtype=wp.int32, device=device)
-    row_energy = wp.zeros(prefilter.lobe_rows(height), dtype=wp.vec3, device=device)
-    energy = wp.zeros(prefilter.lobe_count(height), dtype=wp.vec3, device=device)
+    row_energy = wp.zeros(lobe_rows(height), dtype=wp.vec3, device=device)
+    energy = wp.zeros(lobe_count(height), dtype=wp.vec3, device=device)
 
     def mix(numbers: np.ndarray, smooth: bool) -> tuple[Any, wp.array]:
         out, weights = levels(), wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
@@ -48,7 +59,7 @@ def methods(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[st
         return function, out
 
     def sample(count: int) -> tuple[Any, wp.array]:
-        out, samples = levels(), prefilter.make_lobe_samples(height, lobe, count, device)
+        out, samples = levels(), make_lobe_samples(height, lobe, count, device)
 
         def function() -> None:
             pyramid.build_pyramid(environment, blocks_done, box, isotropic=True)
@@ -60,8 +71,8 @@ def methods(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[st
 
     exact = levels()
     return {
-        "box_mip": mix(prefilter.box_weights(height), False),
-        "energy_mip": mix(prefilter.mip_weights(height, lobe), True),
+        "box_mip": mix(box_weights(height), False),
+        "energy_mip": mix(mip_weights(height, lobe), True),
         **{f"fis{count}": sample(count) for count in SAMPLES},
         "brute_force": (lambda: prefilter.integrate_lobes(environment, lobe, exact), exact),
     }
@@ -70,9 +81,9 @@ def methods(environment: wp.array, lobe: prefilter.Lobe, device: Any) -> dict[st
 def mean_error(values: np.ndarray, exact: np.ndarray, height: int) -> float:
     """Relative RMS error, averaged over the levels after the mirror."""
     errors = []
-    for level in range(1, prefilter.lobe_count(height)):
-        rows, columns = prefilter.lobe_size(height, level)
-        start = prefilter.lobe_offset(height, level)
+    for level in range(1, lobe_count(height)):
+        rows, columns = lobe_size(height, level)
+        start = lobe_offset(height, level)
         ours, truth = (a[start : start + rows * columns].reshape(rows, columns, 3) for a in (values, exact))
         weight = np.sin(np.pi * (np.arange(rows) + 0.5) / rows)[:, None, None]
         errors.append(math.sqrt((weight * (ours - truth) ** 2).sum() / (weight * truth**2).sum()))

@@ -13,11 +13,14 @@ import warp as wp
 from bench.common import measure, report
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
+from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.light import recovery
 from warp_ar.light.config import Kind
 from warp_ar.light.surfaces import find_surfaces
 from warp_ar.scene import load_scene
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 HEIGHTS = (64, 128)
 
@@ -51,7 +54,7 @@ class Setup:
             self.params = wp.array(params, dtype=structs.FrameParams)
             self.confidence = wp.full(shape, 1.0, dtype=wp.float32)
             self.recovered = wp.zeros(shape, dtype=wp.vec3)
-            self.cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell)
+            self.cells = wp.zeros(cell_shape(*shape), dtype=Cell)
             self.recovered = wp.zeros(self.cells.shape, dtype=wp.vec3)
             seen = np.zeros(count, np.dtype(kernels.Observation.numpy_dtype()))
             ink = surfaces.kinds[surfaces.surface] == Kind.INK
@@ -64,12 +67,12 @@ class Setup:
 
     def weigh(self) -> None:
         """Weigh the rims of what clips."""
-        kernels.weigh_boundaries(self.clipped, self.params, self.probes, self.missing)
+        weigh_boundaries(self.clipped, self.params, self.probes, self.missing)
 
     def condense(self) -> None:
         """Condense the map."""
         arrays = (self.radiance, self.confidence, self.clipped, self.missing, self.probes, self.scene, self.cells)
-        kernels.condense_cells(*arrays, proxies=self.proxies)
+        condense_cells(*arrays, proxies=self.proxies)
 
     def trace(self) -> None:
         """Trace all surface points."""
@@ -79,7 +82,7 @@ class Setup:
 
     def add(self) -> None:
         """Apply an excess."""
-        kernels.add_recovered(self.radiance, self.confidence, self.missing, self.cells, self.recovered, self.recovered)
+        add_recovered(self.radiance, self.confidence, self.missing, self.cells, self.recovered, self.recovered)
 
     def solve(self) -> recovery.Estimate:
         """Solve on the host, warm after the first call."""

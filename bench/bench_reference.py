@@ -18,10 +18,10 @@ from bench.common import measure, report, time_once
 from warp_ar.accuracy.known_frame import light_up_to
 from warp_ar.accuracy.path_tracer import BAND, PathTracer
 from warp_ar.device import usable_cores
-from warp_ar.kernels import path_tracer
 from warp_ar.kernels.launch import launch_rows
+from warp_ar.kernels.path_vertices import LocalScene, make_find_vertex
 from warp_ar.kernels.structs import FrameParams
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 
 CASES = ("torus", "desk", "mirror")
@@ -37,11 +37,11 @@ WANTED = 0.01
 
 @functools.cache
 def make_primary_kernel(trace: TraceConfig) -> wp.Kernel:
-    find_vertex = path_tracer.make_find_vertex(trace)
+    find_vertex = make_find_vertex(trace)
 
     @wp.kernel(module="unique", enable_backward=False)
     def primary_kernel(
-        row_start: wp.int32, params: wp.array[FrameParams], scene: path_tracer.LocalScene, depth: wp.array2d[wp.float32]
+        row_start: wp.int32, params: wp.array[FrameParams], scene: LocalScene, depth: wp.array2d[wp.float32]
     ):
         i, j = wp.tid()
         i += row_start

@@ -14,6 +14,7 @@ from warp_ar.kernels import color, environment_samples, receiver_cells, relight,
 from warp_ar.kernels.edges import EdgeLists
 from warp_ar.kernels.environment_samples import EnvironmentSample
 from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.receiver import METHODS, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import (
     BOX,
     PLANE,
@@ -28,7 +29,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 
 H, W = 480, 640
 
@@ -61,7 +62,7 @@ class World:
 def _cells(world: World, out: wp.array) -> dict[str, Callable[[], None]]:
     """Passes of the method ``bounce``, in their order, in a white environment."""
     device, trace = world.device, TraceConfig((SPHERE,), (PLANE, BOX))
-    config = relight.RelightConfig("reflectance", trace, "sh", True, ambient_visibility=True, bounced=True)
+    config = RelightConfig("reflectance", trace, "sh", True, ambient_visibility=True, bounced=True)
     place, ambient_stride, stride, patch_stride = receiver_cells.CellConfig(config), 4, 8, 16
     environment = wp.full((64, 128), wp.vec3(1.0, 1.0, 1.0), dtype=wp.vec3, device=device)
     cumulative = wp.zeros((64, 128), wp.float32, device=device)
@@ -73,13 +74,13 @@ def _cells(world: World, out: wp.array) -> dict[str, Callable[[], None]]:
     def grid(size: int, dtype: type) -> wp.array:
         return wp.zeros((-(-H // size), -(-W // size)), dtype, device=device)
 
-    cells = relight.ReceiverCells()
+    cells = ReceiverCells()
     cells.ambient_visibility, cells.ambient_surface = grid(ambient_stride, wp.vec3), grid(ambient_stride, wp.int32)
     cells.bounced, cells.bounced_surface = grid(stride, wp.vec3), grid(stride, wp.int32)
     cells.ambient_stride, cells.bounced_stride = ambient_stride, stride
     patches, listed = grid(patch_stride, receiver_cells.Patch), grid(patch_stride, receiver_cells.Patch)
     count = wp.zeros(patches.shape[0], wp.int32, device=device)
-    receiver = relight.make_receiver(config, world.picture, cells=cells, **world.known)
+    receiver = make_receiver(config, world.picture, cells=cells, **world.known)
     inputs = world.params, world.scene, world.lights, receiver
     shape, on_cuda = cells.ambient_visibility.shape, wp.get_device(device).is_cuda
     partials = count_partials(*shape, receiver_cells.MAX_PARTIALS) if on_cuda else 1
@@ -113,9 +114,9 @@ def _edges(world: World) -> dict[str, Callable[[], None]]:
     device = world.device
     for samples in (4, 16):
         trace = TraceConfig((SPHERE,), (PLANE, BOX))
-        config = relight.RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
+        config = RelightConfig("reflectance", trace, "sh", True, edge_samples=samples)
         visibility, out = wp.zeros((H, W), wp.int32, device=device), wp.zeros((H, W), wp.vec3, device=device)
-        receiver = relight.make_receiver(config, world.picture, **world.known)
+        receiver = make_receiver(config, world.picture, **world.known)
         count = wp.zeros(1, wp.int32, device=device)
         edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
         lists = EdgeLists(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
@@ -160,9 +161,9 @@ def main(device: str) -> None:
     known = {"table": table, "probes": probes, "key_lights": keys, "irradiance": surroundings}
     world = World(device, params, make_picture(frame, decode, rays), scene, lights, known)
     contenders: dict[str, Callable[[], None]] = {}
-    for method in relight.METHODS:
-        config = relight.RelightConfig(method, TraceConfig((SPHERE,), (PLANE, BOX)), "sh", True)
-        receiver = relight.make_receiver(config, world.picture, **known)
+    for method in METHODS:
+        config = RelightConfig(method, TraceConfig((SPHERE,), (PLANE, BOX)), "sh", True)
+        receiver = make_receiver(config, world.picture, **known)
         call = functools.partial(relight.relight, config, params, scene, lights, receiver, out)
         call()
         bright = 0.3 * 0.3 / (np.pi * (0.02 + 0.09) ** 1.5)  # a white desk at the frame's centre

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.scene import (
     Camera,
     LambertMaterial,

@@ -52,9 +52,10 @@ from warp_ar.kernels.sampling import (
     sample_ggx_visible,
     sample_phong_lobe,
 )
+from warp_ar.kernels.shapes import sphere_uv, to_local_point
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS, MIRROR, PHONG, SPHERE, AreaLight, Hit, RayScene, Shape
 from warp_ar.kernels.textures import SurfacePoint, point_of_triangle
-from warp_ar.kernels.visibility import TraceConfig, make_trace, offset_origin, sphere_uv, to_local_point
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,7 +14,8 @@ import warp as wp
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene, vec8
 from warp_ar.kernels.surfaces import make_physical_surface
-from warp_ar.kernels.visibility import TraceConfig, check_edge_samples, make_primary, make_sample_direction
+from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.visibility import check_edge_samples, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

@@ -47,8 +47,9 @@ import warp as wp
 from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.shapes import FAR, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import FAR, TraceConfig, intersect_sphere, make_trace
+from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
 

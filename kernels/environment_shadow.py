@@ -50,8 +50,10 @@ from warp_ar.kernels.environment_shadow_wavefront import Wavefront, shade_wavefr
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
-from warp_ar.kernels.structs import FrameParams, Picture, RayScene
-from warp_ar.kernels.visibility import FAR, Hit, make_trace, make_visible_proxy, offset_origin, surface_key
+from warp_ar.kernels.shapes import FAR, surface_key
+from warp_ar.kernels.structs import FrameParams, Hit, Picture, RayScene
+from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
 

@@ -25,8 +25,8 @@ import warp as wp
 
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import make_surface, reflect
-from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -40,8 +40,9 @@ from warp_ar.kernels.reflect import (
     make_shade_unoccluded,
 )
 from warp_ar.kernels.sampling import frame_from_normal, sample_cosine_hemisphere, uniform_from_bits
-from warp_ar.kernels.structs import SPHERE, FrameParams, Picture, RayScene, Shape
-from warp_ar.kernels.visibility import FAR, Hit, make_trace, offset_origin
+from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.structs import SPHERE, FrameParams, Hit, Picture, RayScene, Shape
+from warp_ar.kernels.trace import make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

@@ -24,8 +24,9 @@ from warp_ar.kernels.environment_shadow_cells import (
 )
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.reflect import DistantLightConfig
+from warp_ar.kernels.shapes import FACES, MESH_KEY, surface_key
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import FACES, MESH_KEY, inside_rect, make_visible_proxy, surface_key
+from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
 

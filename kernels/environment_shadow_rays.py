@@ -19,8 +19,9 @@ from warp_ar.kernels.environment_shadow_cells import EnvironmentShadowConfig
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.reflect import DistantLight, look_up, make_find_in_frame
+from warp_ar.kernels.shapes import FAR, intersect_sphere
 from warp_ar.kernels.structs import BOX, PLANE, FrameParams, Picture, RayScene
-from warp_ar.kernels.visibility import FAR, intersect_sphere, make_trace
+from warp_ar.kernels.trace import make_trace
 
 wp.set_module_options({"enable_backward": False})
 

@@ -30,8 +30,10 @@ from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
 from warp_ar.kernels.launch import MOST_REGISTERS, launch
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
+from warp_ar.kernels.shapes import FAR, intersect_sphere, surface_key
 from warp_ar.kernels.structs import FrameParams, Picture, RayScene
-from warp_ar.kernels.visibility import FAR, intersect_sphere, make_trace, make_visible_proxy, offset_origin, surface_key
+from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.visibility import make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
 

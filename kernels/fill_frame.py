@@ -22,8 +22,9 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import pixel_radiance
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace
+from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
 

@@ -38,9 +38,9 @@ import warp as wp
 
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import ggx_lobe, reflect, schlick
 from warp_ar.kernels.pixels import shown_radiance
-from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.sampling import (
     frame_from_normal,
@@ -53,16 +53,10 @@ from warp_ar.kernels.sampling import (
 )
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import make_sample_light, make_visible_share, tile_turn
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import FrameParams, Hit, Light, Picture, Probe, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    TraceConfig,
-    inside_rect,
-    make_sample_direction,
-    make_trace,
-    meets_probe,
-    offset_origin,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace, meets_probe, offset_origin
+from warp_ar.kernels.visibility import inside_rect, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

@@ -33,7 +33,7 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.prefilter import energy_compensation, sample_dfg
+from warp_ar.kernels.split_sum import energy_compensation, sample_dfg
 from warp_ar.kernels.structs import BOX, METALLIC_ROUGHNESS, MIRROR, PHONG, Hit, Material, RayScene
 from warp_ar.kernels.textures import SurfacePoint, point_of_triangle, sample_texture, slant
 

@@ -23,21 +23,15 @@ import warp as wp
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
 from warp_ar.kernels.pixels import shown_radiance
+from warp_ar.kernels.receiver import Receiver, RelightConfig
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
-from warp_ar.kernels.relight import Receiver, RelightConfig, make_direct_lighting
+from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shade import NearPoint, ShadeConfig, make_shade_hit
 from warp_ar.kernels.shadow import tile_turn
+from warp_ar.kernels.shapes import FAR, ROUNDING, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Light, Probe, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    ROUNDING,
-    TraceConfig,
-    inside_rect,
-    intersect_sphere,
-    make_sample_direction,
-    make_trace,
-    offset_origin,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.visibility import inside_rect, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,8 +13,8 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.shapes import to_local_point
 from warp_ar.kernels.structs import FrameParams, RayScene, Shape
-from warp_ar.kernels.visibility import to_local_point
 
 wp.set_module_options({"enable_backward": False})
 

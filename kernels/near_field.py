@@ -47,8 +47,8 @@ from warp_ar.kernels.color import brightness
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import Surface, make_surface, material_at, reflect, roughness_at, surface_point
-from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -64,16 +64,10 @@ from warp_ar.kernels.sampling import (
     sample_ggx_visible,
     sample_phong_lobe,
 )
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Picture, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    VisibleObjects,
-    inside_rect,
-    make_primary,
-    make_sample_direction,
-    make_trace,
-    offset_origin,
-)
+from warp_ar.kernels.trace import make_trace, offset_origin
+from warp_ar.kernels.visibility import VisibleObjects, inside_rect, make_primary, make_sample_direction
 
 wp.set_module_options({"enable_backward": False})
 

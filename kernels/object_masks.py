@@ -5,16 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.shapes import FAR, intersect_box, intersect_sphere, meets_mesh, to_local_point, to_local_vector
 from warp_ar.kernels.structs import BOX, MESH, SPHERE, FrameParams, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    inside_rect,
-    intersect_box,
-    intersect_sphere,
-    meets_mesh,
-    to_local_point,
-    to_local_vector,
-)
+from warp_ar.kernels.visibility import inside_rect
 
 wp.set_module_options({"enable_backward": False})
 

@@ -52,8 +52,8 @@ from warp_ar.kernels.sampling import (
     uniform_from_bits,
 )
 from warp_ar.kernels.shadow import LightSample, has_penumbra, sample_light
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, Emitter, Light
-from warp_ar.kernels.visibility import FAR
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,6 +1,6 @@
 """What ``relight`` needs to know of the receiver beyond its own pixel, estimated for cells of the frame.
 
-**Ambient visibility.** Reflectance is what the camera sees over what the environment sends (``relight``, equation 3).
+**Ambient visibility.** Reflectance is what the camera sees over what the environment sends (``receiver``, equation 3).
 The environment's filtered irradiance knows nothing of what stands in the way: in the shadow of the ball or of a box it
 is too much, and the receiver would be taken for darker than it is. So per cell, over the environment's samples
 (``environment_samples``),
@@ -37,24 +37,13 @@ from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch, launch_rows
-from warp_ar.kernels.relight import (
-    DEFAULT_REFLECTANCE,
-    Receiver,
-    ReceiverCells,
-    RelightConfig,
-    make_direct_lighting,
-)
+from warp_ar.kernels.receiver import DEFAULT_REFLECTANCE, Receiver, ReceiverCells, RelightConfig
+from warp_ar.kernels.relight import make_direct_lighting
 from warp_ar.kernels.shadow import sample_light, tile_turn
+from warp_ar.kernels.shapes import intersect_sphere, surface_key
 from warp_ar.kernels.structs import PLANE, FrameParams, Light, RayScene
-from warp_ar.kernels.visibility import (
-    TraceConfig,
-    inside_rect,
-    intersect_sphere,
-    make_trace,
-    make_visible_proxy,
-    offset_origin,
-    surface_key,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.visibility import inside_rect, make_visible_proxy
 
 wp.set_module_options({"enable_backward": False})
 
@@ -427,7 +416,7 @@ def estimate_ambient_visibility(
         params: (1,) FrameParams: camera and light_rect.
         scene: Proxies.
         lights: (n,) Light.
-        receiver: From ``relight.make_receiver``: picture, balls and the environment's irradiance; with the cells of
+        receiver: From ``make_receiver``: picture, balls and the environment's irradiance; with the cells of
             ``gather_light`` if ``bounced``.
         samples: (n,) of the environment.
         count: How many of them are used, the first ones. The same for all cells, so there is no noise; an aligned block
@@ -475,8 +464,7 @@ def send_light(
         params: (1,) FrameParams: camera and light_rect.
         scene: Objects and proxies.
         lights: (n,) Light.
-        receiver: From ``relight.make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has
-            them.
+        receiver: From ``make_receiver``, with the cells of ``estimate_ambient_visibility`` where the config has them.
         stride: Pixels along a patch.
         patches_out: (ceil(H / stride), ceil(W / stride)) patches; those that send nothing have no area.
         rows: Band of rows of patches; None means all.
@@ -529,7 +517,7 @@ def gather_light(
         config: As for ``estimate_ambient_visibility``.
         params: (1,) FrameParams: camera and light_rect.
         scene: Proxies.
-        receiver: From ``relight.make_receiver``: picture, balls and the environment's irradiance.
+        receiver: From ``make_receiver``: picture, balls and the environment's irradiance.
         patches: (r, c) of ``list_patches``; only rows that light_rect reaches are read.
         count: (r,) how many of a row send light.
         patch_stride: Pixels along a patch.

@@ -8,19 +8,8 @@ radiance L receives
     visibility.
 
 The kernels here fill the two sides: ``observe_surfaces`` measures L, ``trace_transfer`` works out T, ``trace_emitters``
-the same for emitters at finite distances. ``warp_ar.light.recovery`` solves for what is missing in the clipped cells,
-``add_recovered`` puts it into the map.
-
-**Saturation boundaries.** Half a pixel around an emitter clips as well: ``weigh_boundaries``.
-
-**Cells.** The environment is condensed to ``CELL_ROWS`` x ``CELL_COLUMNS`` cells of a latlong grid (5.6 degrees), each
-with its mean radiance, its share at clipping, and the direction in which that share lies.
-
-**Visibility.** From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own
-size, the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex
-mirror does; that is kept apart, for real balls scatter some of it. Where a proxy is in the way, its radiance is what
-the ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left for
-what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+the same for emitters at finite distances. ``kernels/recover_cells.py`` has the cells; ``warp_ar.light.recovery`` solves
+for what is missing in the clipped ones.
 """
 
 from __future__ import annotations
@@ -31,47 +20,24 @@ import warp as wp
 
 from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
-from warp_ar.kernels.latlong import (
-    PI,
-    direction_from_latlong,
-    latlong_from_direction,
-    sample_latlong,
-    sample_row,
-    texel_solid_angle,
-)
+from warp_ar.kernels.latlong import PI
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.recover_cells import Cell, cell_of
+from warp_ar.kernels.shapes import FAR, ROUNDING
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 from warp_ar.kernels.unwrap import reflecting_normal
-from warp_ar.kernels.visibility import FAR, ROUNDING, TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
-
-CELL_ROWS = 32
-CELL_COLUMNS = 64
 
 PATCH = wp.constant(5)
 """Points along the side of the patch over which a surface point is averaged."""
 BALL_MARGIN = wp.constant(wp.float32(1.08))
 """How much larger a ball is taken to be where it hides surfaces from the camera: its outline's blur."""
-FULL_TRUST = wp.constant(wp.float32(0.5))
-"""Confidence above which a texel counts as seen; as for filling."""
-LOST = 0.02
-"""Clipped share from which a cell's light is where it clips, not where nothing is seen, and the cell is in a region."""
-_LOST = wp.constant(wp.float32(LOST))
 FAR_FROM_BALL = wp.constant(wp.float32(10.0))
 """Radii from which what a ball throws is left out: (R / 2 s)^2, less than a four-hundredth of the light itself."""
 GRAZING = wp.constant(wp.float32(1.0e-3))
 """Cosine below which a ball mirrors nothing: the light passes along its outline, and is seen straight."""
-MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
-"""Radians: balls of less than ten pixels are taken to have ten."""
-WIDE = wp.constant(wp.float32(6.0))
-"""Half pixels: what is wider clips hardly beyond its boundary, for it exceeds clipping by less than an emitter does."""
-SHARPNESS = wp.constant(wp.float32(2.0))
-"""Exponent of the share around a texel of the smallest emitter."""
-BOUNDARY_REACH = wp.constant(2)
-"""Samples of a Gaussian to each side, one standard deviation apart."""
-MOST_LEFT = wp.constant(wp.float32(4.0))
-"""How much more light what still clips of a cell may get because less of it clips."""
 CLOSE = wp.constant(wp.float32(1.0e-3))
 """Relative distance within which what a camera ray meets is the surface itself."""
 
@@ -94,321 +60,6 @@ class Observation:
     deviation: wp.vec3  # standard deviation over the patch
     clipped: wp.vec3  # share of the patch at clipping
     visible: wp.float32  # share of the patch that the camera sees, 0 where it sees none
-
-
-@wp.struct
-class Cell:
-    """A part of the environment."""
-
-    radiance: wp.vec3  # mean, as captured
-    clipped: wp.vec3  # mean share that may lack light: at clipping, or, in a cell that shows no light, not seen
-    missing: wp.vec3  # the same, saturation boundaries counting less
-    hidden: wp.float32  # mean share that is not seen; 0 in a cell that shows some light
-    modelled: wp.float32  # 1 where the first ball looks at a proxy, 0 where at the environment beyond
-    middle: wp.vec3  # unit
-    direction: wp.vec3  # unit: of what is at clipping, or of the cell's middle
-    solid_angle: wp.float32
-
-
-def cell_shape(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of cells for a map of this size."""
-    return min(CELL_ROWS, height), min(CELL_COLUMNS, width)
-
-
-@wp.func
-def trust(confidence: wp.float32) -> wp.float32:
-    """How far a texel counts as seen, 0..1; 0 for NaN."""
-    t = wp.clamp(confidence / FULL_TRUST, 0.0, 1.0)
-    return wp.where(confidence > 0.0, t * t * (3.0 - 2.0 * t), 0.0)
-
-
-@wp.func
-def mean_around(
-    clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32, near_pole: wp.float32
-) -> wp.vec3:
-    """Gaussian mean around a texel, of a standard deviation in radians.
-
-    ``near_pole`` standard deviations from a pole it is taken around directions, elsewhere along rows and columns.
-    """
-    height = wp.float32(clipped.shape[0])
-    width = wp.float32(clipped.shape[1])
-    sine = wp.sin(PI * (wp.float32(i) + 0.5) / height)
-    total = wp.vec3(0.0, 0.0, 0.0)
-    total_weight = wp.float32(0.0)
-    a = wp.int32(-BOUNDARY_REACH)
-    if sine < near_pole * deviation:
-        # A circle of latitude is no straight line here.
-        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
-        across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
-        upward = wp.cross(across, direction)
-        while a <= BOUNDARY_REACH:
-            b = wp.int32(-BOUNDARY_REACH)
-            while b <= BOUNDARY_REACH:
-                toward = direction + deviation * (wp.float32(a) * across + wp.float32(b) * upward)
-                weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
-                total += weight * sample_latlong(clipped, toward)
-                total_weight += weight
-                b += 1
-            a += 1
-        return total / total_weight
-    down_step = deviation * height / PI
-    across_step = deviation * width / (2.0 * PI * sine)
-    # One row of samples at a time, those unrolled: their loads do not wait for each other.
-    while a <= BOUNDARY_REACH:
-        y = wp.float32(i) + down_step * wp.float32(a)
-        row = wp.int32(wp.floor(y))
-        part = y - wp.floor(y)
-        for b in range(wp.static(-BOUNDARY_REACH), wp.static(BOUNDARY_REACH + 1)):
-            x = wp.float32(j) + across_step * wp.float32(b)
-            top = sample_row(clipped, row, x)
-            weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
-            total += weight * (top + part * (sample_row(clipped, row + 1, x) - top))
-            total_weight += weight
-        a += 1
-    return total / total_weight
-
-
-@wp.kernel(enable_backward=False)
-def weigh_boundaries_kernel(
-    # In:
-    row_start: wp.int32,
-    clipped: wp.array2d[wp.vec3],
-    params: wp.array[FrameParams],
-    probes: wp.array[Probe],
-    # Out:
-    missing_out: wp.array2d[wp.vec3],
-):
-    """A texel times a power of the mean around it."""
-    i, j = wp.tid()
-    i += row_start
-    share = clipped[i, j]
-    if not wp.max(share) > 0.0:
-        missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
-        return
-    to_ball = probes[0].center - params[0].camera_position
-    pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
-    # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
-    half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
-    around = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
-    if around < 0.999:
-        # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
-        wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
-        around = wp.pow(around, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
-    missing_out[i, j] = share * around
-
-
-def weigh_boundaries(
-    clipped: wp.array,
-    params: wp.array,
-    probes: wp.array,
-    missing_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Weigh what clips by how likely it is the light itself: saturation boundaries count less.
-
-    A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
-    ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
-    in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
-
-        2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
-
-    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
-    (w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
-
-    Args:
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P), at least one: the ball.
-        missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
-        rows: Band of rows, None for all.
-    """
-    launch_rows(
-        weigh_boundaries_kernel,
-        clipped.shape,
-        [clipped, params, probes],
-        [missing_out],
-        rows=rows,
-        device=clipped.device,
-    )
-
-
-@functools.cache
-def make_condense_cells_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel for the given kinds of proxy."""
-    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
-    def condense_cells_kernel(
-        # In:
-        row_start: wp.int32,
-        radiance: wp.array2d[wp.vec3],
-        confidence: wp.array2d[wp.float32],
-        clipped: wp.array2d[wp.vec3],
-        missing: wp.array2d[wp.vec3],
-        probes: wp.array[Probe],
-        scene: RayScene,
-        # Out:
-        cells_out: wp.array2d[Cell],
-    ):
-        band_row, column = wp.tid()
-        row = row_start + band_row
-        height = radiance.shape[0]
-        width = radiance.shape[1]
-        rows = cells_out.shape[0]
-        columns = cells_out.shape[1]
-        cell = Cell()
-        toward = wp.vec3(0.0, 0.0, 0.0)
-        lost_toward = wp.vec3(0.0, 0.0, 0.0)
-        for i in range(row * height // rows, (row + 1) * height // rows):
-            area = texel_solid_angle(i, height, width)
-            for j in range(column * width // columns, (column + 1) * width // columns):
-                direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, height, width)
-                trusted = trust(confidence[i, j])
-                lost = trusted * clipped[i, j]
-                cell.solid_angle += area
-                cell.radiance += area * radiance[i, j]
-                cell.clipped += area * lost
-                cell.missing += area * trusted * missing[i, j]
-                cell.hidden += area * (1.0 - trusted)
-                toward += area * direction
-                lost_toward += area * (lost[0] + lost[1] + lost[2]) * direction
-        cell.radiance /= cell.solid_angle
-        cell.clipped /= cell.solid_angle
-        cell.missing /= cell.solid_angle
-        cell.hidden /= cell.solid_angle
-        if wp.max(cell.clipped) > _LOST:
-            cell.hidden = 0.0
-        else:
-            cell.clipped += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
-            cell.missing += cell.hidden * wp.vec3(1.0, 1.0, 1.0)
-        cell.middle = wp.normalize(toward)
-        cell.direction = cell.middle
-        if wp.length(lost_toward) > 0.0:
-            cell.direction = wp.normalize(lost_toward)
-        if trace.occluded_by_proxies(scene, probes[0].center, cell.direction, FAR):
-            cell.modelled = 1.0
-        cells_out[row, column] = cell
-
-    return condense_cells_kernel
-
-
-def condense_cells(
-    radiance: wp.array,
-    confidence: wp.array,
-    clipped: wp.array,
-    missing: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    cells_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Condense a map to cells.
-
-    Args:
-        radiance: ``wp.vec3`` (h, w), complete.
-        confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
-        missing: The same from ``weigh_boundaries``.
-        probes: ``Probe`` (P), at least one.
-        scene: Its proxies are known surfaces: what clips there is lit, not a light.
-        cells_out: ``Cell``, ``cell_shape(h, w)``.
-        proxies: Kinds of proxy in the scene.
-        rows: Band of cell rows, None for all.
-    """
-    launch_rows(
-        make_condense_cells_kernel(proxies),
-        cells_out.shape,
-        [radiance, confidence, clipped, missing, probes, scene],
-        [cells_out],
-        rows=rows,
-        device=cells_out.device,
-    )
-
-
-@wp.func
-def missing_share(confidence: wp.float32, missing: wp.vec3, unseen: wp.float32) -> wp.vec3:
-    """Share of a texel that lacks light, where ``unseen`` is what counts of one that is not seen."""
-    trusted = trust(confidence)
-    return trusted * missing + unseen * (1.0 - trusted) * wp.vec3(1.0, 1.0, 1.0)
-
-
-@wp.kernel(enable_backward=False)
-def add_recovered_kernel(
-    # In:
-    row_start: wp.int32,
-    radiance: wp.array2d[wp.vec3],
-    confidence: wp.array2d[wp.float32],
-    missing: wp.array2d[wp.vec3],
-    cells: wp.array2d[Cell],
-    recovered: wp.array2d[wp.vec3],
-    # Out:
-    recovered_out: wp.array2d[wp.vec3],
-):
-    """Every texel of a cell plus its share of the cell's excess."""
-    band_row, column = wp.tid()
-    row = row_start + band_row
-    height = radiance.shape[0]
-    width = radiance.shape[1]
-    top = row * height // recovered.shape[0]
-    bottom = (row + 1) * height // recovered.shape[0]
-    left = column * width // recovered.shape[1]
-    right = (column + 1) * width // recovered.shape[1]
-    unseen = wp.where(cells[row, column].hidden > 0.0, 1.0, 0.0)
-    now = wp.vec3(0.0, 0.0, 0.0)
-    solid_angle = wp.float32(0.0)
-    for i in range(top, bottom):
-        area = texel_solid_angle(i, height, width)
-        for j in range(left, right):
-            now += area * missing_share(confidence[i, j], missing[i, j], unseen)
-            solid_angle += area
-    now /= solid_angle
-    more = recovered[row, column]
-    then = cells[row, column].missing
-    for c in range(3):
-        if now[c] > 0.0:
-            more[c] *= wp.min(then[c] / now[c], MOST_LEFT)
-    for i in range(top, bottom):
-        for j in range(left, right):
-            share = missing_share(confidence[i, j], missing[i, j], unseen)
-            recovered_out[i, j] = radiance[i, j] + wp.cw_mul(share, more)
-
-
-def add_recovered(
-    radiance: wp.array,
-    confidence: wp.array,
-    missing: wp.array,
-    cells: wp.array,
-    recovered: wp.array,
-    recovered_out: wp.array,
-    *,
-    rows: Rows | None = None,
-) -> None:
-    """Give texels back what they lost.
-
-    Where more or less of a cell clips than when its excess was found, the energy stays what was found: a thousandth
-    that clips can have a high excess, and in the next frame be half of the cell; a video codec takes the weakest
-    channel of an emitter across the limit and back. Below a quarter of the share the energy falls with it.
-
-    Args:
-        radiance: As captured and completed, ``wp.vec3`` (h, w).
-        confidence: How well each texel was seen, ``wp.float32`` (h, w).
-        missing: Share at clipping per channel from ``weigh_boundaries``, ``wp.vec3`` (h, w).
-        cells: ``Cell``, ``cell_shape(h, w)``, of when the excess was found.
-        recovered: Radiance that a wholly clipped texel lacks, per cell: ``wp.vec3``, ``cell_shape(h, w)``.
-        recovered_out: ``wp.vec3`` (h, w).
-        rows: Band of rows of cells, None for all.
-    """
-    launch_rows(
-        add_recovered_kernel,
-        recovered.shape,
-        [radiance, confidence, missing, cells, recovered],
-        [recovered_out],
-        rows=rows,
-        device=recovered_out.device,
-    )
 
 
 @wp.func
@@ -488,17 +139,9 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
     return grey * cosine / spread
 
 
-@wp.func
-def cell_of(direction: wp.vec3, rows: wp.int32, columns: wp.int32) -> wp.int32:
-    """Index of the cell that holds a direction."""
-    at = latlong_from_direction(direction, rows, columns)
-    row = wp.clamp(wp.int32(at[0]), 0, rows - 1)
-    return row * columns + wp.clamp(wp.int32(at[1]), 0, columns - 1)
-
-
 @functools.cache
-def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
-    """Kernels for the given kinds of proxy: observe, transfer, emitters."""
+def make_observe_surfaces_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``observe_surfaces`` for the given kinds of proxy."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
 
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
@@ -559,6 +202,54 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     seen.deviation[channel] = wp.sqrt(wp.max(squares[channel], 0.0) / count)
         observations_out[index] = seen
 
+    return observe_surfaces_kernel
+
+
+def observe_surfaces(
+    frame: wp.array,
+    decode_table: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    points: wp.array,
+    observations_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Measure what the frame shows of surface points.
+
+    Args:
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
+        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P): they hide surfaces.
+        scene: Its proxies hide surfaces as well.
+        points: ``SurfacePoint`` (n).
+        observations_out: ``Observation`` (n).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_observe_surfaces_kernel(proxies),
+        observations_out.shape,
+        [frame, decode_table, params, probes, scene, points],
+        [observations_out],
+        rows=rows,
+        device=observations_out.device,
+    )
+
+
+# Visibility. From x a cell is hidden in part or whole by a ball, softly: the cell is taken as a disc of its own size,
+# the ball as an edge in front of it. The ball also throws the light of every cell onto the point, as a convex mirror
+# does; that is kept apart, for real balls scatter some of it. Where a proxy is in the way, its radiance is what the
+# ball shows of it: the share goes to the cell in which the ball sees the point that was hit (no parallax is left for
+# what is modelled). The horizon needs no mention: what lies below a surface has no cosine.
+@functools.cache
+def make_trace_transfer_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``trace_transfer`` for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_transfer_kernel(
         # In:
@@ -603,6 +294,53 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                     target = cell_of(hit.point - probes[0].center, rows, columns)
                 transfer_out[index, target] = transfer_out[index, target] + share
 
+    return trace_transfer_kernel
+
+
+def trace_transfer(
+    points: wp.array,
+    observations: wp.array,
+    cells: wp.array,
+    probes: wp.array,
+    scene: RayScene,
+    traced_out: wp.array,
+    transfer_out: wp.array,
+    mirrored_out: wp.array,
+    *,
+    proxies: tuple[int, ...],
+    rows: Rows | None = None,
+) -> None:
+    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
+
+    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
+
+    Args:
+        points: ``SurfacePoint`` (n).
+        observations: ``Observation`` (n): points that the camera does not see are left out.
+        cells: ``Cell`` (rows, columns): middles and solid angles.
+        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
+        scene: Its proxies hide the environment.
+        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
+        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
+        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
+        proxies: Kinds of proxy in the scene.
+        rows: Band of points, None for all.
+    """
+    launch_rows(
+        make_trace_transfer_kernel(proxies),
+        points.shape,
+        [points, observations, cells, probes, scene],
+        [traced_out, transfer_out, mirrored_out],
+        rows=rows,
+        device=transfer_out.device,
+    )
+
+
+@functools.cache
+def make_trace_emitters_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
+    """Kernel of ``trace_emitters`` for the given kinds of proxy."""
+    trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def trace_emitters_kernel(
         # In:
@@ -642,81 +380,7 @@ def make_kernels(proxies: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel, wp.Ker
                 given += beam * mirrored_irradiance(probes[k], point, wp.normalize(from_ball))
         transfer_out[row, index] = given
 
-    return observe_surfaces_kernel, trace_transfer_kernel, trace_emitters_kernel
-
-
-def observe_surfaces(
-    frame: wp.array,
-    decode_table: wp.array,
-    params: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    points: wp.array,
-    observations_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Measure what the frame shows of surface points.
-
-    Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
-        decode_table: Linear value of each code, ``wp.vec3`` (256).
-        params: ``FrameParams`` (1): the camera.
-        probes: ``Probe`` (P): they hide surfaces.
-        scene: Its proxies hide surfaces as well.
-        points: ``SurfacePoint`` (n).
-        observations_out: ``Observation`` (n).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_kernels(proxies)[0],
-        observations_out.shape,
-        [frame, decode_table, params, probes, scene, points],
-        [observations_out],
-        rows=rows,
-        device=observations_out.device,
-    )
-
-
-def trace_transfer(
-    points: wp.array,
-    observations: wp.array,
-    cells: wp.array,
-    probes: wp.array,
-    scene: RayScene,
-    traced_out: wp.array,
-    transfer_out: wp.array,
-    mirrored_out: wp.array,
-    *,
-    proxies: tuple[int, ...],
-    rows: Rows | None = None,
-) -> None:
-    """Irradiance that a surface point receives from each cell of the environment, per unit of the cell's radiance.
-
-    Nothing of it changes from frame to frame, so each point is traced once: when the camera first sees it.
-
-    Args:
-        points: ``SurfacePoint`` (n).
-        observations: ``Observation`` (n): points that the camera does not see are left out.
-        cells: ``Cell`` (rows, columns): middles and solid angles.
-        probes: ``Probe`` (P), at least one; the environment is the one that the first sees.
-        scene: Its proxies hide the environment.
-        traced_out: 1 where a point has been traced, 0 before, ``wp.int32`` (n).
-        transfer_out: Straight, past balls and proxies, ``wp.float32`` (n, rows * columns).
-        mirrored_out: By way of balls, ``wp.float32`` (n, rows * columns).
-        proxies: Kinds of proxy in the scene.
-        rows: Band of points, None for all.
-    """
-    launch_rows(
-        make_kernels(proxies)[1],
-        points.shape,
-        [points, observations, cells, probes, scene],
-        [traced_out, transfer_out, mirrored_out],
-        rows=rows,
-        device=transfer_out.device,
-    )
+    return trace_emitters_kernel
 
 
 def trace_emitters(
@@ -745,7 +409,7 @@ def trace_emitters(
         stream: CUDA stream; None means the device's current one.
     """
     launch_rows(
-        make_kernels(proxies)[2],
+        make_trace_emitters_kernel(proxies),
         transfer_out.shape,
         [points, observations, emitters, probes, scene],
         [transfer_out],

@@ -19,9 +19,9 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.emitters import add_emitters, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.lobes import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.materials import make_surface, reflect, specular_occlusion
 from warp_ar.kernels.pixels import shown_radiance
-from warp_ar.kernels.prefilter import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.structs import (
     LAMBERT,
     METALLIC_ROUGHNESS,
@@ -29,11 +29,12 @@ from warp_ar.kernels.structs import (
     PHONG,
     Emitter,
     FrameParams,
+    Hit,
     Picture,
     Probe,
     RayScene,
 )
-from warp_ar.kernels.visibility import Hit, TraceConfig, make_trace, meets_probe
+from warp_ar.kernels.trace import TraceConfig, make_trace, meets_probe
 
 wp.set_module_options({"enable_backward": False})
 

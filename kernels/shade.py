@@ -50,9 +50,8 @@ from warp_ar.kernels.shadow import (
     make_visible_share,
     tile_turn,
 )
-from warp_ar.kernels.structs import FrameParams, Light, RayScene
+from warp_ar.kernels.structs import FrameParams, Hit, Light, RayScene
 from warp_ar.kernels.visibility import (
-    Hit,
     VisibleObjects,
     check_edge_samples,
     inside_rect,

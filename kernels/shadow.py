@@ -13,8 +13,9 @@ import math
 import warp as wp
 
 from warp_ar.kernels.sampling import frame_from_normal
+from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import DIRECTIONAL, POINT, SPOT, Light, RayScene
-from warp_ar.kernels.visibility import FAR, TraceConfig, make_trace, offset_origin
+from warp_ar.kernels.trace import TraceConfig, make_trace, offset_origin
 
 wp.set_module_options({"enable_backward": False})
 

@@ -12,15 +12,10 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.shapes import FAR, intersect_sphere
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import (
-    FAR,
-    TraceConfig,
-    VisibleObjects,
-    inside_rect,
-    intersect_sphere,
-    make_trace,
-)
+from warp_ar.kernels.trace import TraceConfig, make_trace
+from warp_ar.kernels.visibility import VisibleObjects, inside_rect
 
 wp.set_module_options({"enable_backward": False})
 

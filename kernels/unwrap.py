@@ -34,8 +34,8 @@ from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
+from warp_ar.kernels.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
 from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
-from warp_ar.kernels.visibility import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
 
 wp.set_module_options({"enable_backward": False})
 

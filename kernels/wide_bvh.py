@@ -11,7 +11,7 @@ block ~c if not. The root is at block 0. A leaf is five blocks: x, y and z of th
 and of the third, and as integers the triangles' numbers. Children that a node lacks are boxes that no ray meets, of
 an empty leaf, which lies after the root: rays that are no numbers end, too. Triangles that a leaf lacks are points.
 
-Boxes are larger than their triangles by a margin that covers the rounding of a slab's bounds; ``kernels/visibility.py``
+Boxes are larger than their triangles by a margin that covers the rounding of a slab's bounds; ``kernels/shapes.py``
 says why no ray then slips through. Triangles are tested as Warp does, so that both devices agree: watertight [WBW13],
 edge functions by Kahan's product of differences, whose sign is exact. Directions along an axis take 1e-30 for zero:
 1 / 0 times a distance of 0 would be no number.

@@ -37,7 +37,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request

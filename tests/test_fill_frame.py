@@ -10,7 +10,8 @@ from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
 from warp_ar.kernels.fill_frame import FRAME_TRUST, OWN_SHADOW, fill_frame
 from warp_ar.scene import loads_scene
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 HEIGHT = 64
 WIDTH = 2 * HEIGHT

@@ -35,7 +35,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import ProxyMaterial, dumps_scene, loads_scene
 from warp_ar.stages.request import Request
 

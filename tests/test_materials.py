@@ -11,7 +11,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import materials as reference
 from warp_ar.kernels.materials import MIN_ALPHA, ggx_lobe, make_reflect_direct, make_surface, phong_lobe
-from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG, TEXTURES, Hit, Material, RayScene, Shape
 
 MODELS = (LAMBERT, PHONG, METALLIC_ROUGHNESS, MIRROR)

@@ -20,9 +20,9 @@ from tests.test_relight import constant_environment, records
 from warp_ar.engine.graph import make_plan
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import color, mirror_ball
+from warp_ar.kernels.receiver import METHODS as RELIGHT_METHODS
+from warp_ar.kernels.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
-from warp_ar.kernels.relight import METHODS as RELIGHT_METHODS
-from warp_ar.kernels.relight import RelightConfig, make_receiver
 from warp_ar.kernels.shade import ShadeConfig
 from warp_ar.kernels.structs import (
     BOX,
@@ -46,7 +46,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import load_scene
 from warp_ar.stages.features import find_features
 from warp_ar.stages.mirror_ball import SAMPLES, mirror_config

@@ -12,7 +12,7 @@ from tests.test_environment_shadow import COUNT, SIDE, draw, sky, sphere
 from tests.test_relight import CAMERA, DESK, LOOK_DOWN, POINTS, RAYS, H, W, records
 from warp_ar.engine.graph import make_plan
 from warp_ar.kernels import near_field, shade
-from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import DistantLight, DistantLightConfig
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -21,12 +21,14 @@ from warp_ar.kernels.structs import (
     SPHERE,
     TEXTURES,
     FrameParams,
+    Hit,
     Material,
     RayScene,
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import Hit, TraceConfig, VisibleObjects, make_visible, trace_pixels
+from warp_ar.kernels.trace import TraceConfig
+from warp_ar.kernels.visibility import VisibleObjects, make_visible, trace_pixels
 from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request

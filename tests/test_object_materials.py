@@ -13,9 +13,10 @@ import warp as wp
 from tests.gltf_files import SQUARE_UVS, Gltf
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
-from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, RayScene
-from warp_ar.kernels.visibility import FAR, make_trace
+from warp_ar.kernels.trace import TraceConfig, make_trace
 from warp_ar.scene import (
     Camera,
     FileMaterial,
@@ -26,9 +27,10 @@ from warp_ar.scene import (
     dumps_scene,
     object_from_trimesh,
 )
+from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.mesh_files import load_mesh, mesh_from_trimesh
 from warp_ar.scene.object_materials import look_of, reflects_diffusely, reflects_glossily
-from warp_ar.scene.ray_scene import HostScene, TraceConfig, trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 CAMERA = Camera(width=64, height=48, fx=600.0, fy=620.0, cx=30.5, cy=24.0)
 DETAIL = TraceConfig((0,), ()).general()

@@ -27,10 +27,10 @@ from warp_ar.kernels.path_sampling import (
     split_emitters,
     surface_density,
 )
-from warp_ar.kernels.prefilter import integrate_dfg
 from warp_ar.kernels.sampling import sample_cosine_hemisphere, sample_uniform_hemisphere
+from warp_ar.kernels.shapes import FAR
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, PHONG, Emitter, Hit, RayScene
-from warp_ar.kernels.visibility import FAR
 
 HEIGHT = 16
 COUNT = 1 << 16

@@ -9,8 +9,21 @@ from tests.reference import latlong
 from tests.reference import prefilter as reference
 from tests.reference import pyramid as reference_pyramid
 from warp_ar.engine.graph import make_plan
-from warp_ar.kernels import guards, prefilter, pyramid
+from warp_ar.kernels import guards, pyramid
 from warp_ar.kernels.latlong import direction_from_latlong
+from warp_ar.kernels.lobes import (
+    level_from_roughness,
+    level_from_shininess,
+    lobe_alpha,
+    lobe_count,
+    lobe_offset,
+    lobe_size,
+    lobe_texels,
+    make_lobe_samples,
+    mip_weights,
+    sample_levels,
+)
+from warp_ar.kernels.split_sum import energy_compensation, integrate_dfg, sample_dfg
 from warp_ar.scene import loads_scene
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.features import find_features
@@ -73,14 +86,14 @@ def sample_kernel(
 ):
     i = wp.tid()
     d = direction_from_latlong(at[i][0], at[i][1], height, 2 * height)
-    out[i] = prefilter.sample_levels(levels, d * 3.0, level, height)
+    out[i] = sample_levels(levels, d * 3.0, level, height)
 
 
 @wp.kernel(enable_backward=False)
 def level_kernel(values: wp.array[wp.float32], height: wp.int32, out: wp.array2d[wp.float32]):
     i = wp.tid()
-    out[0, i] = prefilter.level_from_roughness(values[i], height)
-    out[1, i] = prefilter.level_from_shininess(values[i], height)
+    out[0, i] = level_from_roughness(values[i], height)
+    out[1, i] = level_from_shininess(values[i], height)
 
 
 @wp.kernel(enable_backward=False)
@@ -88,8 +101,8 @@ def dfg_kernel(
     table: wp.array2d[wp.vec2], at: wp.array[wp.vec2], out: wp.array[wp.vec2], factor_out: wp.array[wp.vec3]
 ):
     i = wp.tid()
-    out[i] = prefilter.sample_dfg(table, at[i][0], at[i][1])
-    factor_out[i] = prefilter.energy_compensation(out[i], wp.vec3(1.0, 0.5, 0.0))
+    out[i] = sample_dfg(table, at[i][0], at[i][1])
+    factor_out[i] = energy_compensation(out[i], wp.vec3(1.0, 0.5, 0.0))
 
 
 def run(radiance, method, lobe="ggx", bands=1):
@@ -117,8 +130,8 @@ def run(radiance, method, lobe="ggx", bands=1):
 def unpack(levels, height):
     texels = levels.numpy().astype(np.float64)
     result = []
-    for level in range(prefilter.lobe_count(height)):
-        size, start = prefilter.lobe_size(height, level), prefilter.lobe_offset(height, level)
+    for level in range(lobe_count(height)):
+        size, start = lobe_size(height, level), lobe_offset(height, level)
         result.append(texels[start : start + size[0] * size[1]].reshape(*size, 3))
     return result
 
@@ -142,11 +155,11 @@ def sun(height, row, sky=1e-4, value=1e6):
 
 @pytest.mark.parametrize("height", [1, 2, 3, 4, 5, 7, 8, 16, 33, 64, 100, 128, 256])
 def test_levels_and_widths_fit_the_map(device, height):
-    count = prefilter.lobe_count(height)
-    assert prefilter.lobe_alpha(height, count - 1) == 1.0
-    assert prefilter.lobe_texels(height) == sum(math.prod(prefilter.lobe_size(height, level)) for level in range(count))
+    count = lobe_count(height)
+    assert lobe_alpha(height, count - 1) == 1.0
+    assert lobe_texels(height) == sum(math.prod(lobe_size(height, level)) for level in range(count))
     for level in range(1, count):
-        rows, alpha = prefilter.lobe_size(height, level)[0], prefilter.lobe_alpha(height, level)
+        rows, alpha = lobe_size(height, level)[0], lobe_alpha(height, level)
         assert rows >= 1
         assert rows >= min(height, 8 / alpha - 1)  # eight texels per unit of alpha, or all that there are
         # The kernels find the same level.
@@ -170,7 +183,7 @@ def test_levels_grow_with_roughness_and_fall_with_shininess(device, height):
         assert (np.diff(level) * sign >= -1e-6).all()
         assert np.abs(np.diff(level)).max() < 0.5  # no jump where the narrowest lobe meets the mirror
         assert level.min() >= 0
-        assert level.max() == prefilter.lobe_count(height) - 1
+        assert level.max() == lobe_count(height) - 1
 
 
 # --- Closed forms -----------------------------------------------------------------------------------------------------
@@ -216,7 +229,7 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
     radiance = np.random.default_rng(2).random((height, 2 * height, 3)) ** 8
     for index, level in enumerate(unpack(run(radiance, "brute_force", lobe), height)[1:], 1):
         directions = latlong.directions(*level.shape[:2]).reshape(-1, 3)
-        twin = reference.integrate_lobe(radiance, directions, prefilter.lobe_alpha(height, index), lobe)
+        twin = reference.integrate_lobe(radiance, directions, lobe_alpha(height, index), lobe)
         np.testing.assert_allclose(level.reshape(-1, 3), twin, rtol=1e-4, atol=ROUNDING)
         check_error("prefilter", level.reshape(-1, 3), twin)
 
@@ -225,8 +238,8 @@ def test_the_reference_is_the_twin_s(device, lobe, height):
 def test_the_reference_agrees_with_monte_carlo(device, lobe):
     height, count = 32, 200_000
     radiance = np.random.default_rng(3).random((height, 2 * height, 3)) ** 4
-    level = prefilter.lobe_count(height) - 2  # alpha 1/2
-    alpha = prefilter.lobe_alpha(height, level)
+    level = lobe_count(height) - 2  # alpha 1/2
+    alpha = lobe_alpha(height, level)
     ours = unpack(run(radiance, "brute_force", lobe), height)[level]
     rng = np.random.default_rng(4)
     samples = rng.standard_normal((count, 3))
@@ -243,26 +256,26 @@ def test_the_reference_agrees_with_monte_carlo(device, lobe):
 
 def test_mip_weights_are_a_blend_and_match_a_gaussian(device):
     for lobe in LOBES:
-        weights = prefilter.mip_weights(64, lobe)
+        weights = mip_weights(64, lobe)
         assert (weights >= 0).all()
         np.testing.assert_allclose(weights.sum(1), 1, atol=1e-9)
     # A narrow Phong lobe is a Gaussian of variance alpha^2 per axis: so is the blend.
-    weights = prefilter.mip_weights(256, "phong")
+    weights = mip_weights(256, "phong")
     texel = np.pi / 256 * 2.0 ** np.arange(weights.shape[1])
     variance = (texel**2 - texel[0] ** 2) / 12 + texel**2 / 4
     variance[0] = 0
     for level in range(2, 6):
-        assert (weights[level] * variance).sum() == pytest.approx(prefilter.lobe_alpha(256, level) ** 2, rel=0.2)
+        assert (weights[level] * variance).sum() == pytest.approx(lobe_alpha(256, level) ** 2, rel=0.2)
 
 
 def test_samples_of_a_lobe_have_its_mean_cosine(device):
     for lobe in LOBES:
-        samples = prefilter.make_lobe_samples(64, lobe, 4096, device)
+        samples = make_lobe_samples(64, lobe, 4096, device)
         cosine = (samples.directions.numpy()[..., 2] * samples.weights.numpy()).sum(1)
         np.testing.assert_allclose(samples.weights.numpy().sum(1), 1, atol=1e-5)
         theta = np.linspace(0, np.pi / 2, 20_001)
-        for level in range(1, prefilter.lobe_count(64)):
-            weight = reference.lobe(np.cos(theta), prefilter.lobe_alpha(64, level), lobe) * np.sin(theta)
+        for level in range(1, lobe_count(64)):
+            weight = reference.lobe(np.cos(theta), lobe_alpha(64, level), lobe) * np.sin(theta)
             assert cosine[level] == pytest.approx((weight * np.cos(theta)).sum() / weight.sum(), abs=1e-3)
 
 
@@ -361,7 +374,7 @@ def test_errors_on_real_environments(device, shared, name, lobe):
 
 def test_the_split_sum_is_the_quadrature_s(device):
     table = wp.zeros((17, 17), dtype=wp.vec2)
-    prefilter.integrate_dfg(table)
+    integrate_dfg(table)
     values = table.numpy()
     assert np.isfinite(values).all()
     for i in (6, 8, 12, 16):
@@ -371,7 +384,7 @@ def test_the_split_sum_is_the_quadrature_s(device):
 
 def test_the_split_sum_of_a_mirror_is_fresnel(device):
     table = wp.zeros((5, 9), dtype=wp.vec2)
-    prefilter.integrate_dfg(table)
+    integrate_dfg(table)
     cosine = np.arange(1, 9) / 8
     np.testing.assert_allclose(table.numpy()[0, 1:, 1], (1 - cosine) ** 5, atol=1e-4)
     np.testing.assert_allclose(table.numpy()[0, 1:].sum(1), 1, atol=1e-4)
@@ -379,7 +392,7 @@ def test_the_split_sum_of_a_mirror_is_fresnel(device):
 
 def test_a_white_metal_keeps_a_white_furnace_white(device):
     table = wp.zeros((32, 32), dtype=wp.vec2)
-    prefilter.integrate_dfg(table)
+    integrate_dfg(table)
     at = np.array([[a, b] for a in (-0.1, 0.0, 0.3, 1.0, 1.1) for b in (-1.0, 0.0, 0.37, 1.0, 2.0)], np.float32)
     out, factor = wp.zeros(25, dtype=wp.vec2), wp.zeros(25, dtype=wp.vec3)
     wp.launch(dfg_kernel, 25, [table, wp.array(at, dtype=wp.vec2)], [out, factor])

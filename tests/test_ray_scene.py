@@ -18,12 +18,10 @@ from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
 from warp_ar.scene import Pose
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.object_materials import reflects_diffusely, reflects_glossily
-from warp_ar.scene.ray_scene import (
-    HostScene,
-    make_ray_mesh,
-    trace_config,
-)
+from warp_ar.scene.ray_mesh import make_ray_mesh
+from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import EMPTY, Outline, screen_rects
 from warp_ar.scene.texture_pack import linear_texture
 

@@ -20,6 +20,7 @@ from tests.test_relight import CAMERA, DESK, FLOAT_ERROR, LOOK_DOWN, POINTS, con
 from warp_ar.kernels import cells as frame_cells
 from warp_ar.kernels import environment_samples, receiver_cells, relight, summed_area
 from warp_ar.kernels.environment_samples import EnvironmentSample
+from warp_ar.kernels.receiver import ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.receiver_cells import Patch
 from warp_ar.kernels.structs import (
     BOX,
@@ -34,10 +35,11 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.scene import Camera, Proxy, Scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.ray_scene import HostScene, proxies_face
+from warp_ar.scene.kinds import proxies_face
+from warp_ar.scene.ray_scene import HostScene
 
 SIZE_OF_FRAME = (48, 64)
 FOCAL = 60.0
@@ -87,9 +89,7 @@ class View:
     ):
         kinds = tuple(sorted({int(proxy["kind"]) for proxy in proxies}))
         trace = TraceConfig((), kinds if scene is None else (BOX, PLANE, MESH))
-        self.relight = relight.RelightConfig(
-            "reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms
-        )
+        self.relight = RelightConfig("reflectance", trace, "sh" if irradiance is None else "map", bool(probes), **forms)
         self.config = receiver_cells.CellConfig(self.relight)
         self.size = size
         self.params = records(
@@ -117,7 +117,7 @@ class View:
             self.surroundings = wp.array(irradiance, dtype=wp.vec3)
 
     def receiver(self, cells=None):
-        return relight.make_receiver(
+        return make_receiver(
             self.relight,
             make_picture(self.frame, tables()[0], self.rays),
             table=self.table,
@@ -133,7 +133,7 @@ class View:
     def share(self, samples, stride=4, count=None, rows=None, out=None, cells=None, bounced=False, partials=1):
         share = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = relight.ReceiverCells()
+        written = ReceiverCells()
         written.ambient_visibility, written.ambient_surface, written.ambient_stride = share, surface, stride
         sums = None
         if partials > 1:
@@ -169,7 +169,7 @@ class View:
             receiver_cells.list_patches(patches, listed, count, rows=(rows[-1][1] // 2, patches.shape[0]))
         bounced = wp.full(self.cells(stride), wp.vec3(7.0, 7.0, 7.0), dtype=wp.vec3) if out is None else out[0]
         surface = wp.full(self.cells(stride), 7, dtype=wp.int32) if out is None else out[1]
-        written = relight.ReceiverCells()
+        written = ReceiverCells()
         written.bounced, written.bounced_surface, written.bounced_stride = bounced, surface, stride
         inputs = self.config, self.params, self.scene, self.receiver(), listed, count, patch_stride
         for band in rows or [None]:
@@ -197,7 +197,7 @@ def middles(stride, size=SIZE_OF_FRAME):
 
 
 def cells_of(view, stride, share=None, share_surface=None, bounced=None, bounced_surface=None):
-    cells = relight.ReceiverCells()
+    cells = ReceiverCells()
     cells.ambient_stride = cells.bounced_stride = stride
     for name, values in (("ambient_visibility", share), ("bounced", bounced)):
         if values is not None:
@@ -679,7 +679,7 @@ def full(view, samples=None, strides=(4, 4, 4), rows=None):
     share = share[0], wp.full(view.cells(strides[0]), 7, dtype=wp.int32)
     for band in rows or [None]:
         view.share(samples, strides[0], out=share, rows=band)
-    cells = relight.ReceiverCells()
+    cells = ReceiverCells()
     cells.ambient_visibility, cells.ambient_surface, cells.ambient_stride = *share, strides[0]
     patches = wp.full(view.cells(strides[2]), Patch(), dtype=Patch)
     for band in rows or [None]:

@@ -21,6 +21,8 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.recover_cells import CELL_COLUMNS, CELL_ROWS, Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.light import fit, noise, recovery, regions
 from warp_ar.light import solver as light_solver
 from warp_ar.light import surfaces as light_surfaces
@@ -28,12 +30,13 @@ from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.problem import mirroring_points
 from warp_ar.scene import Pose, Proxy, load_scene, loads_scene
 from warp_ar.scene.geometry import rotation_matrix
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.kinds import trace_config
+from warp_ar.scene.ray_scene import HostScene
 from warp_ar.session import Session
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.recover import LATENCY, Recover
 
-ROWS, COLUMNS = kernels.CELL_ROWS, kernels.CELL_COLUMNS
+ROWS, COLUMNS = CELL_ROWS, CELL_COLUMNS
 QUADRATURE = 0.003
 """A sum over cells of 5.6 degrees against an integral of a cosine: their middles stand for them."""
 FURNACE = 0.02
@@ -107,11 +110,11 @@ def seen(device, count):
 
 def cells_of(device, radiance=1.0, clipped=0.0):
     d, solid_angle = reference.cell_directions(ROWS, COLUMNS)
-    values = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
+    values = np.zeros((ROWS, COLUMNS), np.dtype(Cell.numpy_dtype()))
     values["middle"] = values["direction"] = d.reshape(ROWS, COLUMNS, 3)
     values["solid_angle"] = solid_angle.reshape(ROWS, COLUMNS)
     values["radiance"], values["clipped"], values["missing"] = radiance, clipped, clipped
-    return values, wp.array(values, dtype=kernels.Cell, device=device)
+    return values, wp.array(values, dtype=Cell, device=device)
 
 
 def transfer_of(device, points, cells, probes, scene, proxies=()):
@@ -226,7 +229,7 @@ def ball_of(device, pixels):
 def weighed_boundaries(device, clipped, pixels):
     out = wp.full(clipped.shape[:2], wp.vec3(np.nan), dtype=wp.vec3, device=device)
     source = wp.array(clipped.astype(np.float32), dtype=wp.vec3, device=device)
-    kernels.weigh_boundaries(source, *ball_of(device, pixels), out)
+    weigh_boundaries(source, *ball_of(device, pixels), out)
     return out.numpy()
 
 
@@ -288,11 +291,11 @@ def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     to = {"dtype": wp.vec3, "device": device}
     arrays = wp.array(radiance, **to), wp.array(confidence, dtype=wp.float32, device=device), wp.array(clipped, **to)
     weighed = wp.zeros(shape, **to)
-    kernels.weigh_boundaries(arrays[2], *ball_of(device, 40.0), weighed)
-    cells = wp.zeros(kernels.cell_shape(*shape), dtype=kernels.Cell, device=device)
+    weigh_boundaries(arrays[2], *ball_of(device, 40.0), weighed)
+    cells = wp.zeros(cell_shape(*shape), dtype=Cell, device=device)
     host = HostScene(dataclasses.replace(scene, objects=()), device)
     proxies = trace_config(scene).proxies
-    kernels.condense_cells(*arrays, weighed, probes_of(device), host.ray_scene, cells, proxies=proxies)
+    condense_cells(*arrays, weighed, probes_of(device), host.ray_scene, cells, proxies=proxies)
     got = cells.numpy()
     area = reference.cell_directions(*shape)[1].reshape(shape)[..., None]
     weight = got["solid_angle"][..., None]
@@ -302,7 +305,7 @@ def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     assert not got["modelled"][0].any()
     recovered = rng.uniform(0, 5, (*got.shape, 3)).astype(np.float32)
     put_back = wp.zeros(shape, **to)
-    kernels.add_recovered(*arrays[:2], weighed, cells, wp.array(recovered, **to), put_back)
+    add_recovered(*arrays[:2], weighed, cells, wp.array(recovered, **to), put_back)
     added = (area * (put_back.numpy() - radiance)).sum((0, 1))
     meant = (weight * got["missing"] * recovered).sum((0, 1))
     assert (got["missing"] <= got["clipped"] * (1 + 1e-5)).all()
@@ -311,8 +314,8 @@ def test_cells_keep_energy_and_recovered_returns_it(device, height, scene):
     for share in (1.0, 0.3, 0.1, 0.01, 0.0):
         later = wp.array(np.full((*shape, 3), share), **to)
         now = wp.zeros_like(cells)
-        kernels.condense_cells(*arrays, later, probes_of(device), host.ray_scene, now, proxies=proxies)
-        kernels.add_recovered(*arrays[:2], later, cells, wp.array(recovered, **to), put_back)
+        condense_cells(*arrays, later, probes_of(device), host.ray_scene, now, proxies=proxies)
+        add_recovered(*arrays[:2], later, cells, wp.array(recovered, **to), put_back)
         added = (area * (put_back.numpy() - radiance)).sum((0, 1))
         left = np.minimum(got["missing"], 4.0 * now.numpy()["missing"])
         assert added == pytest.approx((weight * left * recovered).sum((0, 1)), rel=1e-4, abs=1e-6)
@@ -419,7 +422,7 @@ class DistantLight:
         values["clipped"] = values["missing"] = (radiance >= 1.0).reshape(ROWS, COLUMNS, 3)
         down = values["direction"][..., 2] < -0.05
         values["modelled"] = down
-        cells = wp.array(values, dtype=kernels.Cell, device=self.device)
+        cells = wp.array(values, dtype=Cell, device=self.device)
         straight, mirrored = transfer_of(
             self.device, self.points, cells, self.probes, self.host.ray_scene, self.proxies
         )
@@ -806,7 +809,7 @@ def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monk
 
 def what_is_seen(surroundings=0.4, table=0.3):
     """Cells and observations of an environment that does not clip."""
-    cells = np.zeros((ROWS, COLUMNS), np.dtype(kernels.Cell.numpy_dtype()))
+    cells = np.zeros((ROWS, COLUMNS), np.dtype(Cell.numpy_dtype()))
     cells["solid_angle"], cells["radiance"] = (
         reference.cell_directions(ROWS, COLUMNS)[1].reshape(ROWS, COLUMNS),
         surroundings,

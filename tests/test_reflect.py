@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from tests.test_relight import H, W, records, shape
-from warp_ar.kernels.prefilter import lobe_texels
+from warp_ar.kernels.lobes import lobe_texels
 from warp_ar.kernels.reflect import (
     DistantLight,
     DistantLightConfig,
@@ -24,13 +24,14 @@ from warp_ar.kernels.structs import (
     PLANE,
     Emitter,
     FrameParams,
+    Hit,
     Picture,
     Probe,
     RayScene,
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import Hit, TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 
 FOCAL = 60.0
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)

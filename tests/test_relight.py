@@ -8,6 +8,16 @@ from tests.reference import relight as reference
 from tests.test_composite import tables
 from warp_ar.kernels import color, relight, summed_area
 from warp_ar.kernels.edges import EdgeLists
+from warp_ar.kernels.receiver import (
+    METHODS,
+    READINGS,
+    RelightConfig,
+    make_receiver,
+    relief_factor,
+    surroundings_size,
+    text_response,
+    turned_relief,
+)
 from warp_ar.kernels.structs import (
     BOX,
     DIRECTIONAL,
@@ -23,7 +33,7 @@ from warp_ar.kernels.structs import (
     Shape,
     make_picture,
 )
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 
 H, W = 48, 64
 # Points on the desk are computed in float32, 1e-7 of a metre or so; lights are decimetres away and 1/d^2 doubles that.
@@ -89,7 +99,7 @@ def run(
     rows=None,
 ):
     frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
-    config = relight.RelightConfig(
+    config = RelightConfig(
         method,
         TraceConfig(tuple(sorted({o["kind"] for o in objects})), tuple(sorted({p["kind"] for p in proxies}))),
         "sh" if irradiance_map is None else "map",
@@ -105,7 +115,7 @@ def run(
     if irradiance_map is not None:
         surroundings = wp.array(irradiance_map, dtype=wp.vec3)
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
-    receiver = relight.make_receiver(
+    receiver = make_receiver(
         config,
         make_picture(frame_array, tables()[0], wp.array(RAYS, dtype=wp.vec2)),
         table=table,
@@ -138,9 +148,7 @@ def run_edges(
         (np.arange(width) - (width - 1) / 2) / (60 * detail), (np.arange(height) - (height - 1) / 2) / (60 * detail)
     )
     kinds = [tuple(sorted({s["kind"] for s in shapes})) for shapes in (objects, proxies)]
-    config = relight.RelightConfig(
-        "reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples
-    )
+    config = RelightConfig("reflectance", TraceConfig(*kinds), "sh", bool(probes), soft=soft, edge_samples=samples)
     place = {"camera_position": CAMERA, "world_from_camera": LOOK_DOWN, "light_rect": rect, "focal": (60, 60)}
     params = records(FrameParams, place)
     scene = RayScene()
@@ -152,7 +160,7 @@ def run_edges(
     summed_area.sum_area(frame, table)
     keys = records(KeyLight, {"direction": (0, 0, 1), "directionality": 0.0})
     rays = wp.array(np.stack([columns, lines], -1).astype(np.float32), dtype=wp.vec2)
-    receiver = relight.make_receiver(
+    receiver = make_receiver(
         config,
         make_picture(frame, tables()[0], rays),
         table=table,
@@ -288,9 +296,9 @@ def response_kernel(
     turned_out: wp.array[wp.float32],
 ):
     i = wp.tid()
-    text_out[i] = relight.text_response(n_dot_l, m, alpha[i])
-    relief_out[i] = relight.relief_factor(m, alpha[i])
-    turned_out[i] = relight.turned_relief(m, alpha[i], directionality)
+    text_out[i] = text_response(n_dot_l, m, alpha[i])
+    relief_out[i] = relief_factor(m, alpha[i])
+    turned_out[i] = turned_relief(m, alpha[i], directionality)
 
 
 def responses(n_dot_l, m, alpha, directionality=1.0):
@@ -360,7 +368,7 @@ def test_relief_keeps_the_mean(device):
 # --- twins
 
 
-@pytest.mark.parametrize("method", dict.fromkeys((*relight.METHODS, *relight.READINGS)))
+@pytest.mark.parametrize("method", dict.fromkeys((*METHODS, *READINGS)))
 def test_matches_twin(device, method):
     frame = noise_frame()
     key, directionality = unit(-0.5, 0.3, 0.8), 0.7
@@ -369,7 +377,7 @@ def test_matches_twin(device, method):
     lights = [(np.array([0.1, 0.1, 0.3]), np.array([0.3, 0.2, 0.1])), (np.array([-0.2, 0.0, 0.2]), np.array([0.1] * 3))]
     table = color.decode_table("srgb")
     radiance = reference_color.decode(table, frame)
-    around = reference.surrounding_luminance(frame, table, relight.surroundings_size(H))
+    around = reference.surrounding_luminance(frame, table, surroundings_size(H))
     expected, margin = np.zeros((H, W, 3)), np.full((H, W), np.inf)
     for at, intensity in lights:
         wi, n_dot_l, e = reference.point_light(POINTS, at, intensity)
@@ -421,7 +429,7 @@ def test_box_is_lit_on_the_side_that_faces_the_light(device):
     assert low[H // 2, 3].min() > 0.0
 
 
-@pytest.mark.parametrize("method", relight.METHODS)
+@pytest.mark.parametrize("method", METHODS)
 def test_light_behind_every_surface_adds_nothing(device, method):
     lights = [point((0, 0, -0.2)), {"kind": DIRECTIONAL, "direction": (0.0, 0.0, 1.0), "intensity": (1.0,) * 3}]
     np.testing.assert_array_equal(run(method, lights, noise_frame(), key=((0, 0, -1), 1.0)), 0.0)
@@ -445,7 +453,7 @@ def test_ball_hides_the_desk_and_throws_a_shadow(device):
     assert (dark & ~seen).any()
 
 
-@pytest.mark.parametrize("method", relight.METHODS)
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     "light",
     [
@@ -570,7 +578,7 @@ def test_listed_edges_are_the_same(device, listed):
 
 def test_edge_samples_must_be_a_square_number():
     with pytest.raises(ValueError, match="edge_samples is 3; expected a square number"):
-        relight.RelightConfig("flat", TraceConfig((), (PLANE,)), edge_samples=3)
+        RelightConfig("flat", TraceConfig((), (PLANE,)), edge_samples=3)
 
 
 # --- culling
@@ -608,8 +616,9 @@ def test_nearer_to_the_truth_method_by_method(device, shared):
     import cv2
 
     from warp_ar.scene import load_scene
+    from warp_ar.scene.kinds import trace_config
     from warp_ar.scene.pixel_rays import pixel_rays
-    from warp_ar.scene.ray_scene import HostScene, trace_config
+    from warp_ar.scene.ray_scene import HostScene
 
     case = shared / "truth" / "gold_torus_interior"
     scene = load_scene(case / "scene_light.toml")
@@ -632,10 +641,10 @@ def test_nearer_to_the_truth_method_by_method(device, shared):
     before, wanted = (reference_color.decode(decode_table, image) for image in (camera, truth))
     changed = np.abs(wanted - before).max(-1) > 0.05
     left = {}
-    for method in relight.METHODS:
+    for method in METHODS:
         added = wp.zeros((height, width), wp.vec3)
-        config = relight.RelightConfig(method, trace_config(scene), "sh", True)
-        receiver = relight.make_receiver(
+        config = RelightConfig(method, trace_config(scene), "sh", True)
+        receiver = make_receiver(
             config,
             picture,
             table=table,

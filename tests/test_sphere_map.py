@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from tests.error_model import check_error
 from tests.reference import color as reference_color
 from tests.reference import sphere_map as reference
-from warp_ar.kernels import color, prefilter, sphere_map
+from warp_ar.kernels import color, sphere_map
+from warp_ar.kernels.lobes import lobe_count
 from warp_ar.kernels.structs import FrameParams, Probe
 
 H, W = 96, 128
@@ -218,7 +219,7 @@ def test_bands_give_the_same_bits(device):
 @pytest.mark.parametrize("height", [32, 64, 128, 256])
 def test_lobes_widen_level_by_level(height):
     """The mirror is the texture itself, the widest lobe the level of 2x2, each one between twice as wide."""
-    lobes = prefilter.lobe_count(height)
+    lobes = lobe_count(height)
     levels = [sphere_map.glossy_level(lobe, lobes) for lobe in range(lobes)]
     assert levels[0] == 0
     assert sphere_map.level_size(levels[-1]) == 2

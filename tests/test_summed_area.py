@@ -5,6 +5,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import summed_area as reference
 from warp_ar.kernels import summed_area
+from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
 
 # float32(sum) / float32(count): two roundings of an exact integer and one of the quotient, at most 255 * 3 * 2^-24.
 MEAN_ROUNDING = 255 * 3 * 2.0**-24
@@ -59,22 +60,22 @@ def test_intensity_of_grey_is_its_value(device):
 @pytest.mark.parametrize("size", [(1, 1), (1, 97), (97, 3), (64, 128), (333, 132), (130, 4400), (1600, 257)])
 def test_strips_match_twin(device, size):
     """And again over what the launch before left, whose marks must not count."""
-    shapes = summed_area.strip_shapes(*size)
+    shapes = strip_shapes(*size)
     sums, state = [wp.full(shape, 7, dtype=wp.uint32) for shape in shapes[:2]], wp.zeros(shapes[2], wp.uint32)
     for seed in range(3):
         frame = random_frame(*size, seed)
         table = wp.full(size, 7, dtype=wp.uint32)
-        summed_area.sum_area_by_strips(wp.array(frame, dtype=wp.vec3ub), *sums, state, table)
+        sum_area_by_strips(wp.array(frame, dtype=wp.vec3ub), *sums, state, table)
         np.testing.assert_array_equal(table.numpy(), reference.sum_area(frame))
 
 
 def test_strips_of_white_are_exact(device):
     """The largest sums that halves of words must hold, and a table that overflows."""
     height, width = 4320, 7680 if device != "cpu" else 64
-    shapes = summed_area.strip_shapes(height, width)
+    shapes = strip_shapes(height, width)
     scratch = [wp.zeros(shape, wp.uint32) for shape in shapes]
     table = wp.zeros((height, width), wp.uint32)
-    summed_area.sum_area_by_strips(wp.array(white(height, width), dtype=wp.vec3ub), *scratch, table)
+    sum_area_by_strips(wp.array(white(height, width), dtype=wp.vec3ub), *scratch, table)
     counts = np.outer(np.arange(1, height + 1, dtype=np.int64), np.arange(1, width + 1))
     np.testing.assert_array_equal(table.numpy(), (255 * counts) % 2**32)
 

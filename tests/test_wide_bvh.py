@@ -9,7 +9,7 @@ import warp as wp
 from warp_ar.kernels import wide_bvh
 from warp_ar.kernels.wide_bvh import BLOCK, LEAF_BLOCKS, MOST_DEPTH, NODE_BLOCKS, STACK, WIDTH, build_wide_bvh
 from warp_ar.scene.geometry import Mesh
-from warp_ar.scene.ray_scene import BOX_MARGIN, make_ray_mesh
+from warp_ar.scene.ray_mesh import BOX_MARGIN, make_ray_mesh
 from warp_ar.scene.shapes import torus_mesh
 
 MARGIN = 1e-4

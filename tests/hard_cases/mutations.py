@@ -201,7 +201,7 @@ MUTATIONS = (
     Mutation(
         8,
         "a mirror's level by the logarithm of its width",
-        "kernels/prefilter.py",
+        "kernels/lobes.py",
         "    if alpha < narrowest:\n        return wp.max(alpha, 0.0) / narrowest\n",
         "",
         "tests/test_prefilter.py::test_levels_grow_with_roughness_and_fall_with_shininess",
@@ -226,7 +226,7 @@ MUTATIONS = (
     Mutation(
         10,
         "the printed shader's plain lerp: weight two for the flat term at alpha = -1",
-        "kernels/relight.py",
+        "kernels/receiver.py",
         "    weight = wp.min(wp.abs(alpha), 1.0)\n",
         "    weight = wp.min(alpha, 1.0)\n",
         "tests/test_relight.py::test_paper_in_its_three_cases_by_hand",
@@ -274,7 +274,7 @@ MUTATIONS = (
     Mutation(
         13,
         "the BVH's boxes are not enlarged: rays slip through shared edges",
-        "warp_ar/scene/ray_scene.py",
+        "warp_ar/scene/ray_mesh.py",
         "2.0**-18",
         "0.0",
         f"{HARD}test_rows13_14_rays.py::test_the_20480_triangle_sphere_never_leaks",
@@ -323,7 +323,7 @@ MUTATIONS = (
     Mutation(
         14,
         "a fixed offset of a tenth of a millimetre",
-        "kernels/visibility.py",
+        "kernels/trace.py",
         "                hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)\n",
         "                hit.error = 1.0e-4\n",
         "tests/test_visibility.py::test_rays_that_leave_do_not_come_back",

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.hard_cases.rig import ENVIRONMENT_HEIGHT, FILTERS, METHODS, SIZE, LoneStage, solid_angles
-from warp_ar.kernels import prefilter
+from warp_ar.kernels.lobes import lobe_count, lobe_offset, lobe_size
 from warp_ar.kernels.structs import LAMBERT, METALLIC_ROUGHNESS, MIRROR, PHONG
 
 HEIGHT = ENVIRONMENT_HEIGHT
@@ -65,9 +65,9 @@ def test_a_lamp_of_one_texel_keeps_its_energy(device, stage, method, row, column
         # A series of order 4 is cut at zero: what is cut is at most its lobes' 4 %. Maps are sums of point samples.
         assert total == pytest.approx(np.pi * flux, rel=0.05 if method == "sh4" else 3e-3)
         return
-    for level in range(prefilter.lobe_count(HEIGHT)):
-        rows, columns = prefilter.lobe_size(HEIGHT, level)
-        start = prefilter.lobe_offset(HEIGHT, level)
+    for level in range(lobe_count(HEIGHT)):
+        rows, columns = lobe_size(HEIGHT, level)
+        start = lobe_offset(HEIGHT, level)
         texels = values[start : start + rows * columns, 0].reshape(rows, columns)
         total = float((solid_angles(rows, columns) * texels.astype(float)).sum())
         bound = BOX_MIP if method == "box_mip" else FURNACE

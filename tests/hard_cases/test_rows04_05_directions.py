@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 
 from tests.hard_cases.generators import directions, frames
 from tests.hard_cases.rig import METHODS, SIZE, LoneStage, assert_finite, solid_angles
-from warp_ar.kernels import irradiance, latlong, materials, prefilter, sampling, visibility
+from warp_ar.kernels import irradiance, latlong, materials, sampling
+from warp_ar.kernels.lobes import lobe_texels, sample_levels
+from warp_ar.kernels.shapes import sphere_uv
 from warp_ar.scene import Pose
 
 FURNACE = 5e-4
@@ -122,10 +124,10 @@ def evaluate_kernel(
     i = wp.tid()
     d = directions[i]
     sampled_out[i] = latlong.sample_latlong(ramp, d)
-    level_out[i] = prefilter.sample_levels(levels, d, 1.5, height)
+    level_out[i] = sample_levels(levels, d, 1.5, height)
     irradiance_out[i] = irradiance.sh_irradiance(sh, d)
     frame_out[i] = sampling.frame_from_normal(d)
-    uv_out[i] = visibility.sphere_uv(d)
+    uv_out[i] = sphere_uv(d)
     # Light, view and normal along one line, exactly and an ulp beside it.
     n = wp.normalize(d)
     lobes_out[i] = wp.vec3(
@@ -142,7 +144,7 @@ def test_directions_an_ulp_beyond_unit_length(device):
     height = 8
     ds = directions()
     ramp = np.random.default_rng(0).uniform(1.0, 2.0, (height, 2 * height, 3)).astype(np.float32)
-    levels = np.random.default_rng(1).uniform(1.0, 2.0, (prefilter.lobe_texels(height), 3)).astype(np.float32)
+    levels = np.random.default_rng(1).uniform(1.0, 2.0, (lobe_texels(height), 3)).astype(np.float32)
     sh = np.zeros((9, 3), np.float32)
     sh[0], sh[2], sh[6] = 3.0, 1.0, 0.3
     outputs = [wp.zeros(len(ds), dtype=dtype) for dtype in (wp.vec3, wp.vec3, wp.vec3, wp.mat33, wp.vec2, wp.vec3)]

@@ -33,8 +33,9 @@ from warp_ar.errors import SceneError
 from warp_ar.kernels import recover
 from warp_ar.scene import Object, PhongMaterial, Pose, Proxy
 from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.mesh_files import load_mesh
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 RAY_STAGES = ("unwrap", "visibility", "shade", "relight", "environment_shadow", "near_field", "mirror_ball", "declip")

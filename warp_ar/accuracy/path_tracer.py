@@ -1,8 +1,8 @@
 """The picture of a frame by path tracing: progressive, with a standard error for every pixel.
 
-``kernels/path_tracer.py`` says what it sums. It knows the scene, the light of the environment and one frame with its
-pose, as the pipeline does, and approximates nothing else: with enough samples it is what the pipeline's methods are to
-be judged by.
+``kernels/path_tracer.py`` and ``path_following.py`` say what it sums. It knows the scene, the light of the environment
+and one frame with its pose, as the pipeline does, and approximates nothing else: with enough samples it is what the
+pipeline's methods are to be judged by.
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ from warp_ar.kernels import path_tracer, structs
 from warp_ar.kernels.color import decode_table, encode_table
 from warp_ar.kernels.launch import Rows
 from warp_ar.kernels.path_guides import make_guides
+from warp_ar.kernels.path_picture import finish_picture, make_moments, map_reflectance
 from warp_ar.kernels.path_sampling import make_sky
-from warp_ar.kernels.prefilter import integrate_dfg
+from warp_ar.kernels.path_vertices import LocalScene
+from warp_ar.kernels.split_sum import integrate_dfg
 from warp_ar.light.captured import Light
 from warp_ar.scene import Pose, Scene
+from warp_ar.scene.kinds import trace_config
 from warp_ar.scene.pixel_rays import pixel_rays
-from warp_ar.scene.ray_scene import HostScene, trace_config
+from warp_ar.scene.ray_scene import HostScene
 
 FloatImage = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
@@ -147,7 +150,7 @@ class PathTracer:
             self._params = wp.array(self._camera_values(pose), dtype=structs.FrameParams, device=self.device)
             self._set_reflectances(reflectances)
             shape = (self.camera.height, self.camera.width)
-            self._moments = path_tracer.make_moments(shape, self.device)
+            self._moments = make_moments(shape, self.device)
             self._radiance = wp.zeros(shape, dtype=wp.vec3, device=self.device)
             self._error = wp.zeros(shape, dtype=wp.vec3, device=self.device)
             self._image = wp.zeros(shape, dtype=wp.vec3ub, device=self.device)
@@ -155,7 +158,7 @@ class PathTracer:
 
     def _make_local(self, radiance: FloatImage, emitters: npt.NDArray[Any], seconds: float) -> Any:
         """The scene as paths meet it."""
-        local = path_tracer.LocalScene()
+        local = LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
         objects = np.zeros(len(self.scene.objects), np.dtype(structs.Shape.numpy_dtype()))
         lights = np.zeros(len(self.scene.lights), np.dtype(structs.Light.numpy_dtype()))
@@ -238,14 +241,14 @@ class PathTracer:
 
     def _map_reflectance(self) -> None:
         """Reflectance by the light that the moments hold, which then begin anew."""
-        path_tracer.map_reflectance(self._local, self._moments, self._local.reflectance)
+        map_reflectance(self._local, self._moments, self._local.reflectance)
         found, shown = self._local.reflectance.numpy(), self._local.shown.numpy()
         means = [
             found[shown == k].mean(axis=0) if (shown == k).any() else np.full(3, UNKNOWN_REFLECTANCE)
             for k in range(len(self.scene.proxies))
         ]
         self._set_reflectances(means)
-        self._moments = path_tracer.make_moments(shown.shape, self.device)
+        self._moments = make_moments(shown.shape, self.device)
 
     def sample(self, count: int) -> None:
         """Add ``count`` samples to every pixel.
@@ -338,7 +341,7 @@ class PathTracer:
         if self.samples < 1:
             raise UsageError("no samples yet: call sample() first")
         with exclusive(self.device):
-            path_tracer.finish_picture(
+            finish_picture(
                 self._local, self._moments, self.samples, self._encode, self._radiance, self._error, self._image,
                 exposure=self.exposure,
             )  # fmt: skip

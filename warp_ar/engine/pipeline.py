@@ -37,7 +37,7 @@ from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.light.captured import has_places
 from warp_ar.scene import Pose, Scene, load_scene
 from warp_ar.scene.finite import check_finite
-from warp_ar.scene.ray_scene import skeleton
+from warp_ar.scene.kinds import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality

@@ -22,7 +22,7 @@ from warp_ar.farm.survey import Survey, keep_depth, lit_scene
 from warp_ar.input.plate import Plate
 from warp_ar.input.source import Frame, RecordedSource
 from warp_ar.scene import Pose, Scene
-from warp_ar.scene.ray_scene import skeleton
+from warp_ar.scene.kinds import skeleton
 
 PIPELINES = 4
 """Pipelines that are kept for scenes of other objects: each holds its arrays."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.kernels.recover import LOST
+from warp_ar.kernels.recover_cells import LOST
 from warp_ar.light.config import CONFIG, Kind
 from warp_ar.light.noise import measured_noise, shared_errors
 from warp_ar.light.regions import connected_regions, split_regions
@@ -64,7 +64,7 @@ class Problem:
         """Set up both sides.
 
         Args:
-            cells: Records of ``kernels.recover.Cell``, (rows, columns).
+            cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
             transfer: From ``trace_transfer``, straight, (n, rows * columns).
             mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).

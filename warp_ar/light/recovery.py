@@ -1,7 +1,7 @@
 """Light that clipping lost in the ball, found again from surfaces that the same light falls on.
 
-**Unknowns.** Cells of the environment that clip (``kernels/recover.py``) are grouped to regions: connected ones, split
-where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
+**Unknowns.** Cells of the environment that clip (``kernels/recover_cells.py``) are grouped to regions: connected ones,
+split where they are wider than some steradians. Region r lacks the radiance s_r >= 0, per channel, on top of what the
 ball shows. Beside regions stand *candidates*: emitters or a sun within a region, or where no ball sees, each with its
 power p_j >= 0 (radiance times solid angle, as seen from the ball), a direction and a distance. A surface k has the
 unknown reflectance 1 / u_k; the card's is known.
@@ -168,7 +168,7 @@ class Recovery:
         """Estimate from one frame.
 
         Args:
-            cells: Records of ``kernels.recover.Cell``, (rows, columns).
+            cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
             transfer: From ``trace_transfer``, straight, (n, rows * columns).
             mirrored: From ``trace_transfer``, by way of balls, (n, rows * columns).
             observations: Records of ``Observation``, (n,).

@@ -26,7 +26,7 @@ class Stillness:
         Takes note of what it is given, unless it holds.
 
         Args:
-            cells: Records of ``kernels.recover.Cell``, (rows, columns).
+            cells: Records of ``kernels.recover_cells.Cell``, (rows, columns).
             observations: Records of ``Observation``, (n,).
             settled: Whether enough estimates were made for one to be left out.
         """

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -19,176 +18,31 @@ import warp as wp
 from warp_ar import scene as scenes
 from warp_ar.errors import SceneError
 from warp_ar.kernels import structs
-from warp_ar.kernels.visibility import TraceConfig
-from warp_ar.kernels.wide_bvh import build_wide_bvh
-from warp_ar.scene.area_lights import emits, make_area_table
+from warp_ar.scene.area_lights import make_area_table
 from warp_ar.scene.geometry import Mesh, rotation_matrix
+from warp_ar.scene.kinds import light_kind, material_model, shape_kind
 from warp_ar.scene.mesh_materials import MeshMaterial
-from warp_ar.scene.object_materials import (
-    file_mesh,
-    is_detailed,
-    look_of,
-    mesh_of,
-    reflects_diffusely,
-    reflects_glossily,
-)
+from warp_ar.scene.object_materials import is_detailed, look_of, mesh_of
 from warp_ar.scene.pose import Pose
+from warp_ar.scene.ray_mesh import (
+    FloatArray,
+    RayMesh,
+    make_mesh,
+    make_ray_mesh,
+    mesh_key,
+    shared_ray_mesh,
+    texture_density,
+)
 from warp_ar.scene.screen_extents import Outline, ball_outline, bounced_faces, box_faces, lit_faces, shaded_faces
-from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
 from warp_ar.scene.texture_codes import DECODE
 from warp_ar.scene.texture_pack import TexturePack, mask_cutoff
 
-FloatArray = npt.NDArray[np.float64]
-
-BOX_MARGIN: Final = 2.0**-18
-"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/visibility.py``."""
-
-BVH_CONSTRUCTOR: Final = "sah"
-"""On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
-
-BVH_LEAF_SIZE: Final = 1
-"""Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
-_SHAPES: Final = {"plane": structs.PLANE, "box": structs.BOX, "mesh": structs.MESH, "sphere": structs.SPHERE}
 _ALPHA: Final = {"opaque": structs.OPAQUE, "mask": structs.MASKED, "blend": structs.BLENDED}
-_LIGHTS: Final = {"point": structs.POINT, "spot": structs.SPOT, "directional": structs.DIRECTIONAL}
-_MODELS: Final[dict[type, int]] = {
-    scenes.LambertMaterial: structs.LAMBERT,
-    scenes.PhongMaterial: structs.PHONG,
-    scenes.MetallicRoughnessMaterial: structs.METALLIC_ROUGHNESS,
-    scenes.MirrorMaterial: structs.MIRROR,
-}
-
-PICTURE_CELLS: Final = 16
-"""Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
 _NOWHERE: Final[Mapping[scenes.Marker, Pose | None]] = {}
 _AWAY: Final = (0.0, 0.0, -1e5)
 _BEHIND: Final = -1e3
 _AWAY_SCALE: Final = 1e-6
 """Where shapes wait whose marker is lost: no ray meets them, and no kernel has to ask."""
-
-# Planes whose normals have a larger cosine, 2.6 degrees, send each other less than a hundredth of their light.
-_ONE_WAY: Final = 0.999
-
-
-def shape_kind(item: scenes.Object | scenes.Proxy) -> int:
-    """Kind of ``structs.Shape`` that an object or proxy becomes; what has no kind of its own becomes a fine mesh."""
-    if isinstance(item, scenes.Object) and _mesh_key(item) is not None:
-        return int(structs.MESH)
-    return int(_SHAPES[item.shape])
-
-
-def light_kind(light: scenes.Light) -> int:
-    """Kind of ``structs.Light`` that a light becomes."""
-    return int(_LIGHTS[light.kind])
-
-
-def has_sized_lights(scene: scenes.Scene) -> bool:
-    """Whether any virtual light has a radius, and so a soft shadow."""
-    return any(light.radius > 0.0 for light in scene.lights)
-
-
-def trace_config(scene: scenes.Scene) -> TraceConfig:
-    """Which kinds of shape the rays of ``scene`` can meet, and whether triangles must be asked for more."""
-    looks = [look_of(item) for item in scene.objects]
-    return TraceConfig(
-        objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
-        proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
-        detail=any(look.holed or look.bumpy for look in looks),
-    )
-
-
-def material_model(material: MeshMaterial) -> int:
-    """Model of ``structs.Material`` that a material becomes."""
-    return _MODELS[type(material.surface)]
-
-
-def skeleton(scene: scenes.Scene) -> Any:
-    """What of a scene arrays and kernels are made for; scenes that share it differ in numbers alone."""
-    objects = tuple(
-        (
-            item.shape,
-            item.marker,
-            _mesh_key(item),
-            type(item.material),
-            tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
-            any(map(reflects_diffusely, look_of(item).materials)),
-            any(map(reflects_glossily, look_of(item).materials)),
-            tuple(map(emits, look_of(item).materials)),
-        )
-        for item in scene.objects
-    )
-    lights = tuple((light.kind, light.marker) for light in scene.lights)
-    place = scene.camera, scene.marker, scene.has_marker, scene.pose, scene.captured
-    return *place, scene.probes, scene.proxies, objects, lights
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class RayMesh:
-    """A mesh that rays can meet, moved so that the centre of its bounding box is its origin."""
-
-    mesh: Any
-    """``wp.Mesh`` whose corners are not shared: corner k of face f is point 3 f + k."""
-    center: FloatArray
-    """Where its origin lies in the coordinates of the source, (3,)."""
-    half: FloatArray
-    """Half sizes of its bounding box, (3,)."""
-    normals: npt.NDArray[np.float32]
-    """Unit normal of each corner, (3 m, 3)."""
-    uvs: npt.NDArray[np.float32]
-    """Texture coordinates of each corner, (3 m, 2)."""
-    tree: Any
-    """On CPU what rays walk, of ``kernels.wide_bvh``; None: they walk the ``wp.Mesh``'s own."""
-
-    @property
-    def tree_address(self) -> int:
-        """What ``structs.Shape.tree`` is to be."""
-        return 0 if self.tree is None else int(self.tree.ptr)
-
-
-def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
-    """Build the BVH of a mesh with a margin around every triangle, so that no ray slips through a shared edge.
-
-    The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
-    refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
-    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU that
-    is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
-
-    Args:
-        mesh: The triangles.
-        device: Warp device.
-    """
-    low, high = (bound.astype(np.float64) for bound in mesh.bounds)
-    center = 0.5 * (low + high)
-    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
-    corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
-    half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
-    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
-    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
-    points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
-    indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
-    on_cpu = points.device.is_cpu
-    constructor = "median" if on_cpu else BVH_CONSTRUCTOR
-    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=constructor, bvh_leaf_size=BVH_LEAF_SIZE)
-    wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
-    tree = build_wide_bvh(corners, float(margin)) if on_cpu else None
-    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
-    normals = mesh.normals[mesh.faces].reshape(-1, 3)
-    return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
-
-
-_SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
-
-
-def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
-    """``make_ray_mesh`` of a file's mesh, one for all scenes of a device for as long as any of them holds it.
-
-    A mesh that a program made itself may change in its hands: each scene has its own of that.
-    """
-    by_device = _SHARED.setdefault(mesh, weakref.WeakValueDictionary())
-    known = by_device.get(str(device))
-    if known is None:
-        known = by_device[str(device)] = make_ray_mesh(mesh, device)
-    return known
 
 
 class HostScene:
@@ -245,7 +99,7 @@ class HostScene:
 
     def _write_area_lights(self, device: Any) -> None:
         """The table of what emits; numbers of a scene with the same ``skeleton`` may change it."""
-        keys = map(_mesh_key, self.scene.objects)
+        keys = map(mesh_key, self.scene.objects)
         table = make_area_table(self.scene.objects, [None if key is None else self._meshes[key][0] for key in keys])
         self.has_area_lights = len(table.lights) > 0
         if not self.has_area_lights:
@@ -312,7 +166,7 @@ class HostScene:
         # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
         self._centers = [
             record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
-            for record, key in zip(self._objects, map(_mesh_key, self.scene.objects), strict=True)
+            for record, key in zip(self._objects, map(mesh_key, self.scene.objects), strict=True)
         ]
 
     def _material_records(self) -> npt.NDArray[Any]:
@@ -330,7 +184,7 @@ class HostScene:
             rotation = rotation_matrix(item.rotate)
             position = np.array(item.at)
             record["kind"], record["scale"], record["material"] = shape_kind(item), scale, -1
-            key = _mesh_key(item)
+            key = mesh_key(item)
             if key is not None:
                 _, mesh, record["first_vertex"] = self._load(key, device)
                 record["mesh"], record["tree"] = mesh.mesh.id, mesh.tree_address
@@ -346,7 +200,7 @@ class HostScene:
     def _load(self, key: Any, device: Any) -> tuple[Mesh, RayMesh, int]:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
-            mesh = _make_mesh(key)
+            mesh = make_mesh(key)
             ray_mesh = shared_ray_mesh(mesh, device) if isinstance(key, Path) else make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
@@ -522,66 +376,8 @@ class HostScene:
         return self._shaded
 
 
-def proxies_face(scene: scenes.Scene) -> bool:
-    """Whether light that proxies send can reach one: not if there is one plane or box, or planes that look one way."""
-    if any(proxy.shape == "mesh" for proxy in scene.proxies):
-        return True  # which may face itself
-    normals = [rotation_matrix(proxy.rotate)[:, 2] for proxy in scene.proxies if proxy.shape == "plane"]
-    turned = any(float(a @ b) < _ONE_WAY for a in normals for b in normals)
-    return len(scene.proxies) > 1 and (len(normals) < len(scene.proxies) or turned)
-
-
 def _dtype(struct: Any) -> Any:
     return np.dtype(struct.numpy_dtype())
-
-
-def _mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
-    """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
-    if item.shape == "mesh":
-        return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
-    if not isinstance(item, scenes.Object):
-        return None
-    if item.shape == "torus":
-        outer = item.scale * (item.major_radius + item.minor_radius)
-        return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
-    gap = silhouette_tolerance(item.scale * max(item.radius, 0.5 * item.length)) / item.scale
-    emissive = isinstance(item.material, scenes.EmissiveMaterial)
-    match item.shape:
-        case "rect":
-            pictured = emissive and item.material.image is not None  # type: ignore[union-attr]
-            return "rect", item.size[:2], PICTURE_CELLS if pictured else 1
-        case "disk":
-            return "disk", item.radius, gap
-        case "tube":
-            return "tube", item.radius, item.length, gap
-        case "box" if emissive:
-            return "box", item.size
-    return None
-
-
-_MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": tube_mesh, "box": box_mesh}
-
-
-def _make_mesh(key: Any) -> Mesh:
-    """What ``_mesh_key`` says."""
-    if isinstance(key, Mesh):
-        return key
-    if isinstance(key, Path):
-        return file_mesh(key)
-    return _MAKERS[key[0]](*key[1:]) if key[0] in _MAKERS else torus_mesh(*key)
-
-
-def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:
-    """Texture coordinates of both sets per unit of length on each triangle, (m, 2): square roots of ratios of areas."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    found = np.zeros((len(mesh.faces), 2))
-    for index, uvs in enumerate((mesh.uvs, mesh.uvs_second)):
-        if uvs is not None:
-            u, v = uvs[mesh.faces].astype(np.float64).transpose(2, 0, 1)
-            spanned = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
-            found[:, index] = np.sqrt(np.abs(spanned) / np.where(area > 0.0, area, np.inf))
-    return found.astype(np.float32)
 
 
 def _present(records: npt.NDArray[Any]) -> npt.NDArray[Any]:

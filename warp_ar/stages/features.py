@@ -16,8 +16,8 @@ from warp_ar.kernels.expose import BOXES
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
 from warp_ar.scene.area_lights import emits_light
+from warp_ar.scene.kinds import has_sized_lights, material_model, proxies_face, trace_config
 from warp_ar.scene.object_materials import is_detailed, reflects_diffusely, reflects_glossily, scene_materials
-from warp_ar.scene.ray_scene import has_sized_lights, material_model, proxies_face, trace_config
 from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels import gloss
-from warp_ar.scene.ray_scene import light_kind, proxies_face, trace_config
+from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_ar.kernels import mirror_ball
+from warp_ar.kernels.receiver import RelightConfig, make_receiver
 from warp_ar.kernels.reflect import DistantLight
-from warp_ar.kernels.relight import RelightConfig, make_receiver
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light

@@ -10,6 +10,18 @@ import numpy as np
 import warp as wp
 
 from warp_ar.kernels import prefilter, pyramid, sphere_map
+from warp_ar.kernels.lobes import (
+    Lobe,
+    box_weights,
+    lobe_count,
+    lobe_offset,
+    lobe_rows,
+    lobe_size,
+    lobe_texels,
+    make_lobe_samples,
+    mip_weights,
+    mixed_texels,
+)
 from warp_ar.scene import Material, MirrorMaterial, PhongMaterial, Scene
 from warp_ar.scene.object_materials import reflects_glossily, scene_materials
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
@@ -22,7 +34,7 @@ def glossy_materials(scene: Scene) -> list[Material]:
     return [material.surface for material in scene_materials(scene) if reflects_glossily(material)]
 
 
-def scene_lobe(scene: Scene) -> prefilter.Lobe:
+def scene_lobe(scene: Scene) -> Lobe:
     """Phong where no glossy material has another lobe, else GGX: exponents then take the width that is nearest."""
     kinds = {type(material) for material in glossy_materials(scene)} - {MirrorMaterial}
     return "phong" if kinds == {PhongMaterial} else "ggx"
@@ -79,15 +91,15 @@ class Prefilter(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """Levels, and the pyramid that the levels are made from."""
         height = self.request.quality.environment_height
-        specs = {"prefilter_levels": ArraySpec((prefilter.lobe_texels(height),), wp.vec3)}
+        specs = {"prefilter_levels": ArraySpec((lobe_texels(height),), wp.vec3)}
         if self.method == "sphere_mip":
             return specs
         if self.method != "brute_force" and not self._mirrors_only:
             specs["prefilter_pyramid"] = ArraySpec((pyramid.packed_texels(height, 2 * height),), wp.vec3)
             specs["prefilter_blocks_done"] = ArraySpec((1,), wp.int32)
         if self.method not in ("box_mip", "brute_force") and not self._mirrors_only:
-            specs["prefilter_row_energy"] = ArraySpec((prefilter.lobe_rows(height),), wp.vec3)
-            specs["prefilter_energy"] = ArraySpec((prefilter.lobe_count(height),), wp.vec3)
+            specs["prefilter_row_energy"] = ArraySpec((lobe_rows(height),), wp.vec3)
+            specs["prefilter_energy"] = ArraySpec((lobe_count(height),), wp.vec3)
         return specs
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
@@ -107,16 +119,16 @@ class Prefilter(Stage):
         isotropic = self.method != "box_mip"
         passes = [Pass(lambda rows: pyramid.build_pyramid(environment, blocks_done, box, isotropic=isotropic))]
         if self.method in ("box_mip", "energy_mip"):
-            numbers = prefilter.mip_weights(height, lobe) if isotropic else prefilter.box_weights(height)
+            numbers = mip_weights(height, lobe) if isotropic else box_weights(height)
             weights = wp.array(numbers.astype(np.float32), dtype=wp.float32, device=device)
             passes.append(
                 Pass(
                     lambda rows: prefilter.mix_mips(box, weights, height, levels, smooth=isotropic, rows=rows),
-                    rows=prefilter.mixed_texels(height),
+                    rows=mixed_texels(height),
                 )
             )
         else:
-            samples = prefilter.make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
+            samples = make_lobe_samples(height, lobe, int(self.method.removeprefix("fis")), device)
             passes.append(
                 Pass(lambda rows: prefilter.sample_lobes(box, samples, height, levels, rows=rows), rows=texels)
             )
@@ -131,14 +143,12 @@ class Prefilter(Stage):
     def _look_up(self, arrays: Arrays) -> list[Pass]:
         """Every lobe's directions in a level of the sphere map; mirrors alone need no more than the first."""
         height = self.request.quality.environment_height
-        lobes = prefilter.lobe_count(height)
+        lobes = lobe_count(height)
         known, out = (arrays["params"], arrays["sphere_map"]), arrays["prefilter_levels"]
         passes = []
         for lobe in range(1 if self._mirrors_only else lobes):
-            size = prefilter.lobe_size(height, lobe)
+            size = lobe_size(height, lobe)
             place = sphere_map.glossy_level(lobe, lobes), size, out
-            look_up = functools.partial(
-                sphere_map.look_up_level, *known, *place, first=prefilter.lobe_offset(height, lobe)
-            )
+            look_up = functools.partial(sphere_map.look_up_level, *known, *place, first=lobe_offset(height, lobe))
             passes.append(Pass(lambda rows, look_up=look_up: look_up(rows=rows), rows=size[0]))  # type: ignore[misc]
         return passes

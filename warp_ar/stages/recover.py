@@ -13,11 +13,13 @@ import warp as wp
 
 from warp_ar.kernels import change
 from warp_ar.kernels import recover as kernels
+from warp_ar.kernels.recover_cells import Cell, add_recovered, cell_shape, condense_cells
+from warp_ar.kernels.saturation_boundaries import weigh_boundaries
 from warp_ar.kernels.structs import Emitter
 from warp_ar.light import recovery
 from warp_ar.light.config import CONFIG
 from warp_ar.light.surfaces import find_surfaces
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.host_copies import HostCopies
@@ -104,7 +106,7 @@ class Recover(Stage):
         """The map, the two sides of the equations, and what readers have seen."""
         height = self.request.quality.environment_height
         shape = (height, 2 * height)
-        cells = kernels.cell_shape(*shape)
+        cells = cell_shape(*shape)
         self._surfaces = find_surfaces(self.request.scene, card_only=self.method == "white_card")
         points = len(self._surfaces.points)
         return {
@@ -112,8 +114,8 @@ class Recover(Stage):
             **{name: ArraySpec((CONFIG.search.most,), Emitter) for name in self.wiring.writes if name == "emitters"},
             "recover_recovered": ArraySpec(cells, wp.vec3),
             "recover_missing": ArraySpec(shape, wp.vec3),
-            "recover_cells": ArraySpec(cells, kernels.Cell),
-            "recover_cells_now": ArraySpec(cells, kernels.Cell),
+            "recover_cells": ArraySpec(cells, Cell),
+            "recover_cells_now": ArraySpec(cells, Cell),
             "recover_points": ArraySpec((points,), kernels.SurfacePoint),
             "recover_observations": ArraySpec((points,), kernels.Observation),
             "recover_traced": ArraySpec((points,), wp.int32),
@@ -165,13 +167,13 @@ class Recover(Stage):
 
     def _weigh(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.weigh_boundaries(
+        weigh_boundaries(
             arrays["environment_clipped"], arrays["params"], arrays["probes"], arrays["recover_missing"], rows=rows
         )
 
     def _condense(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.condense_cells(
+        condense_cells(
             arrays["filled_radiance"],
             arrays["environment_confidence"],
             arrays["environment_clipped"],
@@ -214,7 +216,7 @@ class Recover(Stage):
 
     def _add(self, rows: Rows | None) -> None:
         arrays = self._arrays
-        kernels.add_recovered(
+        add_recovered(
             arrays["filled_radiance"],
             arrays["environment_confidence"],
             arrays["recover_missing"],
@@ -232,7 +234,7 @@ class Recover(Stage):
 
     def host_kernels(self) -> tuple[Any, ...]:
         """Of the solver: irradiance from emitters, at whatever places it tries."""
-        return (kernels.make_kernels(self._proxies)[2],) if self.method == "shading" else ()
+        return (kernels.make_trace_emitters_kernel(self._proxies),) if self.method == "shading" else ()
 
     def begin(self) -> None:
         """Decide whether an estimate is begun in this frame, and whether one takes effect."""

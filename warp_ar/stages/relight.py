@@ -13,8 +13,9 @@ import warp as wp
 from warp_ar.kernels import receiver_cells, relight
 from warp_ar.kernels.cells import cell_shape, cell_stride
 from warp_ar.kernels.launch import count_partials
+from warp_ar.kernels.receiver import Receiver, ReceiverCells, RelightConfig, make_receiver
 from warp_ar.kernels.structs import PLANE
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features, sheds_light
 from warp_ar.stages.request import Request
@@ -145,7 +146,7 @@ class Relight(Stage):
             passes.append(Pass(smooth, rows=height, extent=light_rows))
         return passes
 
-    def _receiver(self, config: relight.RelightConfig, arrays: Arrays) -> relight.Receiver:
+    def _receiver(self, config: RelightConfig, arrays: Arrays) -> Receiver:
         """What kernels read of the receiver."""
         names = {
             "table": "summed_area",
@@ -155,10 +156,10 @@ class Relight(Stage):
         }
         known = {word: arrays[name] for word, name in names.items() if name in self.wiring.reads}
         cells = make_cells(self.features, arrays)
-        return relight.make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
+        return make_receiver(config, find_picture(arrays), probes=arrays["probes"], cells=cells, **known)
 
     def _cell_passes(
-        self, config: relight.RelightConfig, inputs: tuple[Any, Any, Any, relight.Receiver], arrays: Arrays, device: Any
+        self, config: RelightConfig, inputs: tuple[Any, Any, Any, Receiver], arrays: Arrays, device: Any
     ) -> list[Pass]:
         """Ambient visibility and bounced light of cells, where the method knows them."""
         params, scene, _, receiver = inputs
@@ -218,7 +219,7 @@ class Relight(Stage):
         return passes
 
 
-def _keep_planes(config: relight.RelightConfig, request: Request) -> relight.RelightConfig:
+def _keep_planes(config: RelightConfig, request: Request) -> RelightConfig:
     """Where all proxies are planes, cells know that: most of their rays are then left out."""
     proxies = trace_config(request.scene).proxies
     if not set(proxies) <= {int(PLANE)}:
@@ -239,9 +240,9 @@ def _cells(request: Request, pixels: int) -> tuple[int, int]:
     return rows, columns
 
 
-def make_cells(features: Features, arrays: Arrays) -> relight.ReceiverCells:
+def make_cells(features: Features, arrays: Arrays) -> ReceiverCells:
     """The cells of a request as kernels read them."""
-    cells = relight.ReceiverCells()
+    cells = ReceiverCells()
     if features.relight_method in GRAINS:
         grain, request = _grain(features), features.request
         cells.ambient_stride, cells.bounced_stride = _stride(request, grain.ambient), _stride(request, grain.bounced)

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.device import usable_cores
 from warp_ar.kernels import summed_area
+from warp_ar.kernels.summed_area_strips import make_sum_strips_kernel, strip_config, strip_shapes, sum_area_by_strips
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
 
@@ -37,7 +38,7 @@ class SummedArea(Stage):
         width, height = self.request.size
         ends = summed_area.slab_shape(height, width, usable_cores())
         names = ("summed_area_sums", "summed_area_group_sums", "summed_area_state")
-        shapes = zip(names, summed_area.strip_shapes(height, width), strict=True)
+        shapes = zip(names, strip_shapes(height, width), strict=True)
         sums = {name: ArraySpec(shape, wp.uint32) for name, shape in shapes}
         sums["summed_area_ends"] = ArraySpec(ends, wp.uint32)
         return {"summed_area": ArraySpec((height, width), wp.uint32), **sums}
@@ -48,8 +49,8 @@ class SummedArea(Stage):
         frame, table = arrays["frame"], arrays["summed_area"]
         if not device.is_cpu:
             sums = [arrays[f"summed_area_{name}"] for name in ("sums", "group_sums", "state")]
-            summed_area.make_sum_strips_kernel(summed_area.strip_config(height, width, device))
-            return [Pass(lambda rows: summed_area.sum_area_by_strips(frame, *sums, table))]
+            make_sum_strips_kernel(strip_config(height, width, device))
+            return [Pass(lambda rows: sum_area_by_strips(frame, *sums, table))]
         ends = arrays["summed_area_ends"]
         passes = [Pass(lambda rows: summed_area.sum_slabs(frame, table, ends, rows=rows), rows=len(ends))]
         if len(ends) == 1:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from warp_ar.kernels import relight
-from warp_ar.scene.ray_scene import trace_config
+from warp_ar.kernels.receiver import RelightConfig
+from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.features import LOCAL, Features
 from warp_ar.stages.shared.picture import frame_reads
 
@@ -24,10 +24,10 @@ def relight_reads(features: Features) -> tuple[str, ...]:
     return tuple(reads)
 
 
-def relight_config(features: Features) -> relight.RelightConfig:
+def relight_config(features: Features) -> RelightConfig:
     """What the relighting of a request's receiver calls for."""
     method = features.relight_method
-    return relight.RelightConfig(
+    return RelightConfig(
         "reflectance" if method in LOCAL else method,
         trace_config(features.request.scene),
         "sh" if features.irradiance == "irradiance_sh" else "map",

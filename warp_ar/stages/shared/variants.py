@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from warp_ar.errors import UsageError
 from warp_ar.kernels.composite import CompositeConfig
+from warp_ar.kernels.receiver import RelightConfig
 from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
-from warp_ar.kernels.relight import RelightConfig
 from warp_ar.kernels.shade import ShadeConfig
-from warp_ar.kernels.visibility import TraceConfig
+from warp_ar.kernels.trace import TraceConfig
 from warp_ar.stages.features import Features
 
 VARIABLE: Final = "WARP_AR_KERNELS"

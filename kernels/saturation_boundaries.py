@@ -1,0 +1,135 @@
+"""Saturation boundaries: how likely what clips in the ball's picture is the light itself.
+
+A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips is larger
+than the light by up to a pixel. ``weigh_boundaries`` makes it count less.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_ar.kernels.latlong import PI, direction_from_latlong, sample_latlong, sample_row
+from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import FrameParams, Probe
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_HALF_PIXEL = wp.constant(wp.float32(0.1))
+"""Radians: balls of less than ten pixels are taken to have ten."""
+WIDE = wp.constant(wp.float32(6.0))
+"""Half pixels: what is wider clips hardly beyond its boundary, for it exceeds clipping by less than an emitter does."""
+SHARPNESS = wp.constant(wp.float32(2.0))
+"""Exponent of the share around a texel of the smallest emitter."""
+BOUNDARY_REACH = wp.constant(2)
+"""Samples of a Gaussian to each side, one standard deviation apart."""
+
+
+@wp.func
+def mean_around(
+    clipped: wp.array2d[wp.vec3], i: wp.int32, j: wp.int32, deviation: wp.float32, near_pole: wp.float32
+) -> wp.vec3:
+    """Gaussian mean around a texel, of a standard deviation in radians.
+
+    ``near_pole`` standard deviations from a pole it is taken around directions, elsewhere along rows and columns.
+    """
+    height = wp.float32(clipped.shape[0])
+    width = wp.float32(clipped.shape[1])
+    sine = wp.sin(PI * (wp.float32(i) + 0.5) / height)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    total_weight = wp.float32(0.0)
+    a = wp.int32(-BOUNDARY_REACH)
+    if sine < near_pole * deviation:
+        # A circle of latitude is no straight line here.
+        direction = direction_from_latlong(wp.float32(i) + 0.5, wp.float32(j) + 0.5, clipped.shape[0], clipped.shape[1])
+        across = wp.normalize(wp.cross(direction, wp.vec3(1.0, 0.0, 0.0)))
+        upward = wp.cross(across, direction)
+        while a <= BOUNDARY_REACH:
+            b = wp.int32(-BOUNDARY_REACH)
+            while b <= BOUNDARY_REACH:
+                toward = direction + deviation * (wp.float32(a) * across + wp.float32(b) * upward)
+                weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
+                total += weight * sample_latlong(clipped, toward)
+                total_weight += weight
+                b += 1
+            a += 1
+        return total / total_weight
+    down_step = deviation * height / PI
+    across_step = deviation * width / (2.0 * PI * sine)
+    # One row of samples at a time, those unrolled: their loads do not wait for each other.
+    while a <= BOUNDARY_REACH:
+        y = wp.float32(i) + down_step * wp.float32(a)
+        row = wp.int32(wp.floor(y))
+        part = y - wp.floor(y)
+        for b in range(wp.static(-BOUNDARY_REACH), wp.static(BOUNDARY_REACH + 1)):
+            x = wp.float32(j) + across_step * wp.float32(b)
+            top = sample_row(clipped, row, x)
+            weight = wp.exp(-0.5 * wp.float32(a * a + b * b))
+            total += weight * (top + part * (sample_row(clipped, row + 1, x) - top))
+            total_weight += weight
+        a += 1
+    return total / total_weight
+
+
+@wp.kernel(enable_backward=False)
+def weigh_boundaries_kernel(
+    # In:
+    row_start: wp.int32,
+    clipped: wp.array2d[wp.vec3],
+    params: wp.array[FrameParams],
+    probes: wp.array[Probe],
+    # Out:
+    missing_out: wp.array2d[wp.vec3],
+):
+    """A texel times a power of the mean around it."""
+    i, j = wp.tid()
+    i += row_start
+    share = clipped[i, j]
+    if not wp.max(share) > 0.0:
+        missing_out[i, j] = wp.vec3(0.0, 0.0, 0.0)
+        return
+    to_ball = probes[0].center - params[0].camera_position
+    pixels = params[0].focal[0] * probes[0].radius / wp.length(to_ball)
+    # A pixel in the middle of the ball is 1 / pixels radians of its normals, twice that of what they mirror.
+    half_pixel = wp.clamp(1.0 / pixels, 0.0, MAX_HALF_PIXEL)
+    around = wp.max(mean_around(clipped, i, j, half_pixel, 6.0))
+    if around < 0.999:
+        # Along rows and columns nearly everywhere: how wide something is need not be known exactly.
+        wide = wp.max(mean_around(clipped, i, j, WIDE * half_pixel, 1.5))
+        around = wp.pow(around, SHARPNESS * wp.max(1.0 - 2.0 * wide, 0.0))
+    missing_out[i, j] = share * around
+
+
+def weigh_boundaries(
+    clipped: wp.array,
+    params: wp.array,
+    probes: wp.array,
+    missing_out: wp.array,
+    *,
+    rows: Rows | None = None,
+) -> None:
+    """Weigh what clips by how likely it is the light itself: saturation boundaries count less.
+
+    A pixel at a light's boundary shows part of the light, and clips all the same if that is bright: what clips in the
+    ball's picture is larger than the light by up to a pixel. A texel counts by the mean share at clipping around it,
+    in the channel that clips most and by a Gaussian of half a pixel's standard deviation, to the power
+
+        2 max(0, 1 - 2 w),    w the same mean by a Gaussian of three pixels.
+
+    An emitter of a few pixels becomes as small as it is, and so do its shadows and highlights. Windows keep theirs
+    (w is a half there): they are not so much brighter than clipping that a pixel clips of which they are a small part.
+
+    Args:
+        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        params: ``FrameParams`` (1): the camera.
+        probes: ``Probe`` (P), at least one: the ball.
+        missing_out: ``wp.vec3`` (h, w), 0 where nothing clips.
+        rows: Band of rows, None for all.
+    """
+    launch_rows(
+        weigh_boundaries_kernel,
+        clipped.shape,
+        [clipped, params, probes],
+        [missing_out],
+        rows=rows,
+        device=clipped.device,
+    )

@@ -1,0 +1,147 @@
+"""Meshes as rays meet them: which shapes become one, and the BVH that no ray slips through."""
+
+from __future__ import annotations
+
+import dataclasses
+import weakref
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_ar import scene as scenes
+from warp_ar.kernels.wide_bvh import build_wide_bvh
+from warp_ar.scene.geometry import Mesh
+from warp_ar.scene.object_materials import file_mesh
+from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
+
+FloatArray = npt.NDArray[np.float64]
+
+BOX_MARGIN: Final = 2.0**-18
+"""How much larger than its triangle a box of the BVH is, in radii of the mesh; see ``kernels/shapes.py``."""
+BVH_CONSTRUCTOR: Final = "sah"
+"""On CUDA; Warp's own choice there is quicker to build, and a fifth to a half slower to walk."""
+BVH_LEAF_SIZE: Final = 1
+"""Triangles per leaf there: a ray that tests triangles holds up those beside it that still walk."""
+PICTURE_CELLS: Final = 16
+"""Into how many parts along either side a rect is cut whose picture emits: light is looked for where it is bright."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RayMesh:
+    """A mesh that rays can meet, moved so that the centre of its bounding box is its origin."""
+
+    mesh: Any
+    """``wp.Mesh`` whose corners are not shared: corner k of face f is point 3 f + k."""
+    center: FloatArray
+    """Where its origin lies in the coordinates of the source, (3,)."""
+    half: FloatArray
+    """Half sizes of its bounding box, (3,)."""
+    normals: npt.NDArray[np.float32]
+    """Unit normal of each corner, (3 m, 3)."""
+    uvs: npt.NDArray[np.float32]
+    """Texture coordinates of each corner, (3 m, 2)."""
+    tree: Any
+    """On CPU what rays walk, of ``kernels.wide_bvh``; None: they walk the ``wp.Mesh``'s own."""
+
+    @property
+    def tree_address(self) -> int:
+        """What ``structs.Shape.tree`` is to be."""
+        return 0 if self.tree is None else int(self.tree.ptr)
+
+
+def make_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
+    """Build the BVH of a mesh with a margin around every triangle, so that no ray slips through a shared edge.
+
+    The BVH is built over triangles that span the enlarged boxes; then the true corners take their place. Nothing is
+    refitted afterwards, so the boxes keep their margin, and the triangles that rays are tested against are exact.
+    Meshes stand still in their own space: the tree is built once, so it is the one that is walked fastest. On CPU that
+    is one of ``kernels.wide_bvh``, and Warp's own, which only holds the triangles, the one that is built fastest.
+
+    Args:
+        mesh: The triangles.
+        device: Warp device.
+    """
+    low, high = (bound.astype(np.float64) for bound in mesh.bounds)
+    center = 0.5 * (low + high)
+    # Vertices at one position stay at one position to the last bit: every corner is computed the same way.
+    corners = (mesh.vertices.astype(np.float64) - center).astype(np.float32)[mesh.faces]
+    half = np.abs(corners).reshape(-1, 3).max(axis=0).astype(np.float64)
+    margin = np.float32(BOX_MARGIN * np.linalg.norm(half))
+    boxes = np.stack([corners.min(axis=1) - margin, corners.max(axis=1) + margin, corners[:, 0]], axis=1)
+    points = wp.array(boxes.reshape(-1, 3), dtype=wp.vec3, device=device)
+    indices = wp.array(np.arange(corners.shape[0] * 3, dtype=np.int32), dtype=wp.int32, device=device)
+    on_cpu = points.device.is_cpu
+    constructor = "median" if on_cpu else BVH_CONSTRUCTOR
+    ray_mesh = wp.Mesh(points=points, indices=indices, bvh_constructor=constructor, bvh_leaf_size=BVH_LEAF_SIZE)
+    wp.copy(points, wp.array(corners.reshape(-1, 3), dtype=wp.vec3, device=device))
+    tree = build_wide_bvh(corners, float(margin)) if on_cpu else None
+    uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
+    normals = mesh.normals[mesh.faces].reshape(-1, 3)
+    return RayMesh(ray_mesh, center, half, normals, uvs[mesh.faces].reshape(-1, 2), tree)
+
+
+_SHARED: weakref.WeakKeyDictionary[Mesh, weakref.WeakValueDictionary[str, RayMesh]] = weakref.WeakKeyDictionary()
+
+
+def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
+    """``make_ray_mesh`` of a file's mesh, one for all scenes of a device for as long as any of them holds it.
+
+    A mesh that a program made itself may change in its hands: each scene has its own of that.
+    """
+    by_device = _SHARED.setdefault(mesh, weakref.WeakValueDictionary())
+    known = by_device.get(str(device))
+    if known is None:
+        known = by_device[str(device)] = make_ray_mesh(mesh, device)
+    return known
+
+
+def mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
+    """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
+    if item.shape == "mesh":
+        return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
+    if not isinstance(item, scenes.Object):
+        return None
+    if item.shape == "torus":
+        outer = item.scale * (item.major_radius + item.minor_radius)
+        return item.major_radius, item.minor_radius, silhouette_tolerance(outer) / item.scale
+    gap = silhouette_tolerance(item.scale * max(item.radius, 0.5 * item.length)) / item.scale
+    emissive = isinstance(item.material, scenes.EmissiveMaterial)
+    match item.shape:
+        case "rect":
+            pictured = emissive and item.material.image is not None  # type: ignore[union-attr]
+            return "rect", item.size[:2], PICTURE_CELLS if pictured else 1
+        case "disk":
+            return "disk", item.radius, gap
+        case "tube":
+            return "tube", item.radius, item.length, gap
+        case "box" if emissive:
+            return "box", item.size
+    return None
+
+
+_MAKERS: Final[dict[str, Any]] = {"rect": rect_mesh, "disk": disk_mesh, "tube": tube_mesh, "box": box_mesh}
+
+
+def make_mesh(key: Any) -> Mesh:
+    """What ``mesh_key`` says."""
+    if isinstance(key, Mesh):
+        return key
+    if isinstance(key, Path):
+        return file_mesh(key)
+    return _MAKERS[key[0]](*key[1:]) if key[0] in _MAKERS else torus_mesh(*key)
+
+
+def texture_density(mesh: Mesh) -> npt.NDArray[np.float32]:
+    """Texture coordinates of both sets per unit of length on each triangle, (m, 2): square roots of ratios of areas."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    found = np.zeros((len(mesh.faces), 2))
+    for index, uvs in enumerate((mesh.uvs, mesh.uvs_second)):
+        if uvs is not None:
+            u, v = uvs[mesh.faces].astype(np.float64).transpose(2, 0, 1)
+            spanned = (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+            found[:, index] = np.sqrt(np.abs(spanned) / np.where(area > 0.0, area, np.inf))
+    return found.astype(np.float32)
