@@ -38,8 +38,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_unconfigure(config: pytest.Config) -> None:
     """Remove what Warp keeps for threads that compiled kernels; at Python's end it would warn of it.
 
-    So would OpenImageIO of all its objects, where a command that a test has run froze what was loaded: Python's end then
-    frees none of it.
+    So would OpenImageIO of all its objects, where a command that a test has run froze what was loaded: Python's end
+    then frees none of it.
     """
     from warp_ar.engine.modules import remove_header_folders
 

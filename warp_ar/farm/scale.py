@@ -107,10 +107,9 @@ def read_figures(path: str | Path) -> tuple[str, list[Task]]:
         label = f"{path}: work[{index}]"
         _check(label, {k: v for k, v in task.items() if k != "name"}, (*own, *_WORK_KEYS), ("clips", "frames"))
         figures = Figures(**{name: float(task.get(name, data[name])) for name in own})
-        counts = (int(task[key]) for key in ("clips", "frames"))
-        variations = int(task.get("variations", 0))
-        segment = int(task.get("segment_frames", task["frames"]))
-        found.append(Task(str(task.get("name", f"work {index + 1}")), *counts, variations, segment, figures))
+        clips, frames, variations = (int(task.get(key, 0)) for key in ("clips", "frames", "variations"))
+        segment = int(task.get("segment_frames", frames))
+        found.append(Task(str(task.get("name", f"work {index + 1}")), clips, frames, variations, segment, figures))
     return str(source), found
 
 
