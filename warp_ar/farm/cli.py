@@ -221,7 +221,8 @@ def plan(options: argparse.Namespace) -> int:
     )
     for count in sorted({1, len(devices)}):
         print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(min(count, at_once)))}")
-    print(f"output: {found.bytes / 1e6:.1f} MB")
+    kept = f", beside {found.survey_bytes / 1e6:.1f} MB that surveys keep" if found.survey_bytes else ""
+    print(f"output: {found.bytes / 1e6:.1f} MB{kept}")
     return EXIT_FAILED if found.problems else EXIT_DONE
 
 
