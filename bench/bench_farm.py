@@ -12,7 +12,8 @@ Parts, each of which keeps to its share of the minutes:
 - ``long``: a recording through 8 segments: memory over time, and every picture of them equal to those of one run. As
   many of the asked frames as fit its minutes; the figures say how many;
 - ``variations``: variations of one clip by 1, 2 and 4 workers at once, each with its share of the cores: bytes equal;
-  and a variation's frame over one of ``live`` with the same light, in turn.
+  and a variation's frame over one of ``live`` with the same light, in turn;
+- ``kills``: a recording lit while workers and driver are killed at random moments: bytes those of a run left alone.
 
 Results are JSON lines, on the standard output and in ``DIR/farm_PART.jsonl``; progress is on the standard error.
 """
@@ -41,7 +42,7 @@ from bench.farm_runs import jobs_done, prepare, rates, work
 from warp_ar.farm.fitting import probe_worker, workers_of_gpu
 from warp_ar.farm.jobs import parse_jobs, read_jobs
 
-PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18}
+PARTS = {"bounds": 0.1, "gpus": 0.4, "cpu": 0.1, "long": 0.22, "variations": 0.18, "kills": 0.2}
 """Parts in their order, and their shares of the minutes."""
 CLIP_FRAMES = 480
 """Of the recording that ``gpus`` and ``cpu`` light again and again."""
@@ -62,6 +63,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--segment-frames", type=int, default=60, help="of parts gpus and cpu (default: 60)")
     parser.add_argument("--long-frames", type=int, default=54_000, help="asked of part long (default: 54000)")
     parser.add_argument("--variations", type=int, default=2000, help="of part variations (default: 2000)")
+    parser.add_argument("--kill-frames", type=int, default=4800, help="of part kills' recording (default: 4800)")
+    parser.add_argument("--kills", type=int, default=20, help="deaths of workers in part kills (default: 20)")
+    parser.add_argument("--driver-kills", type=int, default=3, help="deaths of the driver there (default: 3)")
     parser.add_argument("--decode", choices=("cpu", "gpu"), default="cpu", help="what decodes (default: cpu)")
     parser.add_argument("--variation-size", default="640x480", metavar="WxH", help="of their pictures (640x480)")
     parser.add_argument(
@@ -259,6 +263,7 @@ def run_parts(bench: Bench) -> None:
     """All parts that are asked for, each within its share of the minutes."""
     from bench.farm_bounds import run_bounds
     from bench.farm_equal import run_long, run_variations
+    from bench.farm_kills import run_kills
 
     runs = {
         "bounds": run_bounds,
@@ -266,6 +271,7 @@ def run_parts(bench: Bench) -> None:
         "cpu": run_cpu,
         "long": run_long,
         "variations": run_variations,
+        "kills": run_kills,
     }
     asked = [part for part in PARTS if part in bench.options.parts.split(",")]
     end = time.monotonic() + 60.0 * bench.options.minutes

@@ -108,6 +108,7 @@ def work(
     cores: Sequence[int] = (),
     limit: float = 600.0,
     steady: float | None = None,
+    meddle: Callable[[int], None] | None = None,
 ) -> Watched:
     """Work a run through with the command, and watch it.
 
@@ -120,6 +121,7 @@ def work(
         cores: Cores that it keeps to; empty: all.
         limit: Seconds after which it is interrupted.
         steady: The same, counted from when as many jobs as there are workers have been done; None: to its end.
+        meddle: Called five times a second with the driver's process number.
     """
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     environment = dict(os.environ, PYTHONPATH=path)
@@ -148,6 +150,8 @@ def work(
         until, warm = start + limit, False
         while process.poll() is None and time.monotonic() < until:
             time.sleep(0.2)
+            if meddle is not None:
+                meddle(process.pid)
             if steady is not None and not warm and _segments_done(folder) >= workers:
                 warm, until = True, min(until, time.monotonic() + steady)
         if process.poll() is None:
@@ -201,7 +205,7 @@ def _watch(pid: int, folder: Path, seen: Watched, say: Callable[[str], None], en
     spent: dict[int, float] = {}
     while not ended.wait(0.5):
         sizes = []
-        for process in [pid, *_children(pid)]:
+        for process in [pid, *workers_of(pid)]:
             with contextlib.suppress(OSError, ValueError, IndexError):
                 resident = int(Path(f"/proc/{process}/statm").read_text().split()[1]) * page
                 fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -221,7 +225,7 @@ def _watch(pid: int, folder: Path, seen: Watched, say: Callable[[str], None], en
                 say(f"{progress['jobs_open']} of {progress['jobs_known']} jobs open, {rate:.1f} frames a second")
 
 
-def _children(pid: int) -> list[int]:
+def workers_of(pid: int) -> list[int]:
     """Workers: processes that a driver has started by spawning."""
     found = []
     with contextlib.suppress(OSError):

@@ -19,9 +19,9 @@ import functools
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.pixels import pixel_radiance
 from warp_ar.kernels.shapes import FAR
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace
@@ -75,6 +75,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         row_start: wp.int32,
         frame: wp.array2d[wp.vec3ub],
         table: wp.array[wp.vec3],
+        linear: wp.array2d[wp.vec3],
         params: wp.array[FrameParams],
         probes: wp.array[Probe],
         scene: RayScene,
@@ -110,7 +111,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
             inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
             if inside and not shaded and passes_balls(probes, camera.camera_position, ray, reach):
                 if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
-                    total += decode(table, frame[row, column])
+                    total += pixel_radiance(frame, table, linear, row, column)
                     count += 1.0
         if count > 0.0:
             weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
@@ -132,6 +133,7 @@ def fill_frame(
     width: int,
     *,
     proxies: tuple[int, ...],
+    linear: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Put what the frame shows into a seeded fill pyramid, where balls left trust open.
@@ -146,12 +148,13 @@ def fill_frame(
         height: Of the map.
         width: Of the map.
         proxies: Kinds of proxy in the scene.
+        linear: ``wp.vec3`` (frame rows, columns), linear radiance of a frame of more than 8 bits; empty or None: none.
         rows: Band of rows, None for all.
     """
     launch_rows(
         make_fill_frame_kernel(proxies),
         (height, width),
-        [frame, decode_table, params, probes, scene, height, width],
+        [frame, decode_table, linear, params, probes, scene, height, width],
         [levels_out],
         rows=rows,
         device=levels_out.device,

@@ -36,11 +36,11 @@ import functools
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import ggx_lobe, reflect, schlick
+from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.reflect import DistantLight, look_up, look_up_layer, make_find_in_frame
 from warp_ar.kernels.sampling import (
     frame_from_normal,
@@ -354,7 +354,7 @@ def make_gloss_kernel(config: GlossConfig) -> wp.Kernel:
                 added += one.change
                 before += one.before
             share = 1.0 / wp.float32(count)
-            shown = decode(sight.picture.decode_table, sight.picture.frame[i, j])
+            shown = shown_radiance(sight.picture, i, j)
             given_back = wp.cw_mul(wp.vec3(1.0, 1.0, 1.0) - ratio, wp.min(share * before, shown))
             change += share * added + wp.where(is_shadowed, 1.0, 0.0) * given_back
         change_out[i, j] = change

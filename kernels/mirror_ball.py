@@ -20,9 +20,9 @@ import math
 
 import warp as wp
 
-from warp_ar.kernels.color import decode
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.materials import reflect
+from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.receiver import Receiver, RelightConfig
 from warp_ar.kernels.reflect import DistantLight, look_up_layer, make_find_in_frame
 from warp_ar.kernels.relight import make_direct_lighting
@@ -95,7 +95,6 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
         distant: DistantLight,
         receiver: Receiver,
         shadow_ratio: wp.array2d[wp.vec3],
-        linear_frame: wp.array2d[wp.vec3],
         # Out:
         mirrored_out: wp.array2d[wp.vec3],
     ):
@@ -106,9 +105,7 @@ def make_mirror_ball_kernel(config: MirrorBallConfig) -> wp.Kernel:
             return
         origin = params[0].camera_position
         ray = receiver.picture.rays[i, j]
-        shown = decode(receiver.picture.decode_table, receiver.picture.frame[i, j])
-        if linear_frame.shape[0] > 0:
-            shown = linear_frame[i, j]
+        shown = shown_radiance(receiver.picture, i, j)
         change = wp.vec3(0.0, 0.0, 0.0)
         count = wp.int32(wp.static(config.samples))  # a variable: the loop stays one
         for sample in range(count):
@@ -169,7 +166,6 @@ def mirror_ball(
     shadow_ratio: wp.array | None,
     mirrored_out: wp.array,
     *,
-    linear_frame: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write what virtual objects change in the picture of mirror balls; zero outside ``params[0].ball_rect``.
@@ -183,14 +179,13 @@ def mirror_ball(
         receiver: From ``make_receiver``; picture and probes are always needed.
         shadow_ratio: (H, W) vec3 of ``environment_shadow``; needed if ``config.ratio``.
         mirrored_out: (H, W) vec3, change of linear radiance in camera values.
-        linear_frame: (H, W) vec3, the frame as linear radiance where more than 8 bits of it are known.
         rows: Band of rows; None means all.
     """
     rays = receiver.picture.rays
     launch_rows(
         make_mirror_ball_kernel(config),
         rays.shape,
-        [params, scene, lights, distant, receiver, shadow_ratio, linear_frame],
+        [params, scene, lights, distant, receiver, shadow_ratio],
         [mirrored_out],
         rows=rows,
         device=rays.device,

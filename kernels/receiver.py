@@ -260,9 +260,13 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         matter.m = 1.0
-        radiance = decode(receiver.picture.decode_table, receiver.picture.frame[row, col])
+        coded = decode(receiver.picture.decode_table, receiver.picture.frame[row, col])
+        radiance = coded
+        if receiver.picture.linear.shape[0] > 0:
+            radiance = wp.max(receiver.picture.linear[row, col], wp.vec3(0.0, 0.0, 0.0))
         is_mirrored = mirror[0] > 0.0
         if is_mirrored:
+            coded = wp.cw_div(coded, mirror)
             radiance = wp.cw_div(radiance, mirror)
         matter.key = receiver.key_lights[0].direction
         matter.directionality = receiver.key_lights[0].directionality
@@ -270,12 +274,12 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
             if wp.static(reading is not None and reading.values == "video"):
                 matter.m = wp.float32(intensity(receiver.picture.frame[row, col])) / 255.0
             else:
-                matter.m = luminance(radiance)
+                matter.m = luminance(coded)
         else:
             around = luminance(radiance)
             if not is_mirrored:
                 around = surrounding_luminance(receiver.table, receiver.picture.decode_table, row, col, receiver.box)
-                matter.m = luminance(radiance) / around
+                matter.m = luminance(coded) / around  # like with like: what is around is told by codes
             if wp.static(method == "relief"):
                 hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
                 matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))

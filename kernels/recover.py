@@ -12,7 +12,6 @@ the same for emitters at finite distances. ``kernels/recover_cells.py`` has the 
 for what is missing in the clipped ones.
 """
 
-from __future__ import annotations
 
 import functools
 
@@ -22,6 +21,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.recover_cells import Cell, cell_of
 from warp_ar.kernels.shapes import FAR, ROUNDING
 from warp_ar.kernels.structs import FrameParams, Probe, RayScene
@@ -140,15 +140,19 @@ def mirrored_irradiance(probe: Probe, point: SurfacePoint, light: wp.vec3) -> wp
 
 
 @functools.cache
-def make_observe_surfaces_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
-    """Kernel of ``observe_surfaces`` for the given kinds of proxy."""
+def make_observe_surfaces_kernel(proxies: tuple[int, ...], linear: bool = False) -> wp.Kernel:
+    """Kernel of ``observe_surfaces`` for the given kinds of proxy, of frames of 8-bit codes or ``linear`` ones."""
     trace = make_trace(TraceConfig(objects=(), proxies=proxies))
+    pixel = wp.vec3 if linear else wp.vec3ub
+    to_light = keep_linear if linear else decode
+    find_levels = clip_levels if linear else saturation_codes
+    clips = is_at_clipping if linear else is_saturated
 
     @wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
     def observe_surfaces_kernel(
         # In:
         row_start: wp.int32,
-        frame: wp.array2d[wp.vec3ub],
+        frame: wp.array2d[pixel],
         table: wp.array[wp.vec3],
         params: wp.array[FrameParams],
         probes: wp.array[Probe],
@@ -162,7 +166,7 @@ def make_observe_surfaces_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         point = points[index]
         seen = Observation()
         across = wp.cross(point.normal, point.tangent)
-        saturation = saturation_codes(table)
+        levels = find_levels(table)
         if wp.dot(point.normal, camera.camera_position - point.position) > 0.0:
             squares = wp.vec3(0.0, 0.0, 0.0)
             count = wp.float32(0.0)
@@ -188,13 +192,13 @@ def make_observe_surfaces_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                         if trace.occluded_by_proxies(scene, camera.camera_position, ray, 1.0 - CLOSE):
                             clear = False
                     if clear:
-                        code = frame[i, j]
-                        value = decode(table, code)
+                        shown = frame[i, j]
+                        value = to_light(table, shown)
                         count += 1.0
                         before = value - seen.radiance
                         seen.radiance += before / count
                         squares += wp.cw_mul(before, value - seen.radiance)
-                        seen.clipped += is_saturated(code, saturation)
+                        seen.clipped += clips(shown, levels)
             if count > 0.0:
                 seen.clipped /= count
                 seen.visible = count / wp.float32(PATCH * PATCH)
@@ -220,8 +224,9 @@ def observe_surfaces(
     """Measure what the frame shows of surface points.
 
     Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
-        decode_table: Linear value of each code, ``wp.vec3`` (256).
+        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes; or ``wp.vec3``, linear radiance.
+        decode_table: Linear value of each code, ``wp.vec3`` (256); for a linear frame where it clips, and where beside
+            another channel that does, ``wp.vec3`` (2).
         params: ``FrameParams`` (1): the camera.
         probes: ``Probe`` (P): they hide surfaces.
         scene: Its proxies hide surfaces as well.
@@ -231,7 +236,7 @@ def observe_surfaces(
         rows: Band of points, None for all.
     """
     launch_rows(
-        make_observe_surfaces_kernel(proxies),
+        make_observe_surfaces_kernel(proxies, frame.dtype is wp.vec3),
         observations_out.shape,
         [frame, decode_table, params, probes, scene, points],
         [observations_out],

@@ -16,12 +16,12 @@ from typing import Literal
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode
 from warp_ar.kernels.emitters import add_emitters, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.lobes import level_from_roughness, level_from_shininess, sample_levels
 from warp_ar.kernels.materials import make_surface, reflect, specular_occlusion
+from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.structs import (
     LAMBERT,
     METALLIC_ROUGHNESS,
@@ -98,14 +98,12 @@ class DistantLight:
 @wp.func
 def look_up(picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec3:
     """Bilinear sample of a frame's linear radiance; x and y are inside the outermost pixel centres."""
-    frame = picture.frame
-    decode_table = picture.decode_table
-    j = wp.min(wp.int32(x), frame.shape[1] - 2)
-    i = wp.min(wp.int32(y), frame.shape[0] - 2)
+    j = wp.min(wp.int32(x), picture.frame.shape[1] - 2)
+    i = wp.min(wp.int32(y), picture.frame.shape[0] - 2)
     fx = x - wp.float32(j)
     fy = y - wp.float32(i)
-    top = (1.0 - fx) * decode(decode_table, frame[i, j]) + fx * decode(decode_table, frame[i, j + 1])
-    bottom = (1.0 - fx) * decode(decode_table, frame[i + 1, j]) + fx * decode(decode_table, frame[i + 1, j + 1])
+    top = (1.0 - fx) * shown_radiance(picture, i, j) + fx * shown_radiance(picture, i, j + 1)
+    bottom = (1.0 - fx) * shown_radiance(picture, i + 1, j) + fx * shown_radiance(picture, i + 1, j + 1)
     return (1.0 - fy) * top + fy * bottom
 
 

@@ -205,12 +205,15 @@ class Picture:
     frame: wp.array2d[wp.vec3ub]  # RGB
     decode_table: wp.array[wp.vec3]  # (256,) of ``color.decode_table``
     rays: wp.array2d[wp.vec2]  # undistorted (x / z, y / z) of each pixel's centre
+    linear: wp.array2d[wp.vec3]  # linear radiance of a frame of more than 8 bits; empty: the codes are all
 
 
-def make_picture(frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None) -> Picture:
+def make_picture(
+    frame: wp.array | None, decode_table: wp.array | None, rays: wp.array | None, linear: wp.array | None = None
+) -> Picture:
     """The arrays of a picture together; None for what a kernel does not read."""
     picture = Picture()
-    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays)):
+    for name, value in (("frame", frame), ("decode_table", decode_table), ("rays", rays), ("linear", linear)):
         if value is not None:
             setattr(picture, name, value)
     return picture

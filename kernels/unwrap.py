@@ -33,6 +33,7 @@ from warp_ar.kernels.camera import project
 from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
+from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
 from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
 
@@ -282,37 +283,6 @@ def lane_across(value: wp.float32, reach: wp.int32) -> wp.float32:
 def vec_across(value: wp.vec3, reach: wp.int32) -> wp.vec3:
     """``lane_across`` of a vector."""
     return wp.vec3(lane_across(value[0], reach), lane_across(value[1], reach), lane_across(value[2], reach))
-
-
-mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
-
-
-@wp.func
-def keep_linear(table: wp.array[wp.vec3], value: wp.vec3) -> wp.vec3:
-    """A pixel of a linear frame, in the place of ``decode``."""
-    return value
-
-
-@wp.func
-def clip_levels(table: wp.array[wp.vec3]) -> mat23:
-    """Where the channels of a linear frame clip, and where beside another one that does."""
-    return mat23(table[0][0], table[0][1], table[0][2], table[1][0], table[1][1], table[1][2])
-
-
-@wp.func
-def is_at_clipping(value: wp.vec3, levels: mat23) -> wp.vec3:
-    """1 in the channels of a linear pixel that clip, in the place of ``is_saturated``."""
-    beside = wp.bool(False)
-    for channel in range(3):
-        beside = beside or value[channel] >= levels[0, channel]
-    least = levels[0]
-    if beside:
-        least = levels[1]
-    return wp.vec3(
-        wp.where(value[0] >= least[0], 1.0, 0.0),
-        wp.where(value[1] >= least[1], 1.0, 0.0),
-        wp.where(value[2] >= least[2], 1.0, 0.0),
-    )
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pathlib
 from collections.abc import Iterator
@@ -35,10 +36,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """Remove what Warp keeps for threads that compiled kernels; at Python's end it would warn of it."""
+    """Remove what Warp keeps for threads that compiled kernels; at Python's end it would warn of it.
+
+    So would OpenImageIO of all its objects, where a command that a test has run froze what was loaded: Python's end
+    then frees none of it.
+    """
     from warp_ar.engine.modules import remove_header_folders
 
     remove_header_folders()
+    gc.unfreeze()
 
 
 @pytest.hookimpl(tryfirst=True)

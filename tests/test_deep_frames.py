@@ -33,6 +33,7 @@ STEP16 = 1.0 / 65535.0
 HALF_STEP16 = 0.51 * STEP16  # a signal is rounded to one of 65536 steps
 STEP10 = 1.0 / 876.0  # of luma in 10 bits of limited range
 HALF = 2.0**-11  # rounding to 16-bit floats, relative
+SCALED = 1e-5  # of a factor: rounding, of which a power of two makes none
 FLOAT32 = 2e-6  # of a matrix and a table in float32, relative to the largest part
 TAGS = {"sdr": (1, 1, 1), "pq": (9, 9, 16), "hlg": (9, 9, 18), "p3": (1, 12, 1)}
 LUMA = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
@@ -255,6 +256,27 @@ def test_light_above_white_lights_as_it_is(first: np.ndarray) -> None:
     untouched = (layers["objects"] == 0.0).all(-1) & ~laid.any(-1)
     assert untouched.sum() > 1000
     np.testing.assert_array_equal(picture[untouched], (5.0 * radiance)[untouched])
+
+
+def test_a_desk_in_the_dark_is_lit_as_a_bright_one(first: np.ndarray) -> None:
+    """A hundredth of the light: all that objects and their shadows take from the environment is a hundredth as well.
+
+    The desk is then darker than 1/255 nearly everywhere. A power of two, so that not one bit of it is lost.
+    """
+    radiance = decode_codes("srgb", first.reshape(-1) / 255.0)[:, 0].reshape(first.shape).astype(np.float32)
+    radiance = np.minimum(radiance, np.float32(0.5))  # no light that clips is guessed
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
+        pose = pipeline(first).pose
+    dim = np.float32(1.0 / 128.0)
+    assert np.median(dim * radiance) < 1.0 / 255.0
+    _, _, bright, many = lit(radiance, linear=True, pose=pose)
+    _, _, dark, few = lit(dim * radiance, linear=True, pose=pose)
+    np.testing.assert_allclose(dark, dim * bright, rtol=FLOAT32, atol=1e-9)
+    shadow = np.abs(few["shadow_ratio"] - many["shadow_ratio"])
+    assert (many["shadow_ratio"] < 0.9).any()
+    assert shadow.max() < SCALED
+    _, _, _, codes = lit(srgb8(dim * radiance), pose=pose)
+    assert np.abs(codes["shadow_ratio"] - many["shadow_ratio"]).max() > 0.03, "8 bits do not hold it"
 
 
 def test_what_a_ball_shows_of_an_object_hides_light_above_white(first: np.ndarray) -> None:

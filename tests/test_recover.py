@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from tests.error_model import check_error
 from tests.reference import recover as reference
 from warp_ar.engine.pipeline import Pipeline
+from warp_ar.input.plate import srgb8
 from warp_ar.kernels import recover as kernels
 from warp_ar.kernels import structs
 from warp_ar.kernels.color import decode_table
@@ -351,6 +352,27 @@ def test_observation_reads_surfaces_and_nothing_else(device, scene):
     assert got["radiance"][0] == pytest.approx(np.full(3, 0.2), abs=1e-6)
     assert got["clipped"][:2] == pytest.approx(np.array([[0, 0, 0], [1, 0, 0]]))
     assert not got["radiance"][2:].any()
+
+
+def test_observation_of_a_linear_frame_reads_light_as_it_is(device, scene):
+    """Darker than 1/255 and brighter than white, against the same in 8 bits."""
+    light = np.full((240, 320, 3), 0.0021, np.float32)
+    light[:, 160:] = 3.5
+    light[:, 160:, 0] = 6.0
+    host = HostScene(dataclasses.replace(scene, objects=()), device)
+    points = points_of(device, [(-0.1, -0.1, 0), (0.1, -0.1, 0)], [(0, 0, 1)] * 2)
+    out = wp.zeros(2, dtype=kernels.Observation, device=device)
+    codes, table, params = look_down(device, scene, srgb8(light))
+    seen = params, probes_of(device), host.ray_scene, points, out
+    clip = wp.array(np.float32([[5.0] * 3, [3.0] * 3]), dtype=wp.vec3, device=device)
+    frame = wp.array(light, dtype=wp.vec3, device=device)
+    kernels.observe_surfaces(frame, clip, *seen, proxies=trace_config(scene).proxies)
+    np.testing.assert_allclose(out.numpy()["radiance"], [[0.0021] * 3, [6.0, 3.5, 3.5]], rtol=1e-6)
+    # Red is at clipping by itself, the others beside it.
+    np.testing.assert_array_equal(out.numpy()["clipped"], [[0.0] * 3, [1.0] * 3])
+    kernels.observe_surfaces(codes, table, *seen, proxies=trace_config(scene).proxies)
+    assert abs(out.numpy()["radiance"][0, 0] / 0.0021 - 1.0) > 0.005
+    assert out.numpy()["radiance"][1].max() == 1.0
 
 
 # ---- the solution -------------------------------------------------------------------------------------------------

@@ -97,6 +97,7 @@ def run(
     rect=(0, H, 0, W),
     out=None,
     rows=None,
+    linear=None,
 ):
     frame = np.full((H, W, 3), 128, np.uint8) if frame is None else frame
     config = RelightConfig(
@@ -117,7 +118,12 @@ def run(
     out = wp.full((H, W), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3) if out is None else out
     receiver = make_receiver(
         config,
-        make_picture(frame_array, tables()[0], wp.array(RAYS, dtype=wp.vec2)),
+        make_picture(
+            frame_array,
+            tables()[0],
+            wp.array(RAYS, dtype=wp.vec2),
+            None if linear is None else wp.array(np.float32(linear), dtype=wp.vec3),
+        ),
         table=table,
         probes=records(Probe, *probes),
         key_lights=keys,
@@ -218,6 +224,31 @@ def test_reflectance_of_a_lambertian_desk_is_recovered(device, rho):
     )
     _, n_dot_l, e = reference.point_light(POINTS, np.array([0, 0, 0.25]), 0.3)
     np.testing.assert_allclose(got, np.broadcast_to(rho / np.pi * n_dot_l * e, got.shape), rtol=HALF_CODE)
+
+
+@pytest.mark.parametrize("method", ["reflectance", "relief"])
+def test_frames_of_more_than_8_bits_reflect_as_they_are(device, method):
+    """A desk darker than 1/255, and one brighter than white: reflectance is of the light itself, not of its codes."""
+    shown = np.exp(np.random.default_rng(4).uniform(np.log(4e-4), np.log(1 / 255), (H, W, 3)))
+    shown[:, W // 2 :] *= 1000.0
+    table = color.decode_table("srgb")
+    frame = reference_color.encode(np.minimum(shown, 1.0), reference_color.encoded_srgb).astype(np.uint8)
+    coded = reference_color.decode(table, frame)
+    surroundings = np.where(np.arange(W) < W // 2, 0.02, 20.0)[None, :, None] * np.ones(3)
+    at, intensity = np.array([0.05, 0.0, 0.25]), 0.3
+    wi, n_dot_l, e = reference.point_light(POINTS, at, intensity)
+    around = reference.surrounding_luminance(frame, table, surroundings_size(H))
+    rest = (around, n_dot_l, (wi @ np.array([0.0, 0.0, 1.0]))[..., None], 0.0, np.pi * surroundings)
+    kd, response = reference.respond(method, frame, shown, *rest, coded)
+    expected = kd / np.pi * response * e
+    for half, level in ((slice(0, W // 2), 0.02), (slice(W // 2, W), 20.0)):
+        got = run(method, [point(at)], frame, sh=constant_environment((level,) * 3), linear=shown)[:, half]
+        np.testing.assert_allclose(got, expected[:, half], rtol=3e-4, atol=1e-9)
+        codes = run(method, [point(at)], frame, sh=constant_environment((level,) * 3))[:, half]
+        if method == "reflectance":
+            assert np.abs(codes / got - 1.0).max() > 0.1, "8 bits do not hold it"
+    same = run(method, [point(at)], frame, linear=coded)
+    np.testing.assert_array_equal(same, run(method, [point(at)], frame))
 
 
 SLANT = unit(0.6, 0.0, 0.8)

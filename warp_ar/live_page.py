@@ -121,6 +121,8 @@ def serve_page(options: argparse.Namespace) -> int:
             raise
         say(error)
         code = EXIT_USAGE
+    finally:
+        gc.unfreeze()  # whoever called goes on with a collector that sees all
     if not server.ended or code in (EXIT_INTERRUPTED, EXIT_TERMINATED):
         # A frame of the reference, or a kernel that is compiled, takes many seconds and cannot be stopped, and Python
         # would wait for its thread, or end it within native code, which aborts. All files are closed and temporary

@@ -79,9 +79,9 @@ def surrounding_luminance(frame, decode_table, size):
     return np.maximum(np.interp(mean, np.arange(256), grey), 1e-4)
 
 
-def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, surroundings):
-    """(Kd, response) of one light, equations of the module's docstring."""
-    m = (radiance @ LUMINANCE)[..., None]
+def respond(method, frame, radiance, around, n_dot_l, alpha, directionality, surroundings, coded=None):
+    """(Kd, response) of one light, equations of the module's docstring; ``coded``: what 8 bits hold of the radiance."""
+    m = ((radiance if coded is None else coded) @ LUMINANCE)[..., None]
     kd = np.full(radiance.shape, 0.5)
     if method == "flat":
         return kd, n_dot_l

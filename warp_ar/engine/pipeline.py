@@ -158,8 +158,8 @@ class Pipeline(Closing):
                 from frames one after another; None: if the scene says that the camera meters by itself. Light that
                 dims on all surfaces alike is then taken for a drift.
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
-            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. The mirror ball is
-                read, and the plate among the layers kept, at that depth; markers and surfaces are seen in 8 bits.
+            linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls and
+                surfaces are read, and the plate among the layers kept, at that depth; markers are found in 8 bits.
             real_time: Whether no frame waits for light that is estimated beside the frames, by a process of its own: it
                 takes effect when it is there, so pictures of two runs may differ for some frames. For live cameras.
 

@@ -45,8 +45,12 @@ def make_parser() -> argparse.ArgumentParser:
             help="workers of a Ray cluster, or of one that is started here",
         )
     plan = commands.add_parser("plan", help="count jobs, try three of them on a few frames, say what all would take")
-    plan.add_argument("jobs", type=Path, metavar="JOBS.toml", help="clips, and what is to be made of them")
+    plan.add_argument("jobs", type=Path, nargs="?", metavar="JOBS.toml", help="clips, and what is to be made of them")
     plan.add_argument("--workers", type=int, metavar="N", help="workers that there will be")
+    plan.add_argument(
+        "--figures", type=Path, metavar="FILE", help="instead of trying jobs: tables of what many GPUs would take"
+    )
+    plan.add_argument("--gpus", metavar="N,M", help="with --figures: for how many (default: 1,8,32,128,1000)")
     for command in (run, resume, plan):
         command.add_argument("--device", default="auto", metavar="auto|cpu|cuda", help="where the kernels run")
     status = commands.add_parser("status", help="say where a run stands")
@@ -173,8 +177,30 @@ def _tell(folder: Path, failed: dict[str, str]) -> int:
     return EXIT_FAILED
 
 
+def _tell_scale(options: argparse.Namespace) -> int:
+    """Tables of what many GPUs would take."""
+    from warp_ar.farm.scale import GPUS, read_figures, table_of
+
+    gpus: Sequence[int] = GPUS
+    if options.gpus is not None:
+        try:
+            gpus = [int(part) for part in options.gpus.split(",")]
+        except ValueError:
+            gpus = [0]
+        if min(gpus) < 1:
+            raise UsageError(f"--gpus {options.gpus}: expected numbers from 1 on with commas between, such as 1,8")
+    source, tasks = read_figures(options.figures)
+    text = "\n\n".join([source] * bool(source) + [table_of(task, gpus) for task in tasks])
+    print("\n".join(map(printable, text.splitlines())))
+    return EXIT_DONE
+
+
 def plan(options: argparse.Namespace) -> int:
     """``farm plan``."""
+    if options.figures is not None:
+        return _tell_scale(options)
+    if options.jobs is None or options.gpus is not None:
+        raise UsageError("plan: name a job file, or --figures FILE, with --gpus or without")
     from warp_ar.farm.plan import make_plan
     from warp_ar.farm.pool import cores_of, devices_of, keeping_to
 
@@ -195,7 +221,8 @@ def plan(options: argparse.Namespace) -> int:
     )
     for count in sorted({1, len(devices)}):
         print(f"{count} worker{'s' if count > 1 else ''}: {words_of_seconds(found.seconds(min(count, at_once)))}")
-    print(f"output: {found.bytes / 1e6:.1f} MB")
+    kept = f", beside {found.survey_bytes / 1e6:.1f} MB that surveys keep" if found.survey_bytes else ""
+    print(f"output: {found.bytes / 1e6:.1f} MB{kept}")
     return EXIT_FAILED if found.problems else EXIT_DONE
 
 

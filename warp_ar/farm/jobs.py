@@ -18,6 +18,7 @@ from warp_ar.errors import SceneError
 from warp_ar.farm.catalogue import Dataset, check_dataset, read_dataset
 from warp_ar.farm.tables import JobsError, JobTable
 from warp_ar.files import is_file, is_folder, parse_toml, read_text
+from warp_ar.output.encoders import CODINGS
 from warp_ar.scene import CapturedLight, Scene, load_calibration, load_scene
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS
 
@@ -28,7 +29,9 @@ clip's end, or by what each segment finds for itself from some frames before it 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 DECODERS = ("cpu", "gpu")
 """What decodes recordings: the processor, or the GPU's decoding unit where it has one for their coding."""
-_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode")
+AS_RECORDED = "recorded"
+"""What recordings are written in, of ``CODINGS`` and this one: as deep as they came."""
+_RUN_KEYS = ("quality", "light", "segment_frames", "preroll", "decode", "coding")
 _CLIP_KEYS = ("name", "scene", "path", "light", "calibration", "frames")
 
 
@@ -46,6 +49,8 @@ class Settings:
     """Frames before a segment from which its light and its track are gathered, with ``light = "preroll"``."""
     decode: str = DECODERS[0]
     """One of ``DECODERS``."""
+    coding: str = AS_RECORDED
+    """Of what is written: one of ``CODINGS``, or ``AS_RECORDED``."""
 
     def gpu_of(self, device: str) -> int | None:
         """Number of the GPU that decodes for a worker on a device; None: the processor does."""
@@ -213,6 +218,8 @@ def parse_jobs(data: dict[str, Any], label: str) -> JobFile:
         raise JobsError(
             f'{label}: run.light = "preroll": a data set needs light that is captured once; "follow" or "fixed"'
         )
+    if dataset is not None and settings.coding != AS_RECORDED:
+        raise JobsError(f"{label}: run.coding = {settings.coding!r}: a data set is pictures of 8 bits; leave it out")
     jobs = JobFile(settings, tuple(clips), dataset)
     for scene in {clip.scene: index for index, clip in reversed(list(enumerate(clips)))}.values():
         base = scene_of(jobs, scene)
@@ -247,7 +254,8 @@ def _read_settings(table: JobTable) -> Settings:
     quality = table.choice("quality", PRESETS, DEFAULT_PRESET)
     size = table.integer("segment_frames", low=1) if "segment_frames" in table else None
     light, decode = table.choice("light", LIGHTS, LIGHTS[0]), table.choice("decode", DECODERS, DECODERS[0])
-    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode)
+    coding = table.choice("coding", (AS_RECORDED, *CODINGS), AS_RECORDED)
+    return Settings(quality, light, size, table.integer("preroll", 48, low=0), decode, coding)
 
 
 def _read_clip(table: JobTable, names: dict[str, int]) -> Clip:

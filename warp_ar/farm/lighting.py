@@ -18,7 +18,8 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.engine.result import Result
 from warp_ar.farm.frames import open_part
 from warp_ar.farm.jobs import Job, JobFile, lit_range, scene_of, source_of
-from warp_ar.farm.survey import Survey, lit_scene
+from warp_ar.farm.survey import Survey, keep_depth, lit_scene
+from warp_ar.input.plate import Plate
 from warp_ar.input.source import Frame, RecordedSource
 from warp_ar.scene import Pose, Scene
 from warp_ar.scene.kinds import skeleton
@@ -44,6 +45,15 @@ class Lit:
     def image(self) -> Image:
         """The picture, uint8 RGB (height, width, 3)."""
         return self.frame.image if self.result is None else self.result.image
+
+    @property
+    def radiance(self) -> npt.NDArray[np.float32]:
+        """The picture as linear radiance, float32 RGB (height, width, 3); where ``light`` was asked for it."""
+        if self.result is not None:
+            return self.result.radiance
+        plate = self.frame.plate
+        wide = self.frame.image.astype(np.uint16) * np.uint16(257)
+        return self.pipeline.inputs.radiance(Plate(wide) if plate is None else plate)
 
 
 class Lighter(Closing):
@@ -108,7 +118,8 @@ class Lighter(Closing):
             return
         own = lit_scene(self._jobs, job.clip, survey) if scene is None else scene
         with contextlib.closing(self._open(job.clip, job.first, job.end)) as source:
-            pipeline = self._pipeline_for(own, source.size, outputs, follows=len(survey.keys) > 0)
+            linear = keep_depth(source, own)
+            pipeline = self._pipeline_for(own, source.size, outputs, follows=len(survey.keys) > 0, linear=linear)
             pipeline.restart(saturation=survey.saturation)
             self._key = None
             for frame in source:
@@ -120,7 +131,7 @@ class Lighter(Closing):
                     continue
                 self._follow(pipeline, survey, job.clip, frame.index)
                 call = pipeline.submit if outputs == ("image",) else pipeline
-                yield Lit(frame, pose, call(frame.image, time_seconds=frame.time, pose=pose), pipeline)
+                yield Lit(frame, pose, call(frame.deepest, time_seconds=frame.time, pose=pose), pipeline)
 
     def _open(self, clip: int, first: int, end: int) -> RecordedSource:
         """Frames of a clip."""
@@ -138,10 +149,18 @@ class Lighter(Closing):
             pipeline.take_light(*survey.light(key))
 
     def _pipeline_for(
-        self, scene: Scene, size: tuple[int, int], outputs: tuple[str, ...], *, follows: bool
+        self, scene: Scene, size: tuple[int, int], outputs: tuple[str, ...], *, follows: bool, linear: bool
     ) -> Pipeline:
-        """A pipeline for a scene, one that is there where only numbers differ; ``follows``: by surveyed light."""
-        key = skeleton(scene), size, outputs, follows
+        """A pipeline for a scene, one that is there where only numbers differ.
+
+        Args:
+            scene: What to show.
+            size: Of the frames, width and height.
+            outputs: Of the pipeline.
+            follows: Whether it is lit by what a survey found.
+            linear: Whether frames have more than 8 bits.
+        """
+        key = skeleton(scene), size, outputs, follows, linear
         pipeline = self._pipelines.pop(key, None)
         if pipeline is not None and not pipeline.update(scene):
             pipeline.close()
@@ -156,6 +175,7 @@ class Lighter(Closing):
                 synchronous=True,
                 follows_camera=False,
                 emitters=follows,
+                linear=linear,
             )
         self._pipelines[key] = pipeline
         while len(self._pipelines) > PIPELINES:
@@ -169,6 +189,7 @@ class Lighter(Closing):
         first, _ = lit_range(self._jobs.clips[job.clip], survey.index.length)
         begin = max(first, job.first - self._jobs.settings.preroll)
         with contextlib.closing(self._open(job.clip, begin, job.end)) as source:
+            linear = keep_depth(source, scene)
             pipeline = Pipeline(
                 scene,
                 device=self._device,
@@ -176,11 +197,13 @@ class Lighter(Closing):
                 size=source.size,
                 outputs=outputs,
                 synchronous=True,
+                linear=linear,
             )
             with pipeline:
                 pipeline.start_clock(0.0)
                 for frame in source:
                     given = None if scene.pose is None else Pose(*scene.pose.at(frame.index))
-                    result = pipeline.submit(frame.image, time_seconds=frame.time, pose=given)
+                    call = pipeline.submit if outputs == ("image",) else pipeline
+                    result = call(frame.deepest, time_seconds=frame.time, pose=given)
                     if frame.index >= job.first:
                         yield Lit(frame, result.pose, result, pipeline)

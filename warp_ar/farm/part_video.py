@@ -2,8 +2,8 @@
 
 Frames keep the time stamps of the recording that they come from, so that a variable rate stays what it was and the
 recording's own sound fits. Segments have no B-frames: a packet's decoding time is then its picture's, and packets of
-one segment follow those of another whatever their times are. The encoder's threads are fixed, for x264's bytes depend
-on their number.
+one segment follow those of another whatever their times are. The encoder's threads are fixed, for its bytes depend on
+their number.
 """
 
 from __future__ import annotations
@@ -19,52 +19,100 @@ import av
 import numpy.typing as npt
 
 from warp_ar.errors import SinkError, SourceError, reason
-from warp_ar.output.sink import ThreadedSink
-from warp_ar.output.video_sink import FRAGMENT_SECONDS, add_h264, of_even_size, rgb_to_yuv
+from warp_ar.output.encoders import Encoding, find_encoding
+from warp_ar.output.sink import ThreadedSink, check_image, check_radiance
+from warp_ar.output.video_sink import (
+    FRAGMENT_SECONDS,
+    add_stream,
+    of_even_size,
+    rgb_to_yuv,
+    signal_of,
+    tag_for_players,
+    yuv_picture,
+)
 from warp_ar.signature import PROGRAM
 
 ENCODER_THREADS = 2
-"""Of x264, on every machine."""
+"""Of x264 and x265, on every machine."""
+_X265 = f"pools=none:frame-threads={ENCODER_THREADS}:open-gop=0"
+"""x265's threads that share a picture depend on the machine's cores: there are none, only some that take one each."""
 _MOST_SCALE = 100_000_000
 _LANGUAGES = ("language", "title", "handler_name")
 """Metadata of a stream that stays true in another file."""
 
 
+def part_encoding(coding: str = "8bit") -> Encoding:
+    """How segments are encoded: H.264 in 8 bits, else H.265; the same bytes on every machine.
+
+    Args:
+        coding: One of ``CODINGS``.
+
+    Raises:
+        SinkError: The encoder is not there.
+    """
+    own = {"threads": str(ENCODER_THREADS)} if coding == "8bit" else {"x265-params": _X265}
+    return find_encoding(coding, options={"bf": "0", **own})
+
+
 class PartSink(ThreadedSink):
-    """H.264 in MP4 whose frames have given time stamps.
+    """Video in MP4 whose frames have given time stamps.
 
     Args:
         path: The file.
         ticks: Time stamp of every frame that will come, growing.
         tick: Seconds of a tick.
         fps: Mean rate of the whole recording: all its parts have one header.
+        coding: One of ``CODINGS``; but for ``8bit`` frames are linear radiance, as those of ``VideoSink``.
+        transfer: The camera's, by which 10-bit codes are encoded.
 
     Raises:
         SinkError: A frame cannot be written.
     """
 
-    def __init__(self, path: Path, ticks: Sequence[int], tick: fractions.Fraction, fps: float) -> None:
+    def __init__(
+        self,
+        path: Path,
+        ticks: Sequence[int],
+        tick: fractions.Fraction,
+        fps: float,
+        *,
+        coding: str = "8bit",
+        transfer: str = "srgb",
+    ) -> None:
         super().__init__(1)
+        self._encoding, self._transfer = part_encoding(coding), transfer
         self.description = str(path)
         self._path, self._ticks, self._tick, self._fps = path, ticks, tick, fps
         self._container: Any = None
 
+    def _check(self, image: Any) -> None:
+        if self._encoding.coding == "8bit":
+            check_image(image)
+        else:
+            check_radiance(image)
+
     def _start(self, width: int, height: int) -> None:
+        encoding = self._encoding
         self._container = av.open(str(self._path), "w", format="mp4")
         self._container.metadata["comment"] = PROGRAM
         rate = fractions.Fraction(self._fps).limit_denominator(1001)
         group = max(1, round(FRAGMENT_SECONDS * self._fps))
-        options = {"bf": "0", "threads": str(ENCODER_THREADS), "g": str(group)}
-        self._stream = add_h264(self._container, rate, width, height, options)
+        self._stream = add_stream(self._container, rate, width, height, encoding, {"g": str(group)})
+        if encoding.encoder == "libx265":
+            tag_for_players(self._stream)
         self._stream.time_base = self._stream.codec_context.time_base = self._tick
-        self._converter = rgb_to_yuv(width, height, self._tick)
+        self._converter = rgb_to_yuv(width, height, self._tick, encoding.coding, encoding.pixel_format)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         image = of_even_size(image)
         try:
             if self._container is None:
                 self._start(image.shape[1], image.shape[0])
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            coding = self._encoding.coding
+            if coding == "8bit":
+                picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            else:
+                picture = yuv_picture(signal_of(image, coding, self._transfer), coding)
             picture.pts, picture.time_base = int(self._ticks[index] - self._ticks[0]), self._tick
             self._converter.push(picture)
             self._container.mux(self._stream.encode(self._converter.pull()))
@@ -121,6 +169,8 @@ def join_parts(
             target = stack.enter_context(av.open(str(output), "w", format="mp4", options=options))
             with av.open(str(parts[0])) as first:
                 video = target.add_stream_from_template(first.streams.video[0])
+                if first.streams.video[0].codec_context.name == "hevc":
+                    tag_for_players(video)
                 header = bytes(first.streams.video[0].codec_context.extradata or b"")
             video.time_base = tick
             sound: Iterator[Any] = iter(())

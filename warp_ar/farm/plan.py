@@ -40,6 +40,8 @@ class Plan:
     """Milliseconds of a job beside its frames."""
     bytes: float
     """Of all outputs."""
+    survey_bytes: float
+    """That surveys keep in the run's folder."""
     problems: tuple[str, ...] = ()
     """Clips that cannot be read, and why."""
 
@@ -83,17 +85,19 @@ def make_plan(jobs: JobFile, device: str, say: Callable[[str], None]) -> Plan:
     trials = [_try(jobs, clip, lengths[clip], device, say) for clip in list(lengths)[::step][:PROBES]]
     if not trials:
         raise RunError(f"no clip can be tried: {problems[0] if problems else 'there is none'}")
-    survey_ms, frame_ms, job_ms, size = (sum(values) / len(trials) for values in zip(*trials, strict=True))
-    return Plan(len(lengths), count, lit, surveyed, survey_ms, frame_ms, job_ms, lit * size, tuple(problems))
+    survey_ms, frame_ms, job_ms, size, kept = (sum(values) / len(trials) for values in zip(*trials, strict=True))
+    written = lit * size, surveyed * kept
+    return Plan(len(lengths), count, lit, surveyed, survey_ms, frame_ms, job_ms, *written, tuple(problems))
 
 
 def _try(
     jobs: JobFile, clip: int, length: int, device: str, say: Callable[[str], None]
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float, float]:
     """Do the first job of a clip on a few frames, twice: the second time all is compiled and read.
 
     Returns:
-        Milliseconds of a surveyed frame, of a lit frame, of a job beside its frames, and bytes of a lit frame.
+        Milliseconds of a surveyed frame, of a lit frame, of a job beside its frames; bytes of a lit frame, and of a
+        surveyed one.
     """
     first, end = lit_range(jobs.clips[clip], length)
     few = dataclasses.replace(jobs.clips[clip], end=min(end, first + FRAMES))
@@ -103,10 +107,10 @@ def _try(
         work = Work(Context(tried, Path(name), device))
         try:
             job = job_of_clip(tried, clip, 0, length)
-            whole, survey = _time(work, Job("survey", clip)), 0.0
+            whole = _time(work, Job("survey", clip))
             again = Path(name) / Job("survey", clip).place(tried)
             again.rename(again.with_name("first"))
-            survey = _time(work, Job("survey", clip))[0]
+            survey, kept = _time(work, Job("survey", clip))[:2]
             times = []
             for _ in range(2):
                 seconds, size, frames, begun = _time(work, job)
@@ -124,6 +128,7 @@ def _try(
         1e3 * per_frame,
         1e3 * max(seconds - frames * per_frame, 0.0),
         size / max(frames, 1),
+        kept / max(looked - first, 1),
     )
 
 

@@ -7,6 +7,7 @@ does not depend on which frames were lit before it. The file is a ZIP of NumPy a
 - ``poses`` (n, 12) float64: ``camera_from_world``, R row by row and t in metres; NaN where the marker was lost;
 - ``saturation`` (3,) int64: codes at which the camera's channels saturate;
 - ``size`` (2,) int64: width and height of the frames in pixels;
+- ``coding`` str: what a video of the recording's own depth is encoded in;
 - ``keys`` (k,) int64: numbers of the frames from which on each of the k maps holds;
 - ``places`` (k + 1,) int64: where in ``lights.bin`` each begins, and where the last ends.
 
@@ -36,6 +37,8 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, SourceError, reason
 from warp_ar.farm.frames import FrameIndex, index_frames, open_part
 from warp_ar.farm.jobs import JobFile, lit_range, scene_of, source_of
+from warp_ar.input.plate import check_linear
+from warp_ar.input.source import RecordedSource
 from warp_ar.input.sources import open_source
 from warp_ar.kernels.change import CHANGE_FLOOR, CHANGE_SHARE
 from warp_ar.light.captured import Light, find_emitters
@@ -76,6 +79,7 @@ class Survey:
                 self._places: npt.NDArray[np.int64] = values["places"]
                 width, height = (int(v) for v in values["size"])
                 self.size = width, height
+                self.coding = str(values["coding"])
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise SourceError(f"{self._path} cannot be read: {reason(error)}; remove its folder and resume") from error
 
@@ -169,6 +173,7 @@ def survey_clip(jobs: JobFile, clip: int, folder: Path, device: str, tell: Calla
         writer.add("poses", poses)
         with open_source(path, fps=fps) as source:
             writer.add("size", source.size)
+            writer.add("coding", source.curve or ("10bit" if source.deep else "8bit"))
         writer.add("saturation", look.saturation)
         writer.add("keys", look.keys)
         writer.add("places", writer.places)
@@ -237,6 +242,7 @@ def _look_at_frames(
     outputs = ("pose", "environment") if look.captures else ("pose",)
     environment: Map | None = None
     with open_part(path, index, first, end, fps, jobs.settings.gpu_of(device)) as source:
+        linear = keep_depth(source, look.scene)
         pipeline = Pipeline(
             look.scene,
             device=device,
@@ -245,11 +251,12 @@ def _look_at_frames(
             outputs=outputs,
             synchronous=True,
             follows_camera=False,
+            linear=linear,
         )
         with pipeline:
             for frame in source:
                 pose = None if given is None else Pose(*given.at(frame.index))
-                result = pipeline(frame.image, time_seconds=frame.time, pose=pose)
+                result = pipeline(frame.deepest, time_seconds=frame.time, pose=pose)
                 if result.pose is not None:
                     look.poses[frame.index] = (*result.pose.rotation.ravel(), *result.pose.translation)
                     environment = result.environment if look.captures else None
@@ -264,6 +271,18 @@ def _look_at_frames(
     kept = _rounded(environment)
     emitters = find_emitters(kept, np.zeros_like(kept), 0.0)
     Light(kept, np.ones(kept.shape[:2], np.float32), emitters).save(look.folder / LIGHT)
+
+
+def keep_depth(source: RecordedSource, scene: Scene) -> bool:
+    """Have a source keep what of its pictures is more than 8 bits; whether there is such.
+
+    Raises:
+        UsageError: They are linear light, which does not fit the camera's transfer.
+    """
+    if source.deep == "light":
+        check_linear(str(scene.camera.transfer))
+    source.keeps_depth = source.deep != ""
+    return source.keeps_depth
 
 
 def _rounded(values: Map) -> Map:

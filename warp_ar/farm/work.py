@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.closing import Closing
+from warp_ar.engine.layers import RADIANCE
 from warp_ar.errors import WarpArError, reason
 from warp_ar.farm.draws import NoPlace, draw_variation
 from warp_ar.farm.frames import mean_rate, shown_ticks
-from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
+from warp_ar.farm.jobs import AS_RECORDED, Job, job_of_clip, jobs_of_clip, lit_range, scene_of, source_of
 from warp_ar.farm.labels import LAYERS, LabelWriter
 from warp_ar.farm.lighting import Lighter
 from warp_ar.farm.manifest import aside, is_no_space, publish, publish_file
@@ -106,9 +107,14 @@ class Work(Closing):
         ticks, tick = shown_ticks(survey.index, source_of(self.context.jobs, job.clip)[1])
         count = 0
         rate = mean_rate(ticks, tick)
-        with PartSink(part / PART, ticks[job.first : job.end].tolist(), tick, rate) as sink:
-            for lit in self._lighter.light(job):
-                sink.write(lit.image)
+        own = self.context.jobs.settings.coding
+        coding = survey.coding if own == AS_RECORDED else own
+        outputs = ("image",) if coding == "8bit" else (RADIANCE,)
+        transfer = str(scene_of(self.context.jobs, job.clip).camera.transfer)
+        stamps = ticks[job.first : job.end].tolist()
+        with PartSink(part / PART, stamps, tick, rate, coding=coding, transfer=transfer) as sink:
+            for lit in self._lighter.light(job, outputs=outputs):
+                sink.write(lit.image if coding == "8bit" else lit.radiance)
                 count += 1
                 tell(count)
         return {"frames": count}

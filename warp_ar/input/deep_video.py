@@ -58,6 +58,11 @@ def depth_of(context: Any) -> str:
     return "" if bits == 8 else "light" if wide else "codes"
 
 
+def curve_of(context: Any) -> str:
+    """Transfer of a stream of HDR, as ``Source.curve`` says it; argument as that of ``depth_of``."""
+    return {int(ColorTrc.SMPTE2084): "pq", int(ColorTrc.ARIB_STD_B67): "hlg"}.get(int(context.color_trc), "")
+
+
 def plate_from_video(reformatter: VideoReformatter, picture: Any) -> Plate:
     """Upright plate of a decoded picture, by the picture's own matrix, range, transfer and primaries."""
     signal = _upright(_signal(reformatter, picture), picture)

@@ -1,7 +1,7 @@
 """Frames of more than 8 bits: a camera's codes of 16 bits, or linear light, beside the 8-bit frame that is tracked.
 
-    8-bit codes    what markers are found in, and what stages see that look at surfaces
-    plate          where the frame becomes light: the mirror ball, and the picture's own radiance
+    8-bit codes    what markers are found in, and means of a pixel's surroundings
+    plate          where the frame becomes light: the mirror ball, surfaces, and the picture's own radiance
 
 Codes of 16 bits become light by the camera's transfer; linear light is taken as it stands, 1 being where a camera of 8
 bits would clip, Rec. 709 primaries, and may be above.

@@ -81,6 +81,8 @@ class Source(Closing):
     deep: str = ""
     """Its pictures have more than 8 bits: ``codes`` of the camera, or linear ``light``; empty: they have not."""
 
+    curve: str = ""
+    """Transfer of HDR pictures, ``pq`` or ``hlg``; empty: they are no HDR."""
     keeps_depth: bool = False
     """Whether frames come with their plates; to be set before they are read."""
 

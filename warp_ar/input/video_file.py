@@ -18,7 +18,7 @@ from av.video.reformatter import Colorspace, VideoReformatter
 
 from warp_ar.errors import SourceError, reason
 from warp_ar.files import limits, too_much
-from warp_ar.input.deep_video import HD_HEIGHT, TO_RGB, depth_of, plate_from_video
+from warp_ar.input.deep_video import HD_HEIGHT, TO_RGB, curve_of, depth_of, plate_from_video
 from warp_ar.input.plate import Plate, codes8
 from warp_ar.input.source import DEFAULT_FPS, Frame, RecordedSource, check_fps, check_size, existing_path
 
@@ -78,6 +78,7 @@ class VideoFile(RecordedSource):
             self.length = int(stream.frames) or round(seconds * rate) or None
             codec = stream.codec_context.name
             self.deep = depth_of(stream.codec_context)
+            self.curve = curve_of(stream.codec_context) if self.deep else ""
             first = next(self._pictures(container), None)
         if first is None:
             raise SourceError(f"{self._path}: frame 0 cannot be decoded: the video stream holds no picture")

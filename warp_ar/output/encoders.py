@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import av
+import cv2
 from av.codec import codecs_available
 
 from warp_ar.errors import SinkError, UsageError, reason
@@ -30,6 +31,8 @@ _FORMATS: Final = {
 }
 """Pixel formats by bits, in order of preference: what most players decode first."""
 _HARDWARE: Final = ("_nvenc", "_qsv", "_vaapi", "_videotoolbox", "_amf", "_mf", "_v4l2m2m", "_vulkan")
+_AVX2: Final = 11
+"""OpenCV's number of AVX2, ``CPU_AVX2``, which its Python names do not hold."""
 _PROBED: Final = 256
 """Pixels of a side of the picture that an encoder is tried with; hardware refuses much smaller ones."""
 
@@ -77,8 +80,7 @@ def find_encoding(
         raise SinkError(
             f"{name} takes no pictures of {bits} bits, only {', '.join(formats[:8])}; choose another encoder"
         )
-    wanted = {**_DEFAULTS.get(name, {}), **(options or {})}
-    encoding = Encoding(name, pixel_format, coding, wanted)
+    encoding = Encoding(name, pixel_format, coding, _with_defaults(name, options or {}))
     problem, unknown = _try(encoding)
     if problem:
         raise SinkError(f"{name} does not work here ({problem}); choose another encoder or other options")
@@ -87,6 +89,24 @@ def find_encoding(
             f"--encoder-option {unknown[0]}: {name} has no such option; ffmpeg -h encoder={name} lists them"
         )
     return encoding
+
+
+def _with_defaults(encoder: str, options: Mapping[str, str]) -> dict[str, str]:
+    """Options of an encoder, the defaults among them; parameters of x264's and x265's own go behind those here.
+
+    x264's tree of macroblocks (`mbtree`), in its code for AVX-512, reads memory that nothing has written: at some
+    sizes, 320x240 among them, the same pictures then give other bytes from run to run. Its other code does not, gives
+    the same bytes whatever the processor, and is as fast (docs/notes/2026-11-23-encoders.md).
+    """
+    wanted = {**_DEFAULTS.get(encoder, {}), **options}
+    key = {"libx264": "x264-params", "libx265": "x265-params"}.get(encoder)
+    if key is None:
+        return wanted
+    own = _DEFAULTS[encoder].get(key, "")
+    if encoder == "libx264" and cv2.checkHardwareSupport(_AVX2):
+        own = "asm=avx2"
+    joined = ":".join(text for text in (own, options.get(key, "")) if text)
+    return {**wanted, key: joined} if joined else wanted
 
 
 def _try(encoding: Encoding) -> tuple[str, Sequence[str]]:

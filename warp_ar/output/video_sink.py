@@ -134,7 +134,7 @@ class VideoSink(ThreadedSink):
         self._container.metadata["comment"] = PROGRAM
         self._stream = add_stream(self._container, self._rate, width, height, self._encoding, {"g": str(group)})
         if movie and self._encoding.encoder in ("libx265", "hevc_nvenc", "hevc_videotoolbox"):
-            self._stream.codec_context.codec_tag = "hvc1"  # Apple's players know no other
+            tag_for_players(self._stream)
         self._container.start_encoding()
         self._converter = rgb_to_yuv(width, height, 1 / self._rate, self._encoding.coding, self._encoding.pixel_format)
 
@@ -148,7 +148,7 @@ class VideoSink(ThreadedSink):
             if self._encoding.coding == "8bit":
                 picture = av.VideoFrame.from_ndarray(image, format="rgb24")
             else:
-                picture = yuv_picture(self._signal(image), self._encoding.coding)
+                picture = yuv_picture(signal_of(image, self._encoding.coding, self._transfer), self._encoding.coding)
             picture.pts, picture.time_base = index, 1 / self._rate
             self._converter.push(picture)
             picture = self._converter.pull()
@@ -157,15 +157,6 @@ class VideoSink(ThreadedSink):
         except (av.FFmpegError, OSError) as error:
             self._broken = True
             raise SinkError(f"{self._path}: frame {index} cannot be written: {reason(error)}") from error
-
-    def _signal(self, radiance: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """R'G'B' from 0 to 1 of linear radiance, as the coding means it."""
-        from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
-
-        if self._encoding.coding == "10bit":
-            return np.asarray(encode_codes(self._transfer, radiance))
-        curve = pq_of_light if self._encoding.coding == "pq" else hlg_of_light
-        return curve(converted(radiance, REC_709, REC_2020))
 
     def _check_file(self) -> None:
         if self._file is not None and self._file.error is not None:
@@ -222,9 +213,9 @@ def add_stream(
     return stream
 
 
-def add_h264(container: Any, rate: fractions.Fraction, width: int, height: int, options: Mapping[str, str]) -> Any:
-    """A stream of H.264 in a new container, of colours as they are commonly understood; as `add_stream`."""
-    return add_stream(container, rate, width, height, find_encoding(), options)
+def tag_for_players(stream: Any) -> None:
+    """Name H.265 in MP4 and MOV as Apple's players know it."""
+    stream.codec_context.codec_tag = "hvc1"
 
 
 def of_even_size(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -259,6 +250,22 @@ def rgb_to_yuv(
     )
     graph.link_nodes(*nodes).configure()
     return graph
+
+
+def signal_of(radiance: npt.NDArray[np.float32], coding: str, transfer: str) -> npt.NDArray[np.float64]:
+    """R'G'B' from 0 to 1 of linear radiance, (height, width, 3), as a coding of 10 bits means it.
+
+    Args:
+        radiance: float32, Rec. 709 primaries.
+        coding: ``10bit``, ``pq`` or ``hlg``.
+        transfer: The camera's, by which ``10bit`` is encoded.
+    """
+    from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
+
+    if coding == "10bit":
+        return np.asarray(encode_codes(transfer, radiance))
+    curve = pq_of_light if coding == "pq" else hlg_of_light
+    return curve(converted(radiance, REC_709, REC_2020))
 
 
 def yuv_picture(signal: npt.NDArray[np.float64], coding: str) -> av.VideoFrame:

@@ -31,7 +31,7 @@ from warp_ar.stages.base import (
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.environment_sets import REFERENCE_SIZE, sample_names
-from warp_ar.stages.shared.picture import find_picture
+from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import distant_variant
 
@@ -117,7 +117,7 @@ class EnvironmentShadow(Stage):
             *distant_light_reads(features),
         ]
         if METHODS[quality.method(cls.name)].bounce == "traced":
-            reads.append("frame")
+            reads += frame_reads(features)
         return Wiring(tuple(reads), ("shadow_ratio",))
 
     def idle(self, reach: Reach) -> str | None:

@@ -12,6 +12,7 @@ from warp_ar.kernels import change, fill, fill_frame
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import frame_reads
 
 
 class Fill(Stage):
@@ -37,7 +38,7 @@ class Fill(Stage):
         if not features.observed:
             return LeftOut(unobserved(features))
         written = "filled_radiance" if features.recovered else "environment"
-        return Wiring(("environment_radiance", "environment_confidence", "frame", "pose"), (written,))
+        return Wiring(("environment_radiance", "environment_confidence", *frame_reads(features), "pose"), (written,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, the fill pyramid, and what readers have seen."""
@@ -78,6 +79,7 @@ class Fill(Stage):
                 height,
                 2 * height,
                 proxies=proxies,
+                linear=arrays["linear_frame"],
                 rows=rows,
             )
 

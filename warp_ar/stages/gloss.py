@@ -13,7 +13,7 @@ from warp_ar.scene.kinds import light_kind, proxies_face, trace_config
 from warp_ar.stages.base import NO_BALL, Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import find_picture
+from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import mirrored_shading
 from warp_ar.stages.shared.variants import shade_variant, trace_variant
@@ -44,7 +44,7 @@ class Gloss(Stage):
             return LeftOut(NO_BALL)
         if "reflected" not in features.layers:
             return LeftOut("nothing virtual can be mirrored, or the quality leaves mirrors as the camera saw them")
-        reads = {"pose", "frame", "objects", *distant_light_reads(features)}
+        reads = {"pose", *frame_reads(features), "objects", *distant_light_reads(features)}
         reads |= {"lights"} if features.request.scene.lights else set()
         reads |= {name for name in features.layers if name in ("shadow_ratio", "added_light", "mirror_ball")}
         return Wiring(tuple(sorted(reads)), ("reflected",))

@@ -15,7 +15,7 @@ from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reach, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import find_picture
+from warp_ar.stages.shared.picture import find_picture, frame_reads
 from warp_ar.stages.shared.relighting import relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import mirrored_shading, shade_config
@@ -59,7 +59,7 @@ def mirrored_relighting(features: Features) -> RelightConfig:
 
 def _reads(features: Features, *, lit: bool) -> set[str]:
     """What objects and, if ``lit``, the receiver are lit by."""
-    reads = {"pose", "frame"} | ({"linear_frame"} if features.request.linear else set())
+    reads = {"pose", *frame_reads(features)}
     if "virtual" in features.layers:
         reads |= {"objects", *distant_light_reads(features)}
         reads |= {"lights"} if shade_config(features).lights else set()
@@ -155,9 +155,7 @@ class MirrorBall(Stage):
             arrays["shadow_ratio"] if config.ratio else None,
         )
 
-        linear = arrays["linear_frame"] if "linear_frame" in reads else None
-
         def launch(rows: Rows | None) -> None:
-            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], linear_frame=linear, rows=rows)
+            mirror_ball.mirror_ball(variant, *inputs, arrays["mirror_ball"], rows=rows)
 
         return [Pass(launch, rows=self.request.size[1], extent=GrowingRows(arrays["ball_rows"]))]

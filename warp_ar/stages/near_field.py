@@ -29,7 +29,7 @@ from warp_ar.stages.base import (
 )
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
-from warp_ar.stages.shared.picture import find_picture, find_visible
+from warp_ar.stages.shared.picture import find_picture, find_visible, frame_reads
 from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
@@ -76,7 +76,7 @@ class NearField(Stage):
             return LeftOut(NO_OBJECT)
         if not features.environment:
             return LeftOut(NO_BALL)
-        reads = ["frame", "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
+        reads = [*frame_reads(features), "pose", "objects", "hit_object", "hits", *distant_light_reads(features)]
         if features.distant.diffuse != "none":
             reads.append("environment_samples")
         reads += [name for name in features.layers if name not in ("virtual", "mirror_ball", "reflected")]

@@ -113,8 +113,9 @@ class Recover(Stage):
             return LeftOut(unobserved(features))
         if not features.recovered:
             return LeftOut("the quality takes the light as the camera clipped it")
+        seen = "linear_frame" if features.request.linear else "frame"
         return Wiring(
-            ("filled_radiance", "environment_confidence", "environment_clipped", "frame", "pose"),
+            ("filled_radiance", "environment_confidence", "environment_clipped", seen, "pose"),
             ("environment", "emitters") if features.emitters else ("environment",),
         )
 
@@ -202,10 +203,10 @@ class Recover(Stage):
         )
 
     def _observe(self, rows: Rows | None) -> None:
-        arrays = self._arrays
+        arrays, linear = self._arrays, "linear_frame" in self.wiring.reads
         kernels.observe_surfaces(
-            arrays["frame"],
-            arrays["decode"],
+            arrays["linear_frame" if linear else "frame"],
+            arrays["linear_clip" if linear else "decode"],
             arrays["params"],
             arrays["probes"],
             arrays["ray_scene"],

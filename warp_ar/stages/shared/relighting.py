@@ -5,6 +5,7 @@ from __future__ import annotations
 from warp_ar.kernels.receiver import RelightConfig
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.features import LOCAL, Features
+from warp_ar.stages.shared.picture import frame_reads
 
 
 def relight_reads(features: Features) -> tuple[str, ...]:
@@ -12,7 +13,7 @@ def relight_reads(features: Features) -> tuple[str, ...]:
     method = features.relight_method
     reads = ["pose", "lights", "objects"]
     if method != "flat":
-        reads += ["frame", "key_lights"]
+        reads += [*frame_reads(features), "key_lights"]
     if method in ("relief", "reflectance", *LOCAL):
         reads.append("summed_area")
     if method in ("reflectance", *LOCAL):

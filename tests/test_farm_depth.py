@@ -1,0 +1,157 @@
+"""Recordings of more than 8 bits stay so: read, surveyed, lit, encoded in segments and joined."""
+
+from __future__ import annotations
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from tests.farm_rig import desk_frames, make_jobs
+from warp_ar.engine.layers import RADIANCE
+from warp_ar.farm.jobs import Job, job_of_clip, jobs_of_clip
+from warp_ar.farm.lighting import Lighter
+from warp_ar.farm.records import Context
+from warp_ar.farm.tables import JobsError
+from warp_ar.farm.work import Work
+from warp_ar.input.sources import open_source
+from warp_ar.kernels.color import decode_codes
+from warp_ar.output.sinks import open_sink
+from warp_ar.signals import REC_709, REC_2020, converted, hlg_of_light, pq_of_light
+from warp_ar.srgb import encode_srgb
+
+COUNT = 12
+RATE = 24
+TAGS = {
+    "10bit": ("bt709", "bt709", "bt709"),
+    "pq": ("smpte2084", "bt2020", "bt2020nc"),
+    "hlg": ("arib-std-b67", "bt2020", "bt2020nc"),
+}
+PEAK = {"10bit": 1.0, "pq": 4.0, "hlg": 2.0}
+"""Of the recordings' light, over that of the bundled clip."""
+LOSS = 6.0 / 876.0
+"""Mean error of a signal by two encodings at a constant rate factor of 18, and chroma of half the size."""
+
+
+def write_deep(path: pathlib.Path, coding: str) -> None:
+    """The bundled desk as light, some of it above white where the coding can hold it."""
+    with open_sink(path, fps=RATE, coding=coding) as sink:
+        for image in desk_frames(COUNT):
+            light = decode_codes("srgb", image.reshape(-1) / 255.0)[:, 0].reshape(image.shape)
+            sink.write((PEAK[coding] * light).astype(np.float32))
+
+
+@pytest.fixture(scope="module", params=["10bit", "pq", "hlg"])
+def clip(request: Any, tmp_path_factory: Any) -> tuple[str, pathlib.Path]:
+    folder = tmp_path_factory.mktemp(request.param)
+    write_deep(folder / "a.mp4", request.param)
+    return request.param, folder
+
+
+def run_all(folder: pathlib.Path, name: str, **run: Any) -> tuple[Any, pathlib.Path]:
+    """Survey the clip, light its segments and join them; the job file and the run's folder."""
+    jobs = make_jobs(folder, [{"scene": "torus", "path": "a.mp4"}], run={"quality": "low", **run})
+    with Work(Context(jobs, folder / name, "cpu")) as work:
+        todo = [Job("survey")]
+        for job in todo:
+            outcome = work.do(job, lambda _: None)
+            assert outcome.state == "done", outcome.reason
+            if job.kind == "survey":
+                count = jobs_of_clip(jobs, 0, COUNT)
+                todo += [job_of_clip(jobs, 0, number, COUNT) for number in range(count)]
+                todo.append(Job("join"))
+    return jobs, folder / name
+
+
+def signal(radiance: np.ndarray, coding: str) -> np.ndarray:
+    if coding == "10bit":
+        return encode_srgb(np.clip(radiance, 0.0, 1.0))
+    return {"pq": pq_of_light, "hlg": hlg_of_light}[coding](converted(radiance, REC_709, REC_2020))
+
+
+def plates(path: pathlib.Path) -> list[np.ndarray]:
+    with open_source(path) as source:
+        source.keeps_depth = True
+        return [frame.plate.radiance("srgb") for frame in source]
+
+
+def tags(path: pathlib.Path) -> tuple[str, ...]:
+    keys = "codec_name,codec_tag_string,pix_fmt,color_transfer,color_primaries,color_space"
+    try:
+        command = ["ffprobe", "-v", "error", "-select_streams", "v", "-show_entries", f"stream={keys}", "-of", "json"]
+        said = subprocess.run([*command, str(path)], capture_output=True, check=True, timeout=60).stdout
+    except FileNotFoundError:
+        pytest.skip("ffprobe is not installed")
+    (stream,) = json.loads(said)["streams"]
+    return tuple(stream.get(key, "") for key in keys.split(","))
+
+
+def test_segments_of_a_deep_recording_are_joined_as_deep_as_it_came(clip: tuple[str, pathlib.Path]) -> None:
+    coding, folder = clip
+    jobs, parts = run_all(folder, "parts", segment_frames=3)
+    _, whole = run_all(folder, "whole")
+    with Lighter(jobs, parts, "cpu") as lighter:
+
+        def lit(first: int, end: int) -> list[np.ndarray]:
+            job = Job("segment", 0, 0, first, end)
+            return [item.radiance.copy() for item in lighter.light(job, outputs=(RADIANCE,))]
+
+        one = lit(0, COUNT)
+        for first in (9, 0, 6, 3):
+            for number, picture in enumerate(lit(first, first + 3), first):
+                np.testing.assert_array_equal(picture, one[number], err_msg=f"frame {number}")
+    joined, alone, before = plates(parts / "a.mp4"), plates(whole / "a.mp4"), plates(folder / "a.mp4")
+    assert len(joined) == COUNT
+    for a, b, picture in zip(joined, alone, one, strict=True):
+        for got in (a, b):
+            assert np.abs(signal(got, coding) - signal(picture, coding)).mean() < LOSS
+    # What nothing virtual touches keeps its depth: steps that 8 bits do not have, and light above white.
+    same = np.abs(one[0] - before[0]).max(-1) == 0.0
+    assert same.mean() > 0.3
+    assert len(np.unique(signal(one[0][same], coding)[:, 1].round(5))) > 300
+    assert coding == "10bit" or one[0].max() > 1.5
+    assert tags(parts / "a.mp4") == ("hevc", "hvc1", "yuv420p10le", *TAGS[coding])
+    with av.open(str(parts / "a.mp4")) as container:
+        stamps = [packet.pts * packet.time_base for packet in container.demux(video=0) if packet.size]
+    with av.open(str(folder / "a.mp4")) as container:
+        assert stamps == sorted(p.pts * p.time_base for p in container.demux(video=0) if p.size)
+
+
+def test_a_run_says_what_is_written(tmp_path: pathlib.Path) -> None:
+    write_deep(tmp_path / "a.mp4", "pq")
+    _, run = run_all(tmp_path, "run", coding="8bit")
+    assert tags(run / "a.mp4")[::2] == ("h264", "yuv420p", "bt709")
+    with pytest.raises(JobsError, match=r'run\.coding = "9bit": expected one of "recorded", "8bit", "10bit"'):
+        run_all(tmp_path, "bad", coding="9bit")
+
+
+ENCODE = """
+import hashlib, sys
+from fractions import Fraction
+from tests.farm_rig import desk_frames
+from warp_ar.farm.part_video import PartSink
+from warp_ar.kernels.color import decode_codes
+for coding in ("8bit", "10bit"):
+    with PartSink(sys.argv[1], [0, 25, 50, 75], Fraction(1, 600), 24.0, coding=coding) as sink:
+        for image in desk_frames(4):
+            codes = decode_codes("srgb", image.reshape(-1) / 255.0)[:, 0].reshape(image.shape).astype("float32")
+            sink.write(image if coding == "8bit" else codes)
+    print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())
+"""
+
+
+def test_bytes_do_not_depend_on_what_memory_held(tmp_path: pathlib.Path) -> None:
+    """glibc fills what it hands out: an encoder that reads what it never wrote gives other bytes then."""
+    made = set()
+    for fill in ("0", "1", "170"):
+        command = [sys.executable, "-c", ENCODE, str(tmp_path / "a.mp4")]
+        environment = {**os.environ, "MALLOC_PERTURB_": fill}
+        root = pathlib.Path(__file__).resolve().parents[1]
+        made.add(subprocess.run(command, env=environment, cwd=root, capture_output=True, check=True).stdout)
+    assert len(made) == 1
