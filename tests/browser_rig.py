@@ -52,10 +52,14 @@ WORKS = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"
 
 
 def write_camera_file(path: Path, images: Iterable[np.ndarray]) -> None:
-    """What Chromium's fake camera plays: JPEGs one after another, thirty a second."""
+    """What Chromium's fake camera plays: JPEGs one after another, thirty a second.
+
+    It takes their codes for a video's, 16 to 235, and stretches them.
+    """
     with path.open("wb") as file:
         for image in images:
-            file.write(cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+            codes = np.rint(16 + image[..., ::-1].astype(np.float32) * (219 / 255)).astype(np.uint8)
+            file.write(cv2.imencode(".jpg", codes, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
 
 
 @contextlib.contextmanager
@@ -84,7 +88,7 @@ def served(options: Sequence[str], cache: Path) -> Iterator[str]:
             process.kill()
             raise
     assert process.returncode == 130, errors
-    assert errors == ""
+    assert errors == "", errors
 
 
 @contextlib.contextmanager

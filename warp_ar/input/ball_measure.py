@@ -32,6 +32,8 @@ SEARCH = 5e-3
 """Metres around the outlines' centre in which the mirrored receiver is compared."""
 ASSUMED = 0.01
 """Share of a radius that is only assumed by which it may be off: a ruler's error."""
+MOST = 0.1
+"""Share of the radius that its interval may have, and half of what the centre's may, for a ball to be used."""
 DOUBT = 0.025
 """Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
 LEAST_CONTRAST = 0.15
@@ -54,6 +56,11 @@ class BallMeasurement:
     """Its standard deviation; None: it was assumed."""
     how: str
     """What told, in words."""
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether radius and centre are known well enough to be put into a scene."""
+        return max(2 * (self.radius_deviation or 0.0), self.deviation) <= MOST * self.radius
 
 
 def measure_ball(

@@ -67,23 +67,21 @@ def mirrored_radius(
             x, y, z = (float(value) for value in found[1])
             costs[k], balls[k] = found[0], dataclasses.replace(ball, center=(x, y, z))
 
-    for k in range(-steps, steps + 1):
+    for k in range(-steps, steps + 1, 2):
         attempt(k, probe.center)
-    if len(costs) <= 2 * steps:
+    if not costs:
         return None
-    # Once more from the best one outward, each from its neighbour's place.
+    # From the best one outward, each from its neighbour's place.
     best = min(costs, key=lambda k: costs[k])
     for way in (1, -1):
-        for k in range(best + way, best + (ASIDE + 1) * way, way):
-            if abs(k) <= steps:
+        for k in range(best + way, best + (ASIDE + 2) * way, way):
+            if k - way in balls:
                 attempt(k, balls[k - way].center)
     best = min(costs, key=lambda k: costs[k])
-    if abs(best) > steps - ASIDE or costs[best] > EXPLAINED:
-        return None
-    aside = min(costs[k] for k in costs if abs(k - best) == ASIDE)
-    if costs[best] > DISTINCT * aside:
-        return None
     near = [k for k in costs if abs(k - best) <= 2]
+    aside = [costs[k] for k in costs if abs(k - best) == ASIDE]
+    if len(near) < 5 or len(aside) < 2 or costs[best] > EXPLAINED or costs[best] > DISTINCT * min(aside):
+        return None
     bend, slope, _ = np.polyfit(near, [costs[k] for k in near], 2)
     part = float(np.clip(-0.5 * slope / bend, best - 1.0, best + 1.0)) - best if bend > 0.0 else 0.0
     radius = probe.radius * (1.0 + STEP * (best + part))

@@ -30,7 +30,7 @@ AGAIN: Final = 0.12
 """Share of the radius around an outline that others tell in which it is looked for again."""
 SAME: Final = 0.05
 """Share of the radius within which two balls are one."""
-MOST: Final = 3
+MOST: Final = 2
 """Balls that are tried: each costs a third of a second and frame."""
 
 
