@@ -74,7 +74,7 @@ class SetupChecks:
         self._measured: dict[str, str] = {}
         self._made: dict[str, object] = {}
         self._told: frozenset[str] = frozenset()
-        self._failed: tuple[str, str] | None = None
+        self._failed: dict[str, str] = {}
         self.missing: Finding | None = None
         """Why the marker is not seen, or that it is one of a board's, in words; None while all is right."""
 
@@ -142,7 +142,8 @@ class SetupChecks:
             raise UsageError("the frames are being looked at already: wait until that is done")
         if name not in self._work:
             raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
-        self._step, self._waits, self._failed = name, True, None
+        self._step, self._waits = name, True
+        self._failed.pop(name, None)
         self._notify(self.message())
 
     def _begin(self) -> None:
@@ -156,7 +157,7 @@ class SetupChecks:
             scene, camera = self._shown()
             self._work[step](scene, look_at(scene.marker, camera, list(self._frames)))
         except WarpArError as error:
-            self._failed = (step, str(error))
+            self._failed[step] = str(error)
         finally:
             self._step = None
             self._notify(self.message())
@@ -247,7 +248,7 @@ class SetupChecks:
             "outdated": self._findings is not None and findings is None,
             "frames": len(self._frames),
             "measured": {step: words for step, words in self._measured.items() if step in valid},
-            "failed": None if self._failed is None else dict(zip(("step", "text"), self._failed, strict=True)),
+            "failed": dict(self._failed),
         }
 
     def missing_record(self) -> dict[str, str] | None:

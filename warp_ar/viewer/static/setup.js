@@ -90,7 +90,7 @@ export class SetupPanel {
     clearInterval(this.#clock);
     // What was asked for stands beside its own button: how long it has taken, what came out, or why nothing did.
     const put_step = (step, id, idle) =>
-      put(id, busy === step ? LOOKING : failed?.step === step ? sentence(failed.text) : measured[step] ?? idle);
+      put(id, busy === step ? LOOKING : failed[step] ? sentence(failed[step]) : measured[step] ?? idle);
     const count = findings?.length ?? 0;
     put_step("ball", "ball-note", "Centre and radius are solved for together, from the frames of the last seconds: move the camera around the ball, then press.");
     put_step("response", "response-note", "How the camera encodes light, told by the card's grey patches under different exposures or light.");
