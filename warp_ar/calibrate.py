@@ -175,6 +175,7 @@ def _run_ball(options: argparse.Namespace) -> int:
     for guess in guesses(scene):
         say(f"{guess}; until then what follows is no better than that")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE
+    say(f"looking at the ball in {len(views)} frames, which takes 5 to 30 seconds")
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
         report = measure_ball(views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius)
