@@ -80,7 +80,11 @@ def served(options: Sequence[str], cache: Path) -> Iterator[str]:
         line = process.stdout.readline()
         found = re.search(r"https?://\S+", line)
         assert found, (line, process.poll())
-        yield found[0]
+        try:
+            yield found[0]
+        except BaseException:
+            process.kill()  # what went wrong is not the server's to wait for
+            raise
         process.send_signal(signal.SIGINT)
         try:
             _, errors = process.communicate(timeout=PATIENCE)
