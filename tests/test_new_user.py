@@ -35,7 +35,7 @@ def desk(tmp_path, monkeypatch):
 
 
 def test_pictures_that_tell_too_little_are_not_written(desk, capsys, monkeypatch):
-    monkeypatch.setattr(calibrate, "MOST_RESPONSE", 0.05)  # five pictures under one lamp tell 0.1
+    monkeypatch.setattr(calibrate, "MOST_DEVIATION", 0.05)  # five pictures under one lamp tell 0.1
     before = (desk / "my_desk" / "scene.toml").read_text()
     for kind, said in (("camera", "the card was tilted by"), ("response", "the curve is known to")):
         assert calibrate.main([kind, "pictures", "--write", "my_desk"]) == 1

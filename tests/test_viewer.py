@@ -352,6 +352,10 @@ def test_the_printed_card_is_used_with_the_sizes_that_were_typed() -> None:
     assert used.marker.board.square_length == pytest.approx(0.97 * SHEET.board.square_length)
     assert used.probes[0].center == pytest.approx((0.0, 0.97 * 0.114, 0.031))
     assert any(proxy.shape == "plane" for proxy in used.proxies)
+    # Boxes stood around the marker of before; those that were pointed out beside the card stay.
+    assert not any(proxy.shape == "box" for proxy in edits.use_card(load_scene("desk"), 0.031, 0.1).proxies)
+    with_box = edits.add_part(used, "proxy", "box")
+    assert edits.use_card(with_box, 0.031, 0.098).proxies == with_box.proxies
     own = edits.set_value(used, "marker", 0, "size", 0.05)
     assert own.marker.board is None
     assert own.marker.size == 0.05

@@ -9,11 +9,6 @@ import contextlib
 import dataclasses
 import os
 import re
-import shutil
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,8 +16,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import warp as wp
 
+from tests.browser_rig import CHROMIUM, SMALL, Tab, axe_core, chromium, serious_findings, served, write_camera_file
 from tests.test_budget import even_costs
 from warp_ar.accuracy.cost_table import relevant_settings
 from warp_ar.accuracy.costs import cost_key, write_costs
@@ -30,38 +25,17 @@ from warp_ar.engine.pipeline import Pipeline
 from warp_ar.input.sources import open_source
 from warp_ar.scene import Scene, SourceSpec, dumps_scene, load_scene
 
-playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 
-PATIENCE = 180.0  # seconds that anything may take on a busy machine
 FRAMES = 48
 BITS, CELL = 8, 12  # the time code: squares along the picture's bottom edge, black or white
 # Half way between black and white, which JPEG moves by a few levels.
 THRESHOLD = 128
 # Levels by which a picture changes at most where nothing was edited: JPEG, and the light, which goes on settling.
 UNCHANGED = 6.0
-
-
-FINGER = 43.5
-"""Pixels that a target of 44 has after rounding."""
 BOX = 0.005
 """Metres: what the page calls fitted is within it."""
-
-
-# The command, with a cost table that does not change when that of the package is made anew.
-LIVE = """
-import faulthandler
-import sys
-faulthandler.enable()
-from warp_ar.accuracy import cost_table
-errors = {
-    setting.name: {method: 0.1 / (1 + i) for i, method in enumerate(setting.methods)} for setting in cost_table.SETTINGS
-}
-cost_table.load_errors = lambda: errors
-from warp_ar.live import main
-sys.exit(main(sys.argv[1:]))
-"""
 
 
 def mark(image: np.ndarray, index: int) -> np.ndarray:
@@ -80,10 +54,6 @@ CODE = f"""() => {{
   for (let bit = 0; bit < {BITS}; bit++) if (data[4 * (bit * {CELL} + {CELL // 2})] > {THRESHOLD}) code |= 1 << bit;
   return {{ code, id: warpAr.view.stats.id }};
 }}"""
-PIXELS = """([x, y, w, h]) => {
-  const canvas = document.getElementById("canvas");
-  return [...canvas.getContext("2d").getImageData(x, y, w, h).data];
-}"""
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +78,7 @@ def scene_file(clip: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory)
 def camera_file(clip: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What Chromium's fake camera plays: JPEGs one after another."""
     path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
-    with path.open("wb") as file:
-        for image in clip:
-            file.write(cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+    write_camera_file(path, clip)
     return path
 
 
@@ -134,40 +102,14 @@ def options() -> list[str]:
 @pytest.fixture
 def url(scene_file: Path, cache: Path, options: list[str]) -> Iterator[str]:
     """The page of a server of its own."""
-    command = [sys.executable, "-c", LIVE, str(scene_file), "--device", "cpu", "--quality", "low"]
-    command += ["--port", "0", "--no-browser", *options]
-    # Costs of its own, but the kernels that are compiled already.
-    environment = {
-        **os.environ,
-        "XDG_CACHE_HOME": str(cache),
-        "WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent),
-    }
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        found = re.search(r"https?://\S+", line)
-        assert found, (line, process.poll())
-        yield found[0]
-        process.send_signal(signal.SIGINT)
-        try:
-            _, errors = process.communicate(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            raise
-    assert process.returncode == 130, errors
-    assert errors == ""
+    with served([str(scene_file), *options], cache) as address:
+        yield address
 
 
 @pytest.fixture(scope="module")
 def browser(camera_file: Path) -> Iterator[Any]:
-    fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
-    arguments = ["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={camera_file}"]
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
+    with chromium(camera_file) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="session")
@@ -175,44 +117,6 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path_factory.mktemp("screenshots"))
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-class Tab:
-    """A page, and the errors that it reports."""
-
-    def __init__(self, page: Any) -> None:
-        self.page = page
-        self.errors: list[str] = []
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
-        page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
-
-    def until(self, expression: str, what: str = "") -> Any:
-        """Wait until an expression of JavaScript holds; returns it. The page's policy forbids doing that inside."""
-        deadline = time.monotonic() + PATIENCE
-        while not (value := self.page.evaluate(expression)):
-            assert time.monotonic() < deadline, f"{what or expression} in vain; errors: {self.errors}"
-            self.page.wait_for_timeout(50)
-        return value
-
-    def shown(self, more: int = 3) -> None:
-        """Wait until so many further frames are on the screen."""
-        count = self.page.evaluate("warpAr.view.stats.shown")
-        self.until(f"warpAr.view.stats.shown >= {count + more}")
-
-    def hold(self) -> None:
-        self.page.click("#play")
-        self.until("warpAr.state.playing === false")
-        self.shown(3)
-
-    def pixels(self, x: float, y: float, size: int = 24) -> np.ndarray:
-        """RGB around a pixel of the picture."""
-        box = [round(x) - size // 2, round(y) - size // 2, size, size]
-        return np.array(self.page.evaluate(PIXELS, box)).reshape(size, size, 4)[..., :3].astype(float)
-
-    def on_screen(self, selector: str) -> tuple[float, float]:
-        """Middle of an element on the screen."""
-        box = self.page.locator(selector).first.bounding_box()
-        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
 @pytest.fixture
@@ -525,42 +429,20 @@ def test_by_keyboard_alone(open_tab: Callable[..., Tab]) -> None:
     tab.until("warpAr.state.playing === false")
 
 
-@pytest.fixture(scope="module")
-def axe() -> str:
-    """The accessibility checks of axe-core, which browsers run."""
-    package = pytest.importorskip("axe_playwright_python", reason="needs axe-core: pip install '.[test]'")
-    return (Path(package.__file__).parent / "axe.min.js").read_text()
-
-
-# Elements that fingers hit, by what they or their label measure; what is not shown is left out.
-SMALL = f"""() => [...document.querySelectorAll("button, a[href], select, summary, input")]
-  .filter((e) => e.offsetParent && !e.closest(".sr"))
-  .map((e) => [e.id || e.outerHTML, ...[e, e.closest("label") ?? e].map((one) => one.getBoundingClientRect())])
-  .filter(([, a, b]) => Math.max(a.width, b.width) < {FINGER} || Math.max(a.height, b.height) < {FINGER})
-  .map(([name]) => name)"""
-WORKS = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice")
-
-
 @pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
-def test_nothing_serious_hinders_anybody(open_tab: Callable[..., Tab], axe: str, size: Any, artefacts: Path) -> None:
+def test_nothing_serious_hinders_anybody(open_tab: Callable[..., Tab], size: Any, artefacts: Path) -> None:
     phone = size[0] < 800
     shape = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": phone, "is_mobile": phone}
     for scheme in ("dark", "light"):
         tab = open_tab(color_scheme=scheme, **shape)
         page = tab.page
-        page.evaluate(axe)
+        page.evaluate(axe_core())
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0], "wider than the screen"
         for name in ("scene", "quality", "light", "setup"):
             page.click(f"#tab-{name}")
             page.wait_for_timeout(300)
             page.screenshot(path=artefacts / f"{size[0]}_{name}_{scheme}.png")
-            found = page.evaluate(f"axe.run({{runOnly: {list(WORKS)}}})")["violations"]
-            serious = [
-                (one["id"], [node["html"] for node in one["nodes"]], one["help"])
-                for one in found
-                if one["impact"] in ("serious", "critical")
-            ]
-            assert serious == [], (name, scheme)
+            assert serious_findings(page) == [], (name, scheme)
             if phone:
                 assert page.evaluate(SMALL) == [], (name, scheme)
         page.context.close()

@@ -30,7 +30,7 @@ from warp_ar.input.camera_calibration import calibrate_camera, write_camera
 from warp_ar.input.card import PAPERS, write_card
 from warp_ar.input.check_ball import DULL, inside_contrast
 from warp_ar.input.checkup import source_of
-from warp_ar.input.grey_response import measure_grey_response
+from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
 from warp_ar.input.response import measure_response, write_response
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import open_source
@@ -41,11 +41,6 @@ from warp_ar.scene.keys import INTRINSICS
 from warp_ar.scene.starter import guesses
 
 Image = NDArray[np.uint8]
-
-MOST_BALL = 0.1
-"""Share of the radius that its interval may have, and half of what the centre's may."""
-MOST_RESPONSE = 0.25
-"""Share of a middle code's value that its interval may have: usual cameras differ from sRGB by as much."""
 
 
 def _marker(options: argparse.Namespace) -> Marker | None:
@@ -180,6 +175,7 @@ def _run_ball(options: argparse.Namespace) -> int:
     for guess in guesses(scene):
         say(f"{guess}; until then what follows is no better than that")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE
+    say(f"looking at the ball in {len(views)} frames, which takes 5 to 30 seconds")
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
         report = measure_ball(views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius)
@@ -198,10 +194,9 @@ def _run_ball(options: argparse.Namespace) -> int:
         flat = inside_contrast(views, camera, dataclasses.replace(probe, center=report.center)) < DULL
         if flat:
             say(f"probe {index}: where it is, the picture is flat: is the ball there, uncovered and polished?")
-        worst = max(2 * (report.radius_deviation or 0.0), report.deviation) / report.radius
         if flat:
             code = EXIT_FAILED
-        elif worst > MOST_BALL:
+        elif not report.is_usable:
             say(
                 f"probe {index}: that is too wide to be used: have the whole ball in every frame, where [probe] has "
                 "it, and move the camera around it"
@@ -220,7 +215,7 @@ def _run_response(options: argparse.Namespace, target: Path | None) -> int:
         found = measure_grey_response(_pictures(options.pictures, options.frames))
         curve = found.curve
         low, high = found.span
-        if target is not None and (interval := 2 * found.deviation[128].max()) > MOST_RESPONSE:
+        if target is not None and (interval := 2 * found.deviation[128].max()) > MOST_DEVIATION:
             say(
                 f"the curve is known to +/- {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: "
                 "nothing is written. Take pictures of the card under exposures, or lamps, that differ more"

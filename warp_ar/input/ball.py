@@ -376,6 +376,35 @@ def fit_ball(
     return BallFit(center, deviation, error, before, samples, rival)
 
 
+def mirrored_error(
+    frames: Sequence[tuple[Image, Pose]],
+    camera: Camera,
+    probe: Probe,
+    proxies: Sequence[Proxy] = (),
+    others: Sequence[Probe] = (),
+) -> tuple[float, Array] | None:
+    """How badly a ball of a radius explains what the frames show it to mirror, at the best place beside its own.
+
+    Args:
+        frames: uint8 RGB pictures with ``camera_from_world``.
+        camera: The camera of all of them.
+        probe: The ball, its centre within some millimetres.
+        proxies: What stands on the receiver; without planes or boxes a desk at the marker's height is assumed.
+        others: Other balls.
+
+    Returns:
+        Mean cost, 0 (all samples agree) to 1, and the centre (3,); None where too little of the receiver is mirrored.
+    """
+    table = decode_table(camera.transfer)
+    task = _Task([_View(image, pose, camera, table) for image, pose in frames], probe, _Receiver(proxies, others))
+    center: Array = np.array(probe.center, np.float64)
+    if task.cost(center, SCALES[-1])[1] < FEWEST:
+        return None
+    for scale in SCALES:
+        center = task.descend(center, scale)
+    return task.cost(center, SCALES[-1])[0], center
+
+
 def posed_frames(source: Source, marker: Marker, camera: Camera, most: int) -> list[tuple[Image, Pose]]:
     """Frames of a source in which the marker is seen well, with their poses; of alternating exposures the longest.
 

@@ -373,6 +373,11 @@ def find_ball(
     return outline
 
 
+def outline_strength(image: Image, camera: Camera, outline: BallOutline) -> float:
+    """How much of a mirror ball is seen at an outline; compares outlines of one picture."""
+    return _strength(image, camera, np.array(outline.sphere))
+
+
 def _strength(image: Image, camera: Camera, sphere: Array) -> float:
     """How much of a mirror ball is seen at a sphere: steps at its rim, compression inside, more for larger balls."""
     radius = _radius(camera, sphere)

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from warp_ar.errors import UsageError
 from warp_ar.input.ball import fit_ball
 from warp_ar.input.ball_outline import outline_search
-from warp_ar.input.ball_solve import find_outlines, ground_below, solve_ball
+from warp_ar.input.ball_radius import DEVIATION, mirrored_radius
+from warp_ar.input.ball_solve import BallSolution, ground_below, solve_ball
+from warp_ar.input.ball_views import agreeing_outlines
 from warp_ar.scene import Camera, Pose, Probe, Proxy
 
 Image = NDArray[np.uint8]
@@ -30,6 +32,10 @@ SEARCH = 5e-3
 """Metres around the outlines' centre in which the mirrored receiver is compared."""
 ASSUMED = 0.01
 """Share of a radius that is only assumed by which it may be off: a ruler's error."""
+MOST = 0.1
+"""Share of the radius that its interval may have, and half of what the centre's may, for a ball to be used."""
+DOUBT = 0.025
+"""Share of the radius by which outlines may differ from what was typed before the mirrored receiver is asked."""
 LEAST_CONTRAST = 0.15
 """Contrast across an outline below which there is none: the bundled clips have 0.32 to 0.55, a bare card 0.08."""
 SEARCH_DEVIATION = 0.0015
@@ -50,6 +56,11 @@ class BallMeasurement:
     """Its standard deviation; None: it was assumed."""
     how: str
     """What told, in words."""
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether radius and centre are known well enough to be put into a scene."""
+        return max(2 * (self.radius_deviation or 0.0), self.deviation) <= MOST * self.radius
 
 
 def measure_ball(
@@ -75,7 +86,11 @@ def measure_ball(
         UsageError: The ball is in too few frames.
     """
     few = views[:: -(-len(views) // OUTLINES)]
-    outlines = find_outlines(few, camera, probe)
+    ground = ground_below(probe, proxies)
+    standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
+    ground = ground if standing else None
+    how = "by {} outlines"
+    outlines = agreeing_outlines(few, camera, probe, ground)
     if not outlines:
         report = outline_search(views, camera, probe.center, probe.radius)
         if report.contrast < LEAST_CONTRAST:
@@ -86,13 +101,18 @@ def measure_ball(
         return BallMeasurement(
             report.center, SEARCH_DEVIATION, probe.radius, None, "by its rim's contrast, height as given"
         )
-    ground = ground_below(probe, proxies)
-    standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
-    solution = solve_ball(outlines, camera, probe, ground if standing else None)
+    solution = solve_ball(outlines, camera, probe, ground)
     assumed = keep_radius or solution.radius_assumed
     radius = probe.radius if assumed else solution.radius
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
     own = max(solution.center_deviation)
+    if not assumed and ground is not None and _is_doubtful(solution, probe, len(few)):
+        mirrored = mirrored_radius(few, camera, probe, proxies, others)
+        if mirrored is not None and _contradicts(solution, mirrored):
+            radius, deviation = mirrored.radius, DEVIATION * mirrored.radius
+            own = SLOPE * deviation
+            solution = dataclasses.replace(solution, center=mirrored.center)
+            how = "by the desk in it"
     better = None
     try:
         found = dataclasses.replace(probe, center=solution.center, radius=radius)
@@ -106,4 +126,22 @@ def measure_ball(
         # Both are right within their intervals, or the mirrored receiver has been confused with another part of it.
         if math.dist(center, solution.center) < 3 * math.hypot(spread, own) and spread < own:
             return BallMeasurement((center[0], center[1], center[2]), spread, radius, told, "by the desk in it")
-    return BallMeasurement(solution.center, own, radius, told, f"by {len(outlines)} outlines")
+    return BallMeasurement(solution.center, own, radius, told, how.format(len(outlines)))
+
+
+def _is_doubtful(solution: BallSolution, probe: Probe, frames: int) -> bool:
+    """Whether outlines are worth a second opinion: some of them are missing, or the ball is not what was given."""
+    allowed = DOUBT * probe.radius
+    moved = max(abs(a - b) for a, b in zip(solution.center[:2], probe.center[:2], strict=True))
+    return len(solution.outlines) < frames or abs(solution.radius - probe.radius) > allowed or moved > 2 * allowed
+
+
+def _contradicts(solution: BallSolution, mirrored: Probe) -> bool:
+    """Whether a ball that explains what is mirrored cannot be the one of the outlines, or is better known."""
+    off = DEVIATION * mirrored.radius
+    if solution.radius_deviation > 1.5 * off:
+        return True
+    if abs(solution.radius - mirrored.radius) > 2 * math.hypot(solution.radius_deviation, off):
+        return True
+    reach = 3 * math.hypot(max(solution.center_deviation), SLOPE * off)
+    return math.dist(solution.center, mirrored.center) > reach

@@ -99,6 +99,14 @@ def _measure(camera: Camera, sphere: Array) -> Array:
     return np.array([f * sphere[0] / sphere[2], f * sphere[1] / sphere[2], f / np.linalg.norm(sphere)])
 
 
+def outline_misfit(found: tuple[BallOutline, Pose], camera: Camera, solution: BallSolution) -> float:
+    """Standard deviations of an outline, of its worst number, by which it is not where a solution has it."""
+    outline, pose = found
+    sphere = pose.apply(np.array(solution.center)) / solution.radius
+    off = _measure(camera, sphere) - _measure(camera, np.array(outline.sphere))
+    return float((np.abs(off) / np.maximum(outline.deviation, LEAST_PIXELS)).max())
+
+
 def solve_ball(
     outlines: Sequence[tuple[BallOutline, Pose]], camera: Camera, probe: Probe, ground: float | None = None
 ) -> BallSolution:

@@ -187,7 +187,10 @@ class CaptureDevice(LiveSource):
         self._capture = opener(device)
         try:
             if not self._capture.isOpened():
-                raise SourceError(f"{self._name} cannot be opened; is it plugged in, and free of other programs?")
+                raise SourceError(
+                    f"{self._name} cannot be opened; is it plugged in, and free of other programs? "
+                    "--source PATH|INDEX takes other frames"
+                )
             if fps is not None:
                 self._capture.set(cv2.CAP_PROP_FPS, fps)
             first = self._read()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Final
 
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from warp_ar.errors import UsageError
 from warp_ar.input.ball_finder import find_ball
-from warp_ar.input.ball_solve import BallSolution, find_outlines, ground_below, rough_circle, solve_ball
+from warp_ar.input.ball_radius import explains_better
+from warp_ar.input.ball_solve import BallSolution, ground_below, rough_circle, solve_ball
+from warp_ar.input.ball_views import agreeing_outlines
 from warp_ar.input.check_pictures import Look
 from warp_ar.input.finding import Finding
 from warp_ar.scene import Camera, Pose, Probe, Scene
@@ -62,13 +65,14 @@ def _check_ball(
     if not seen:
         text = f"{label}: the ball is outside the picture"
         return [Finding("ball.outside", text, "move camera or ball until all of it is in view; check center")]
-    outlines = [pair for pair in find_outlines(views, look.camera, probe) if pair[0].support > LOST]
+    ground = _ground(scene, probe)
+    outlines = [pair for pair in agreeing_outlines(views, look.camera, probe, ground) if pair[0].support > LOST]
     insides = [_inside_of(image, circle) for image, circle in seen]
     contrast = float(np.median([part.std() / max(part.mean(), 1.0) for part in insides]))
     if len(outlines) < max(1, len(seen) // 2):
         return [_why_lost(look, views, label, contrast)]
     found = []
-    solution = solve_ball(outlines, look.camera, probe, _ground(scene, probe))
+    solution = solve_ball(outlines, look.camera, probe, ground)
     pixels = float(np.median([outline.radius for outline, _ in outlines]))
     if pixels < SMALL:
         text = f"{label}: the ball is {2 * pixels:.0f} pixels wide; expected {2 * SMALL:.0f} or more"
@@ -84,7 +88,13 @@ def _check_ball(
     if support < SEEN:
         text = f"{label}: only {support:.0%} of the ball's outline is seen"
         found.append(Finding("ball.hidden", text, "take away what is in front of the ball"))
-    return [*found, *_compare(probe, solution, label, command, scene)]
+    off = _compare(probe, solution, label, command)
+    others = [other for other in scene.probes if other is not probe]
+    seen_ball = dataclasses.replace(probe, center=solution.center, radius=solution.radius)
+    # A ball that explains what is mirrored is right, and the outlines are edges beside its rim.
+    if off and explains_better(views, look.camera, probe, seen_ball, scene.proxies, others):
+        off = []
+    return [*found, *off]
 
 
 def _ground(scene: Scene, probe: Probe) -> float | None:
@@ -93,7 +103,7 @@ def _ground(scene: Scene, probe: Probe) -> float | None:
     return ground if ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius else None
 
 
-def _compare(probe: Probe, solution: BallSolution, label: str, command: str, scene: Scene) -> list[Finding]:
+def _compare(probe: Probe, solution: BallSolution, label: str, command: str) -> list[Finding]:
     """The solution against the scene's numbers."""
     if not solution.radius_assumed:
         off = solution.radius - probe.radius

@@ -64,6 +64,10 @@ BENDS: Final = ((0.0, 0.5), (-0.5, 0.5), (0.0, 0.5), (0.5, 1.0))
 MISFIT: Final = 0.07
 """Standard deviation of the logarithm of what curves of this form miss of a camera's, in the darks; toward code 255,
 where all curves meet, it falls as the square root of what is left."""
+MOST_DEVIATION: Final = 0.25
+"""Share of a middle code's value that its interval may have: usual cameras differ from sRGB by as much."""
+COUNTED: Final = 5
+"""Pictures beyond which more tell nothing new: what compression and the curve's form miss is alike in all of them."""
 ZONES: Final = 3
 """The board's cells are averaged over so many zones along x and y: neighbours share what is wrong with them."""
 _LIMITS: Final = ((0.015, 0.25), (-0.1, 0.1))
@@ -253,7 +257,7 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
         spread = float(np.clip(spread + solved[_TERMS + 1], *_LIMITS[1]))
     rest = design @ solved - target
     # Samples of one picture share what is wrong with them: the pictures and patches count, not the cells.
-    excess = max(float((rest**2).mean()), 1.0)
+    excess = max(float((rest**2).mean()), 1.0) * max(float(count) / COUNTED, 1.0)
     covariance = np.asarray(np.linalg.inv(normal) * excess, float)
     return _curve(np.asarray(solved[:_TERMS], float), covariance[:_TERMS, :_TERMS])
 

@@ -93,7 +93,8 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     """The scene with the printed card as its marker and a mirror ball on the card's cross.
 
     Args:
-        scene: The scene; its balls go, its objects, lights and proxies stay, and it gets a table if it has none.
+        scene: The scene; its balls go, its objects and lights stay, and it gets a table if it has none. Where its
+            marker was another one, walls and boxes go as well: they stood around that marker.
         radius: Of the ball, metres.
         ruler: What the print's rulers of 100 mm measure, metres.
 
@@ -114,13 +115,16 @@ def use_card(scene: Scene, radius: float, ruler: float) -> Scene:
     x, y, _ = ball_center(radius)
     center = (round(x * scale, 5), round(y * scale, 5), radius)
     ball = dataclasses.replace(scene.probes[0], center=center, radius=radius) if scene.probes else Probe(center, radius)
-    has_table = any(proxy.shape == "plane" for proxy in scene.proxies)
+    kept = scene.proxies
+    if card_ruler(scene) is None:
+        kept = tuple(proxy for proxy in kept if proxy.shape == "plane" and not any(proxy.rotate))
+    has_table = any(proxy.shape == "plane" for proxy in kept)
     return checked(
         dataclasses.replace(
             scene,
             marker=dataclasses.replace(SHEET, board=board),
             probes=(ball,),
-            proxies=scene.proxies if has_table else (*scene.proxies, Proxy("plane", size=(1.6, 1.2))),
+            proxies=kept if has_table else (*kept, Proxy("plane", size=(1.6, 1.2))),
         )
     )
 

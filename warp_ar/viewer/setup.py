@@ -18,7 +18,7 @@ from warp_ar.input.ball_measure import measure_ball
 from warp_ar.input.check_pictures import Look, board_instead, look_at, why_unseen
 from warp_ar.input.checkup import check_look
 from warp_ar.input.finding import Finding
-from warp_ar.input.grey_response import measure_grey_response
+from warp_ar.input.grey_response import MOST_DEVIATION, measure_grey_response
 from warp_ar.input.response import write_response
 from warp_ar.input.tracking import TrackState
 from warp_ar.scene import Camera, Probe, Scene
@@ -37,6 +37,12 @@ RESPONSE: Final = "response.txt"
 """Name of a measured response's file."""
 FEWEST: Final = 3
 """Frames without which nothing is measured."""
+PAGE_WORDS: Final = (
+    ("and run python -m warp_ar.calibrate camera PICTURES", "and press “Calibrate”"),
+    ("python -m warp_ar.calibrate camera PICTURES", "press “Calibrate”"),
+    ("python -m warp_ar.calibrate ball SCENE --write", "press “Measure the ball”"),
+)
+"""What a finding's command is on the page."""
 
 
 class SetupChecks:
@@ -66,7 +72,9 @@ class SetupChecks:
         self._seen = self._looked = 0.0
         self._findings: list[Finding] | None = None
         self._measured: dict[str, str] = {}
-        self._failed: str | None = None
+        self._made: dict[str, object] = {}
+        self._told: frozenset[str] = frozenset()
+        self._failed: dict[str, str] = {}
         self.missing: Finding | None = None
         """Why the marker is not seen, or that it is one of a board's, in words; None while all is right."""
 
@@ -87,6 +95,8 @@ class SetupChecks:
         if not self._frames or now - self._frames[-1][1] >= STEP_SECONDS:
             self._frames.append((image, now))
         self._begin()
+        if self._step is None and self._made and self._valid() != self._told:
+            self._notify(self.message())
         if state in (None, TrackState.TRACKED):
             self._seen = now
             # A single marker that is seen may be one of a board's, which is looked at below.
@@ -133,27 +143,36 @@ class SetupChecks:
         if name not in self._work:
             raise UsageError(f"no step {name!r}; expected {', '.join(self._work)}")
         self._step, self._waits = name, True
+        self._failed.pop(name, None)
         self._notify(self.message())
 
     def _begin(self) -> None:
         """Do what was asked for, if there are enough frames."""
         if self._waits and self._step is not None and len(self._frames) >= FEWEST:
             self._waits = False
-            self._busy = self._helper.submit(self._run, self._work[self._step])
+            self._busy = self._helper.submit(self._run, self._step)
 
-    def _run(self, work: Callable[[Scene, Look], None]) -> None:
-        self._failed = None
+    def _run(self, step: str) -> None:
         try:
             scene, camera = self._shown()
-            work(scene, look_at(scene.marker, camera, list(self._frames)))
+            self._work[step](scene, look_at(scene.marker, camera, list(self._frames)))
         except WarpArError as error:
-            self._failed = str(error)
+            self._failed[step] = str(error)
         finally:
             self._step = None
             self._notify(self.message())
 
     def _check(self, scene: Scene, look: Look) -> None:
         self._findings = check_look(scene, look, views=2)
+        self._made["check"] = _state_of(scene)["check"]
+
+    def _valid(self) -> frozenset[str]:
+        """Steps whose result is that of the set-up as it is: undo takes it back, redo brings it again."""
+        try:
+            now = _state_of(self._shown()[0])
+        except WarpArError:
+            return frozenset()  # the source has changed meanwhile
+        return frozenset(step for step, made in self._made.items() if now[step] == made)
 
     def _ball(self, scene: Scene, look: Look) -> None:
         """Measure the first mirror ball and put it where it stands."""
@@ -163,9 +182,15 @@ class SetupChecks:
             raise UsageError("the marker was seen in too few frames to measure the ball by")
         probe, *others = scene.probes
         found = measure_ball(look.views, look.camera, probe, scene.proxies, others)
+        if not found.is_usable:
+            raise UsageError(
+                f"the ball is known to {2e3 * found.deviation:.0f} mm only: nothing is changed. Have all of it in the "
+                "picture, look at it from the side rather than from above, and move the camera around it"
+            )
         x, y, z = (round(value, 5) for value in found.center)
         ball = dataclasses.replace(probe, center=(x, y, z), radius=round(found.radius, 5))
         self._controls.change(lambda w: dataclasses.replace(w, scene=_with_ball(w.scene, ball)), "measure the ball")
+        self._made["ball"] = (ball.center, ball.radius)
         moved = 1e3 * math.dist(found.center, probe.center)
         radius = f"{1e3 * found.radius:.1f} mm"
         radius += (
@@ -181,10 +206,16 @@ class SetupChecks:
     def _response(self, scene: Scene, look: Look) -> None:
         """Measure how the camera encodes light, by the card's greys."""
         found = measure_grey_response(look.images)
+        if (interval := 2 * found.deviation[128].max()) > MOST_DEVIATION:
+            raise UsageError(
+                f"the curve is known to {interval:.0%} only, by {found.views} pictures, and sRGB is as likely: nothing "
+                "is changed. Show the card under exposures, or lamps, that differ more"
+            )
         path = self._folder / RESPONSE
         write_response(found.curve, path)
         camera = dataclasses.replace(scene.camera, transfer=path)
         self._controls.change(lambda w: w.with_camera(camera), "measure the response")
+        self._made["response"] = path
         middle = found.curve[128].mean()
         self._measured["response"] = (
             f"Code 128 is {middle:.3f} of clipping ± {2 * found.deviation[128].max():.0%} (sRGB: 0.216), by "
@@ -203,19 +234,21 @@ class SetupChecks:
 
     def message(self) -> dict[str, Any]:
         """What was found and measured."""
+        self._told = valid = self._valid()
         findings = None
-        if self._findings is not None:
+        if self._findings is not None and "check" in valid:
             findings = [
-                {"name": f.name, "text": f.text, "cost": f.cost, "remedy": f.remedy, "error": f.error}
+                {"name": f.name, "text": f.text, "cost": f.cost, "remedy": _page_words(f.remedy), "error": f.error}
                 for f in self._findings
             ]
         return {
             "type": "setup",
             "busy": self._step,
             "findings": findings,
+            "outdated": self._findings is not None and findings is None,
             "frames": len(self._frames),
-            "measured": dict(self._measured),
-            "failed": self._failed,
+            "measured": {step: words for step, words in self._measured.items() if step in valid},
+            "failed": dict(self._failed),
         }
 
     def missing_record(self) -> dict[str, str] | None:
@@ -226,3 +259,20 @@ class SetupChecks:
 
 def _with_ball(scene: Scene, ball: Probe) -> Scene:
     return dataclasses.replace(scene, probes=(ball, *scene.probes[1:]))
+
+
+def _state_of(scene: Scene) -> dict[str, object]:
+    """What each step's result is about, as a scene has it."""
+    ball = scene.probes[0] if scene.probes else None
+    return {
+        "ball": ball and (ball.center, ball.radius),
+        "response": scene.camera.transfer,
+        "check": (scene.camera, scene.marker, scene.probes, scene.proxies),
+    }
+
+
+def _page_words(remedy: str) -> str:
+    """A finding's remedy with the page's buttons instead of commands."""
+    for command, words in PAGE_WORDS:
+        remedy = remedy.replace(command, words)
+    return remedy

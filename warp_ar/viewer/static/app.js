@@ -120,8 +120,10 @@ connection.addEventListener("calibration", ({ detail }) => {
   $("coverage").replaceChildren(...covered.flat().map((seen) => Object.assign(document.createElement("i"), { className: seen ? "on" : "" })));
   const lines = [];
   const fields = covered.flat();
-  const enough = views >= wanted ? "enough" : `${wanted - views} more are good`;
-  if (on) lines.push(`${views} view${views === 1 ? "" : "s"} so far, ${enough}; ${fields.filter(Boolean).length} of ${fields.length} fields reached. Hold the printed card before the camera, tilted another way each time, until every field of the picture is green.`);
+  const [enough, next] = views >= wanted
+    ? ["enough", "Press “Use what was seen”, or go on: fields that are not green yet make the lens better known."]
+    : [`${wanted - views} more are good`, "Show the printed card from another side each time, tilted and in all parts of the picture: fields that it reached turn green."];
+  if (on) lines.push(`${views} view${views === 1 ? "" : "s"} so far, ${enough}; ${fields.filter(Boolean).length} of ${fields.length} fields reached. ${next}`);
   else if (report) lines.push(`Calibrated and in use: focal length ${report.focal.toFixed(1)} ± ${(2 * report.deviation).toFixed(1)} pixels, ${report.error.toFixed(2)} pixels off on average. Undo takes it back. Start with --calibration camera.yml to have it at once.`, ...report.warnings.map((warning) => `Better: ${warning}.`));
   else lines.push("Print the card, lay it flat and show it to the camera from a dozen sides: light and shadow then sit where they belong.");
   $("calibration-note").textContent = lines.join(" ");

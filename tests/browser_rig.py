@@ -1,0 +1,161 @@
+"""The live page in a real browser: the command as a server, Chromium with a fake camera, and what a tab shows."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PATIENCE = 180.0  # seconds that anything may take on a busy machine
+FINGER = 43.5
+"""Pixels that a target of 44 has after rounding."""
+
+
+# The command, with a cost table that does not change when that of the package is made anew.
+LIVE = """
+import faulthandler
+import sys
+faulthandler.enable()
+from warp_ar.accuracy import cost_table
+errors = {
+    setting.name: {method: 0.1 / (1 + i) for i, method in enumerate(setting.methods)} for setting in cost_table.SETTINGS
+}
+cost_table.load_errors = lambda: errors
+from warp_ar.live import main
+sys.exit(main(sys.argv[1:]))
+"""
+PIXELS = """([x, y, w, h]) => {
+  const canvas = document.getElementById("canvas");
+  return [...canvas.getContext("2d").getImageData(x, y, w, h).data];
+}"""
+# Elements that fingers hit, by what they or their label measure; what is not shown is left out.
+SMALL = f"""() => [...document.querySelectorAll("button, a[href], select, summary, input")]
+  .filter((e) => e.offsetParent && !e.closest(".sr"))
+  .map((e) => [e.id || e.outerHTML, ...[e, e.closest("label") ?? e].map((one) => one.getBoundingClientRect())])
+  .filter(([, a, b]) => Math.max(a.width, b.width) < {FINGER} || Math.max(a.height, b.height) < {FINGER})
+  .map(([name]) => name)"""
+WORKS = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice")
+
+
+def write_camera_file(path: Path, images: Iterable[np.ndarray]) -> None:
+    """What Chromium's fake camera plays: JPEGs one after another, thirty a second.
+
+    It takes their codes for a video's, 16 to 235, and stretches them.
+    """
+    with path.open("wb") as file:
+        for image in images:
+            codes = np.rint(16 + image[..., ::-1].astype(np.float32) * (219 / 255)).astype(np.uint8)
+            file.write(cv2.imencode(".jpg", codes, (cv2.IMWRITE_JPEG_QUALITY, 95))[1].tobytes())
+
+
+@contextlib.contextmanager
+def served(options: Sequence[str], cache: Path) -> Iterator[str]:
+    """The page of a server of its own; it says nothing on its standard error, and ends as Ctrl-C ends it."""
+    command = [sys.executable, "-c", LIVE, *options, "--device", "cpu", "--quality", "low"]
+    command += ["--port", "0", "--no-browser"]
+    # Costs of its own, but the kernels that are compiled already.
+    environment = {
+        **os.environ,
+        "XDG_CACHE_HOME": str(cache),
+        "WARP_CACHE_PATH": str(Path(wp.config.kernel_cache_dir).parent),
+    }
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"https?://\S+", line)
+        assert found, (line, process.poll())
+        try:
+            yield found[0]
+        except BaseException:
+            process.kill()  # what went wrong is not the server's to wait for
+            raise
+        process.send_signal(signal.SIGINT)
+        try:
+            _, errors = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+    assert process.returncode == 130, errors
+    assert errors == "", errors
+
+
+@contextlib.contextmanager
+def chromium(camera_file: Path) -> Iterator[Any]:
+    """The browser, whose camera plays a file."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
+    fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+    arguments = ["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={camera_file}"]
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+def axe_core() -> str:
+    """The accessibility checks of axe-core, which browsers run."""
+    package = pytest.importorskip("axe_playwright_python", reason="needs axe-core: pip install '.[test]'")
+    return (Path(package.__file__).parent / "axe.min.js").read_text()
+
+
+def serious_findings(page: Any) -> list[Any]:
+    """What axe-core, which the page must have, finds in it that hinders somebody."""
+    found = page.evaluate(f"axe.run({{runOnly: {list(WORKS)}}})")["violations"]
+    return [
+        (one["id"], [node["html"] for node in one["nodes"]], one["help"])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]
+
+
+class Tab:
+    """A page, and the errors that it reports."""
+
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        self.errors: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+
+    def until(self, expression: str, what: str = "") -> Any:
+        """Wait until an expression of JavaScript holds; returns it. The page's policy forbids doing that inside."""
+        deadline = time.monotonic() + PATIENCE
+        while not (value := self.page.evaluate(expression)):
+            assert time.monotonic() < deadline, f"{what or expression} in vain; errors: {self.errors}"
+            self.page.wait_for_timeout(50)
+        return value
+
+    def shown(self, more: int = 3) -> None:
+        """Wait until so many further frames are on the screen."""
+        count = self.page.evaluate("warpAr.view.stats.shown")
+        self.until(f"warpAr.view.stats.shown >= {count + more}")
+
+    def hold(self) -> None:
+        self.page.click("#play")
+        self.until("warpAr.state.playing === false")
+        self.shown(3)
+
+    def pixels(self, x: float, y: float, size: int = 24) -> np.ndarray:
+        """RGB around a pixel of the picture."""
+        box = [round(x) - size // 2, round(y) - size // 2, size, size]
+        return np.array(self.page.evaluate(PIXELS, box)).reshape(size, size, 4)[..., :3].astype(float)
+
+    def on_screen(self, selector: str) -> tuple[float, float]:
+        """Middle of an element on the screen."""
+        box = self.page.locator(selector).first.bounding_box()
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2

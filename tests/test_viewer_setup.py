@@ -1,0 +1,223 @@
+"""A desk of one's own set up on the page, from the card to a lit object: Chromium, a fake camera, the keyboard alone.
+
+Screenshots are kept in the folder that WARP_AR_ARTEFACTS names, else in pytest's own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.browser_rig import CHROMIUM, SMALL, Tab, axe_core, chromium, serious_findings, served, write_camera_file
+from tests.random_desk import RandomDesk
+from warp_ar.input.card import write_card
+from warp_ar.input.sheet import SHEET
+from warp_ar.kernels.color import decode_table
+
+pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
+
+SEED = 31
+VIEWS = 14
+HELD = 15
+"""Frames of the film in which each view stands still: half a second."""
+LIGHTS = (1.0, 0.6, 0.3)
+"""What the lamps give, two views at a time."""
+FOCAL = 0.015
+"""Share of the focal length: twelve views of 640x480, packed twice as JPEG, their board in half of the picture."""
+RADIUS = 0.7e-3
+"""Metres: the interval that the page states for this desk."""
+CHANGED = 12.0
+"""Levels by which the picture changes where the teapot is: JPEG changes it by two."""
+
+
+def walk(desk: RandomDesk) -> Iterator[np.ndarray]:
+    """Frames of a hand that carries a camera around the desk, while lamps go on and off."""
+    decode = decode_table("srgb")[:, 0]
+    for k in range(VIEWS):
+        turn, tilt, far = 2.4 * k, np.radians((14, 32, 46)[k % 3]), 0.36 + 0.03 * (k % 4)
+        at = np.array([0.05 * np.cos(1.3 * k), 0.045 + 0.035 * np.sin(1.3 * k), 0.0])
+        eye = at + far * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+        image = desk.photograph(eye, at, (0.0, 25.0, -30.0)[k % 3])
+        dimmed = np.searchsorted(decode, decode * LIGHTS[k // 2 % len(LIGHTS)]).astype(np.uint8)
+        yield from [dimmed[image]] * HELD
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> RandomDesk:
+    card = tmp_path_factory.mktemp("card") / "card.pdf"
+    write_card(SHEET, card, "a4", 600)
+    return RandomDesk(card, SEED)
+
+
+@pytest.fixture(scope="module")
+def browser(desk: RandomDesk, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    write_camera_file(path, walk(desk))
+    with chromium(path) as browser:
+        yield browser
+
+
+class Hands:
+    """A page that is used by the keyboard, looked at by axe-core, and photographed."""
+
+    def __init__(self, tab: Tab, phone: bool, folder: Path, name: str) -> None:
+        self.tab, self.page, self._phone, self._folder, self._name = tab, tab.page, phone, folder, name
+        self._count = 0
+        self.page.evaluate(axe_core())
+
+    def reach(self, selector: str, most: int = 120) -> None:
+        """Press Tab until the focus is there, backward if that is nearer."""
+        for _ in range(most):
+            if self.page.evaluate(f"document.activeElement.matches({selector!r})"):
+                return
+            self.page.keyboard.press("Tab")
+        pytest.fail(f"Tab never reaches {selector}")
+
+    def press(self, selector: str, key: str = "Enter") -> None:
+        self.reach(selector)
+        self.page.keyboard.press(key)
+
+    def type(self, selector: str, text: str) -> None:
+        self.reach(selector)
+        self.page.keyboard.press("Control+a")
+        self.page.keyboard.type(text)
+
+    def look(self, step: str) -> None:
+        """Nothing serious hinders anybody in this step, and a finger hits what it wants."""
+        self.page.screenshot(path=self._folder / f"{self._name}_{self._count}_{step}.png")
+        self._count += 1
+        assert serious_findings(self.page) == [], step
+        if self._phone:
+            assert self.page.evaluate(SMALL) == [], step
+            assert self.page.evaluate("document.documentElement.scrollWidth") <= 390, "wider than the phone"
+
+    def words(self, selector: str) -> str:
+        return str(self.page.inner_text(selector))
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+def test_from_the_card_to_a_lit_object(size: tuple[int, int], desk: RandomDesk, browser: Any, tmp_path: Path) -> None:
+    folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    phone = size[0] < 800
+    with served(["desk"], tmp_path) as url:
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, has_touch=phone, is_mobile=phone, permissions=["camera"]
+        )
+        tab = Tab(context.new_page())
+        tab.page.goto(url)
+        tab.until("!!window.warpAr && warpAr.view.stats.plan > 0 && !!warpAr.scene", "the first lit frame")
+        hands = Hands(tab, phone, folder, f"setup_{size[0]}")
+        use_the_card(tab, hands, desk)
+        measure_the_camera(tab, hands, desk)
+        measure_the_ball(tab, hands, desk)
+        measure_the_response(tab, hands)
+        check(tab, hands)
+        the_object_is_lit(tab, hands)
+        context.close()
+    assert tab.errors == []
+
+
+def use_the_card(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
+    hands.reach("#use-camera")
+    hands.page.keyboard.press("Enter")
+    tab.until("warpAr.state.camera === true && warpAr.view.stats.stamped", "the camera's frames")
+    hands.press("#tab-scene", "ArrowLeft")  # the tabs go round
+    assert hands.page.locator("#panel-setup").is_visible()
+    hands.look("print")
+    hands.reach('[data-download="card-a4.pdf"]')
+    with hands.page.expect_download() as card:
+        hands.page.keyboard.press("Enter")
+    assert card.value.suggested_filename == "card-a4.pdf"
+    tab.until("!document.getElementById('guide').hidden", "the guide")
+    assert "Use the card with these sizes" in hands.words("#guide")
+    # Typed as a ruler has it: to the millimetre.
+    hands.type("#ball-radius", f"{1e3 * desk.radius:.0f}")
+    hands.press("#use-card")
+    tab.until("warpAr.scene.marker.ruler === 0.1", "the card")
+    # The box stood beside the marker of the clip.
+    assert hands.page.evaluate("warpAr.scene.proxies.map(p => p.shape).join()") == "plane"
+    hands.page.keyboard.press("Control+z")
+    tab.until("warpAr.scene.marker.ruler === null && warpAr.scene.proxies.length === 2", "undone")
+    hands.page.keyboard.press("Control+Shift+z")
+    tab.until("warpAr.scene.marker.ruler === 0.1", "done again")
+    tab.until("document.getElementById('track-state').classList.contains('tracked')", "the card in the picture")
+    tab.until("document.getElementById('guide').hidden")
+    hands.look("card")
+
+
+def measure_the_camera(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
+    hands.press("#calibrate")
+    tab.until("document.getElementById('calibration-note').textContent.includes('enough')", "a dozen views")
+    hands.look("camera")
+    hands.press("#calibrate-finish")
+    tab.until("warpAr.state.lens === 'calibrated'", "the calibrated camera")
+    tab.until("document.getElementById('calibration-note').textContent.startsWith('Calibrated and in use')")
+    tab.until(f"Math.abs(warpAr.camera.fx / {desk.camera.fx} - 1) < {FOCAL}", "its focal length in the picture")
+    hands.page.keyboard.press("Control+z")
+    tab.until("warpAr.state.lens !== 'calibrated'", "undone")
+    hands.page.keyboard.press("Control+Shift+z")
+    tab.until("warpAr.state.lens === 'calibrated'", "done again")
+
+
+def measure_the_ball(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
+    hands.press("#measure-ball")
+    tab.until("document.getElementById('ball-note').textContent.startsWith('Looking at the frames')")
+    tab.until("!document.getElementById('measure-ball').disabled", "the ball")
+    said = hands.words("#ball-note")
+    assert said.startswith("The ball's centre was"), said
+    assert abs(hands.page.evaluate("warpAr.scene.probes[0].radius") - desk.radius) < RADIUS
+    hands.look("ball")
+    # What was measured is no longer said once it is undone.
+    hands.page.keyboard.press("Control+z")
+    tab.until("document.getElementById('ball-note').textContent.startsWith('Centre and radius are solved')", "undone")
+    hands.page.keyboard.press("Control+Shift+z")
+    tab.until("document.getElementById('ball-note').textContent.startsWith('The ball')", "done again")
+
+
+def measure_the_response(tab: Tab, hands: Hands) -> None:
+    """By chance of the moment the film tells the curve well enough or not; either is said beside the button."""
+    hands.press("#measure-response")
+    tab.until("document.getElementById('response-note').textContent.startsWith('Looking at the frames')")
+    tab.until("!document.getElementById('measure-response').disabled", "the response")
+    said = hands.words("#response-note")
+    assert said.startswith("Code 128 is") or "nothing is changed" in said, said
+    assert hands.page.locator("#response-file").is_visible() == said.startswith("Code 128 is")
+    hands.look("response")
+
+
+def check(tab: Tab, hands: Hands) -> None:
+    hands.press("#check")
+    tab.until("document.getElementById('check-note').textContent.startsWith('Looking at the frames')")
+    tab.until("!document.getElementById('check').disabled", "the check")
+    hands.look("check")
+    assert hands.words("#check-note") == "Nothing wrong was found.", hands.words("#findings")
+
+
+def the_object_is_lit(tab: Tab, hands: Hands) -> None:
+    """The teapot is there, and is not in the camera's own picture."""
+    hands.press("#play")
+    tab.until("warpAr.state.playing === false")
+    hands.reach("#compare")
+    hands.page.select_option("#compare", "camera")
+    tab.until("warpAr.state.compare_ready && warpAr.state.compare === 'camera'")
+    tab.shown(3)
+    place = hands.page.evaluate(
+        "import('/static/geometry.js').then(g => g.project(warpAr.camera, warpAr.pose, warpAr.scene.objects[0].at))"
+    )
+    x, y = np.clip(place[:2], 20, (619, 459))
+    seen = []
+    for split in (1000, 0):
+        hands.page.evaluate(f"document.getElementById('split').value = {split}")
+        hands.page.locator("#split").dispatch_event("input")
+        seen.append(tab.pixels(x, y))
+    assert np.abs(seen[0] - seen[1]).mean() > CHANGED
+    hands.page.evaluate("document.getElementById('split').value = 500")
+    hands.page.locator("#split").dispatch_event("input")
+    hands.look("lit")
