@@ -90,7 +90,8 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         camera = params[0]
         total = wp.vec3(0.0, 0.0, 0.0)
         count = wp.float32(0.0)
-        for sample in range(wp.static(SIDE * SIDE)):
+        samples = wp.int32(SIDE * SIDE)  # a variable: the loop stays one
+        for sample in range(samples):
             y = wp.float32(i) + (wp.float32(sample // SIDE) + 0.5) / wp.float32(SIDE)
             x = wp.float32(j) + (wp.float32(sample % SIDE) + 0.5) / wp.float32(SIDE)
             direction = direction_from_latlong(y, x, height, width)
