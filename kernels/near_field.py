@@ -46,7 +46,7 @@ import warp as wp
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.materials import Surface, make_surface, material_at, reflect, roughness_at, surface_point
 from warp_ar.kernels.prefilter import level_from_alpha, sample_levels
 from warp_ar.kernels.reflect import (
@@ -255,7 +255,7 @@ def make_lobe_ray(
 
 @functools.cache
 def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
-    """``mirror_ray(params, scene, shape, ray, k) -> NearRay``: from where a mirror is seen at sample ``k`` of a pixel."""
+    """``mirror_ray(params, scene, shape, ray, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
@@ -297,6 +297,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     side = config.side
     lobes = config.lobe_count
 
+    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def near_field_kernel(
         row_start: wp.int32,

@@ -83,7 +83,7 @@ from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_lis
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows, slow_to_compile
 from warp_ar.kernels.shadow import LightSample, has_penumbra, make_shadow, make_visible_share, sample_light, tile_turn
 from warp_ar.kernels.structs import Emitter, FrameParams, KeyLight, Light, Picture, Probe, RayScene
 from warp_ar.kernels.summed_area import box_mean, intensity
@@ -485,6 +485,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     closest_proxy = make_trace(config.trace).closest_proxy
     direct_lighting = make_direct_lighting(config)
 
+    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def relight_kernel(
         # In:
