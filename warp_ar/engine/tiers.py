@@ -176,7 +176,8 @@ def _process() -> subprocess.Popen[bytes]:
 
 def _clang() -> Any:
     """Where Warp's Clang lies."""
-    return getattr(getattr(getattr(wp, "_src", None), "context", None), "runtime", None).llvm._name
+    context: Any = getattr(getattr(wp, "_src", None), "context", None)
+    return context.runtime.llvm._name
 
 
 def _arguments(module: Any) -> dict[str, Any]:
