@@ -47,7 +47,7 @@ from warp_ar.kernels.environment_shadow_cells import (
 )
 from warp_ar.kernels.environment_shadow_rays import make_find_sender, make_masks
 from warp_ar.kernels.environment_shadow_wavefront import Wavefront, shade_wavefront
-from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.launch import Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.reflect import DistantLight
 from warp_ar.kernels.sampling import pcg3d_hash
 from warp_ar.kernels.shapes import FAR, surface_key
@@ -75,6 +75,7 @@ def make_environment_shadow_kernel(config: EnvironmentShadowConfig) -> wp.Kernel
     chunk = min(config.count, CHUNK)
     secondary_count = config.secondary_count
 
+    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False)
     def environment_shadow_kernel(
         # In:

@@ -42,10 +42,15 @@ DEPTH_STEP = wp.constant(wp.float32(0.03))
 """Relative change of depth from which neighbours on a mesh belong to different parts of it."""
 
 
-def window_weight(offset: int, reach: int) -> float:
+@wp.func
+def window_weight(offset: wp.int32, reach: wp.int32) -> wp.float32:
     """Of a cell in a window around another: whole inside, half at its edge, nothing beyond."""
-    distance = abs(offset)
-    return 1.0 if distance < max(reach, 1) else 0.5 if distance == reach else 0.0
+    distance = wp.abs(offset)
+    if distance < wp.max(reach, 1):
+        return 1.0
+    if distance == reach:
+        return 0.5
+    return 0.0
 
 
 @functools.cache
@@ -53,12 +58,9 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
     """Kernel of ``filter_ratio`` for tiles of so many cells along."""
     wide, narrow = side // 2, side // 4
     width = 2 * wide + 1
-    # Values: for a ``wp.static`` of a loop's variable Warp translates the kernel to tell whether it is cached.
-    weights = wp.types.vector(length=width, dtype=wp.float32)
-    wide_weights = weights(*(window_weight(a - wide, wide) for a in range(width)))
-    narrow_weights = weights(*(window_weight(a - wide, narrow) for a in range(width)))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    # The loops stay loops: written out, with weights that are known, they take compilers seconds and gain nothing.
+    @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
     def filter_ratio_kernel(
         # In:
         row_start: wp.int32,
@@ -91,10 +93,10 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
         squares = wp.vec4(0.0)
         far_sent = wp.vec3(0.0)
         near_sent = wp.vec3(0.0)
-        wide_at = wp.static(wide_weights)
-        narrow_at = wp.static(narrow_weights)
         for a in range(wp.static(width)):
             ni = i + a - wp.static(wide)
+            wide_row = window_weight(ni - i, wp.static(wide))
+            narrow_row = window_weight(ni - i, wp.static(narrow))
             for b in range(wp.static(width)):
                 nj = j + b - wp.static(wide)
                 if ni >= 0 and nj >= 0 and ni < surface.shape[0] and nj < surface.shape[1]:
@@ -103,8 +105,8 @@ def make_filter_ratio_kernel(side: int) -> wp.Kernel:
                         # A mesh has no faces to tell apart: neighbours much nearer or farther are another part of it.
                         if key % FACES != MESH_KEY or wp.abs(value[3] - depth) <= DEPTH_STEP * depth:
                             value[3] = 1.0
-                            weight = wide_at[a] * wide_at[b]
-                            near = narrow_at[a] * narrow_at[b]
+                            weight = wide_row * window_weight(nj - j, wp.static(wide))
+                            near = narrow_row * window_weight(nj - j, wp.static(narrow))
                             sent = bounced[ni, nj]
                             far_left += weight * value
                             far_sent += weight * sent

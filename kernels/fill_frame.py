@@ -92,27 +92,29 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         camera = params[0]
         total = wp.vec3(0.0, 0.0, 0.0)
         count = wp.float32(0.0)
-        for sample in range(wp.static(SIDE * SIDE)):
-            y = wp.float32(i) + (wp.float32(sample // SIDE) + 0.5) / wp.float32(SIDE)
-            x = wp.float32(j) + (wp.float32(sample % SIDE) + 0.5) / wp.float32(SIDE)
-            direction = direction_from_latlong(y, x, height, width)
-            ray = direction
-            reach = wp.float32(FAR)
-            hit = trace.closest_proxy(scene, probes[0].center, direction, FAR)
-            shaded = wp.bool(False)
-            if hit.shape >= 0:
-                shaded = shaded_by_ball(probes, hit.point)
-                ray = hit.point - camera.camera_position
-                reach = wp.length(ray)
-                ray = ray / reach
-            at = project(camera, ray)
-            row = wp.int32(wp.round(wp.clamp(at[1], -1.0, 1.0e6)))
-            column = wp.int32(wp.round(wp.clamp(at[0], -1.0, 1.0e6)))
-            inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
-            if inside and not shaded and passes_balls(probes, camera.camera_position, ray, reach):
-                if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
-                    total += pixel_radiance(frame, table, linear, row, column)
-                    count += 1.0
+        side = wp.int32(SIDE)  # a variable: the loops stay loops
+        for row_of_texel in range(side):
+            y = wp.float32(i) + (wp.float32(row_of_texel) + 0.5) / wp.float32(SIDE)
+            for column_of_texel in range(side):
+                x = wp.float32(j) + (wp.float32(column_of_texel) + 0.5) / wp.float32(SIDE)
+                direction = direction_from_latlong(y, x, height, width)
+                ray = direction
+                reach = wp.float32(FAR)
+                hit = trace.closest_proxy(scene, probes[0].center, direction, FAR)
+                shaded = wp.bool(False)
+                if hit.shape >= 0:
+                    shaded = shaded_by_ball(probes, hit.point)
+                    ray = hit.point - camera.camera_position
+                    reach = wp.length(ray)
+                    ray = ray / reach
+                at = project(camera, ray)
+                row = wp.int32(wp.round(wp.clamp(at[1], -1.0, 1.0e6)))
+                column = wp.int32(wp.round(wp.clamp(at[0], -1.0, 1.0e6)))
+                inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
+                if inside and not shaded and passes_balls(probes, camera.camera_position, ray, reach):
+                    if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
+                        total += pixel_radiance(frame, table, linear, row, column)
+                        count += 1.0
         if count > 0.0:
             weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
             trust = known[3] + weight

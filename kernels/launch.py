@@ -13,6 +13,7 @@ import contextlib
 import dataclasses
 import functools
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -35,6 +36,23 @@ Warp's own flags inline up to a cost of 9,000, which kernels with many rays in t
 ``shade`` and ``environment_shadow`` take a fifth longer. Either way values are rounded alike: Clang fuses products and
 sums within an expression of Warp's headers only, never across calls.
 """
+
+_SLOW: weakref.WeakSet[wp.Kernel] = weakref.WeakSet()
+
+
+def slow_to_compile(kernel: wp.Kernel) -> wp.Kernel:
+    """Mark a kernel, the one of its module, that Clang takes seconds for and that pays for inlining in each frame.
+
+    Commands begin with a version of it into which less is inlined (``warp_ar.engine.tiers``).
+    """
+    _SLOW.add(kernel)
+    return kernel
+
+
+def is_slow_to_compile(kernel: wp.Kernel) -> bool:
+    """Whether a kernel is marked by ``slow_to_compile``."""
+    return kernel in _SLOW
+
 
 MAX_PARTIALS = 8
 """Threads of a CUDA device that share a cell's samples at most, each with a partial sum."""

@@ -46,7 +46,7 @@ import warp as wp
 from warp_ar.kernels.color import brightness
 from warp_ar.kernels.emitters import correct_parallax
 from warp_ar.kernels.environment_samples import EnvironmentSample, sample_toward, sobol_second
-from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.lobes import level_from_alpha, sample_levels
 from warp_ar.kernels.materials import Surface, make_surface, material_at, reflect, roughness_at, surface_point
 from warp_ar.kernels.reflect import (
@@ -65,7 +65,7 @@ from warp_ar.kernels.sampling import (
     sample_phong_lobe,
 )
 from warp_ar.kernels.shapes import FAR
-from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Picture, RayScene
+from warp_ar.kernels.structs import METALLIC_ROUGHNESS, PHONG, FrameParams, Hit, Picture, RayScene
 from warp_ar.kernels.trace import make_trace, offset_origin
 from warp_ar.kernels.visibility import VisibleObjects, inside_rect, make_primary, make_sample_direction
 
@@ -188,61 +188,110 @@ def make_look_near(config: NearFieldConfig) -> wp.Function:
     return look_near
 
 
-@functools.cache
-def make_mirror_pixel(config: NearFieldConfig) -> wp.Function:
-    """``mirror_pixel(...) -> vec4``: mean radiance that a mirror shows within a pixel, and 1; zero if no ray leaves it.
+@wp.struct
+class NearRay:
+    """A ray that leaves a pixel of an object, and what stands behind the near field on its way."""
 
-    Arguments as those of ``look_near``, and the mirror's surface, the object that it is, and the pixel's ray.
-    """
-    look_near = make_look_near(config)
-    reflected_radiance = make_reflected_radiance(config.distant)
+    origin: wp.vec3
+    direction: wp.vec3
+    reach: wp.float32  # metres
+    spread: wp.float32  # width over length
+    point: wp.vec3  # that it leaves, without offset
+    radiance: wp.vec3  # a sample's of the environment
+    weight: wp.float32  # that sample's cosine and measure, times its share
+    leaves: wp.bool  # into the open; else into the surface
+
+
+@wp.func
+def make_sample_ray(
+    sample: EnvironmentSample, hit: Hit, normal: wp.vec3, geometric: wp.vec3, share: wp.float32
+) -> NearRay:
+    """Toward a sample of the environment; its weight is 0 where the surface does not see it."""
+    out = NearRay()
+    toward = sample_toward(sample, hit.point)
+    cosine = wp.dot(normal, toward.direction)
+    if cosine > 0.0:
+        out.weight = share * cosine * toward.measure
+        if wp.dot(geometric, toward.direction) > 0.0:
+            out.leaves = True
+            out.radiance = sample.radiance
+            out.origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
+            out.direction = toward.direction
+            out.reach = toward.distance
+            out.spread = RAY_SPREAD
+    return out
+
+
+@wp.func
+def make_lobe_ray(
+    u: wp.vec2, surface: Surface, hit: Hit, wo: wp.vec3, normal: wp.vec3, geometric: wp.vec3, alpha: wp.float32
+) -> NearRay:
+    """Into the lobe of a glossy surface, by two numbers of [0, 1)."""
+    out = NearRay()
+    if surface.model == PHONG:
+        center = reflect(wo, normal)
+        wi = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
+        width = phong_ray_width(wp.dot(wi, center), surface.shininess, alpha)
+    else:
+        basis = frame_from_normal(normal)
+        half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
+        wi = reflect(wo, half)
+        width = ggx_ray_width(wp.dot(half, normal), alpha)
+    if wp.dot(wi, geometric) > 0.0:
+        out.leaves = True
+        out.origin = offset_origin(hit.point, geometric, wi, hit.error)
+        out.direction = wi
+        out.reach = FAR
+        out.spread = width
+        out.point = hit.point
+    return out
+
+
+@functools.cache
+def make_mirror_ray(config: NearFieldConfig) -> wp.Function:
+    """``mirror_ray(params, scene, shape, ray, k) -> NearRay``: from what a pixel's sample ``k`` shows of a mirror."""
     closest_visible = make_primary(config.distant.trace)
     sample_direction = make_sample_direction(config.mirror_samples)
 
     @wp.func(module="unique")
-    def mirror_pixel(
-        params: wp.array[FrameParams],
-        picture: Picture,
-        layers: ReceiverLayers,
-        scene: RayScene,
-        distant: DistantLight,
-        surface: Surface,
-        shape: wp.int32,
-        ray: wp.vec2,
-    ) -> wp.vec4:
-        total = wp.vec4(0.0)
-        for k in range(wp.static(config.mirror_samples)):
-            direction = wp.normalize(sample_direction(params, ray, k))
-            seen = closest_visible(scene, params[0].camera_position, direction)
-            if seen.shape == shape:
-                geometric = seen.geometric_normal
-                if wp.dot(geometric, direction) > 0.0:
-                    geometric = -geometric
-                wi = reflect(-direction, seen.normal)
-                if wp.dot(wi, geometric) > 0.0:
-                    origin = offset_origin(seen.point, geometric, wi, seen.error)
-                    spread = scene.pixel_spread
-                    shown = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR, spread)
-                    if shown[3] <= 0.0:
-                        beyond = reflected_radiance(
-                            distant, surface.model, surface.roughness, surface.shininess, seen.point, wi, 0.0
-                        )
-                        shown = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
-                    total += shown
-        return total / wp.max(total[3], 1.0)
+    def mirror_ray(
+        params: wp.array[FrameParams], scene: RayScene, shape: wp.int32, ray: wp.vec2, k: wp.int32
+    ) -> NearRay:
+        out = NearRay()
+        direction = wp.normalize(sample_direction(params, ray, k))
+        seen = closest_visible(scene, params[0].camera_position, direction)
+        if seen.shape == shape:
+            geometric = seen.geometric_normal
+            if wp.dot(geometric, direction) > 0.0:
+                geometric = -geometric
+            wi = reflect(-direction, seen.normal)
+            if wp.dot(wi, geometric) > 0.0:
+                out.leaves = True
+                out.origin = offset_origin(seen.point, geometric, wi, seen.error)
+                out.direction = wi
+                out.reach = FAR
+                out.spread = scene.pixel_spread
+                out.point = seen.point
+        return out
 
-    return mirror_pixel
+    return mirror_ray
 
 
 @functools.cache
 def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
-    """Kernel specialised to ``config``; equal configs share one kernel."""
+    """Kernel specialised to ``config``; equal configs share one kernel.
+
+    Rays of all kinds go through one loop, so that the walk through the scene is there once: a copy for each kind, and
+    for each turn of an unrolled loop, takes NVRTC nine times as long.
+    """
     look_near = make_look_near(config)
     surface_at = make_surface(config.distant.models, config.distant.textures)
-    mirror_pixel = make_mirror_pixel(config) if config.mirror_samples > 0 else None
+    reflected_radiance = make_reflected_radiance(config.distant) if config.mirror_samples > 0 else None
+    mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side = config.side
     lobes = config.lobe_count
 
+    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def near_field_kernel(
         row_start: wp.int32,
@@ -264,8 +313,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         if visible.objects[i, j] < 0:
             return
         hit = visible.hits[i, j]
-        ray = picture.rays[i, j]
-        direction = wp.normalize(params[0].world_from_camera * wp.vec3(ray[0], ray[1], 1.0))
+        pixel = picture.rays[i, j]
+        direction = wp.normalize(params[0].world_from_camera * wp.vec3(pixel[0], pixel[1], 1.0))
         wo = -direction
         normal = hit.normal
         geometric = hit.geometric_normal
@@ -274,77 +323,88 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
             geometric = -geometric
         cos_o = wp.max(wp.dot(normal, wo), 1.0e-3)
         surface = surface_at(scene, distant.dfg, hit, cos_o, scene.pixel_spread)
+        alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
         set_index = (i % side) * side + j % side
 
+        # Samples of the environment come first, then rays into the lobe.
+        diffuse = wp.int32(0)
+        glossy = wp.int32(0)
         if wp.static(config.distant.diffuse != "none"):
-            total = wp.vec3(0.0)
             if surface.diffuse[0] + surface.diffuse[1] + surface.diffuse[2] > 0.0:
-                stride = samples.shape[0] / wp.static(side * side)
-                first = set_index * stride
-                # A sample's measure is its share of all sets. A set is in the order of its sequence: any first part
-                # of it is a smaller set.
-                share = wp.float32(stride * side * side) / wp.static(float(config.count))
-                for k in range(wp.static(config.count)):
-                    sample = samples[first + k]
-                    toward = sample_toward(sample, hit.point)
-                    cosine = wp.dot(normal, toward.direction)
-                    if cosine > 0.0:
-                        radiance = sample.radiance
-                        if wp.dot(geometric, toward.direction) <= 0.0:
-                            radiance = wp.vec3(0.0)
-                        else:
-                            origin = offset_origin(hit.point, geometric, toward.direction, hit.error)
-                            wi = toward.direction
-                            reach = toward.distance
-                            near = look_near(params[0], picture, layers, scene, distant, origin, wi, reach, RAY_SPREAD)
-                            if near[3] > 0.0:
-                                radiance = wp.vec3(near[0], near[1], near[2])
-                        total += share * cosine * toward.measure * radiance
-            near_out.irradiance[i, j] = total
-
+                diffuse = wp.static(config.count)
         if wp.static(config.distant.specular):
-            reflected = wp.vec4(0.0)
-            transmitted = wp.vec4(0.0)
-            leaving = float(0.0)  # rays; those into the surface are part of its reflectance
             if surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2] > 0.0:
-                alpha = lobe_alpha(surface.model, surface.roughness, surface.shininess)
-                if wp.static(config.mirror_samples > 0):
-                    if alpha < SHARP:
-                        reflected = mirror_pixel(params, picture, layers, scene, distant, surface, hit.shape, ray)
-                if wp.static(lobes > 0):
-                    if alpha >= SHARP:
-                        basis = frame_from_normal(normal)
-                        center = reflect(wo, normal)
-                        for k in range(wp.static(lobes)):
+                glossy = wp.where(alpha < SHARP, wp.static(config.mirror_samples), wp.static(lobes))
+        total = wp.vec3(0.0)
+        reflected = wp.vec4(0.0)
+        transmitted = wp.vec4(0.0)
+        leaving = float(0.0)  # rays; those into the surface are part of its reflectance
+        for n in range(diffuse + glossy):
+            ray = NearRay()
+            if wp.static(config.distant.diffuse != "none"):
+                if n < diffuse:
+                    # A sample's measure is its share of all sets. A set is in the order of its sequence: any first
+                    # part of it is a smaller set.
+                    stride = samples.shape[0] / wp.static(side * side)
+                    share = wp.float32(stride * side * side) / wp.static(float(config.count))
+                    ray = make_sample_ray(samples[set_index * stride + n], hit, normal, geometric, share)
+            if wp.static(config.distant.specular):
+                if n >= diffuse:
+                    k = n - diffuse
+                    if wp.static(config.mirror_samples > 0):
+                        if alpha < SHARP:
+                            ray = mirror_ray(params, scene, hit.shape, pixel, k)
+                    if wp.static(lobes > 0):
+                        if alpha >= SHARP:
                             index = wp.uint32(set_index * wp.static(lobes) + k)
                             shift = wp.static(0.5 / (max(lobes, 1) * side * side))
                             u = wp.vec2(radical_inverse(index) + shift, sobol_second(index) + shift)
-                            if surface.model == PHONG:
-                                wi = frame_from_normal(center) * sample_phong_lobe(u, surface.shininess)
-                                width = phong_ray_width(wp.dot(wi, center), surface.shininess, alpha)
-                            else:
-                                half = basis * sample_ggx_visible(u, wp.transpose(basis) * wo, alpha)
-                                wi = reflect(wo, half)
-                                width = ggx_ray_width(wp.dot(half, normal), alpha)
-                            if wp.dot(wi, geometric) > 0.0:
-                                origin = offset_origin(hit.point, geometric, wi, hit.error)
-                                near = look_near(params[0], picture, layers, scene, distant, origin, wi, FAR, width)
-                                leaving += 1.0
-                                reflected += near
-                                level = level_from_alpha(
-                                    wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * width,
-                                    distant.level_height,
-                                )
-                                turned = wi
-                                if wp.static(config.distant.emitters):
-                                    turned = correct_parallax(distant.emitters, hit.point, wi)
-                                beyond = sample_levels(distant.levels, turned, level, distant.level_height)
-                                missed = (1.0 - near[3]) * beyond
-                                transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
-                reflected = reflected / wp.max(leaving, 1.0)
-                transmitted = transmitted / wp.max(leaving, 1.0)
-            near_out.reflected[i, j] = reflected
-            near_out.transmitted[i, j] = transmitted
+                            ray = make_lobe_ray(u, surface, hit, wo, normal, geometric, alpha)
+            near = wp.vec4(0.0)
+            if ray.leaves:
+                near = look_near(
+                    params[0], picture, layers, scene, distant, ray.origin, ray.direction, ray.reach, ray.spread
+                )
+            if wp.static(config.distant.diffuse != "none"):
+                if n < diffuse:
+                    radiance = ray.radiance
+                    if near[3] > 0.0:
+                        radiance = wp.vec3(near[0], near[1], near[2])
+                    if ray.weight > 0.0:
+                        total += ray.weight * radiance
+            if wp.static(config.distant.specular):
+                if n >= diffuse and ray.leaves:
+                    leaving += 1.0
+                    if wp.static(config.mirror_samples > 0):
+                        if alpha < SHARP and near[3] <= 0.0:
+                            beyond = reflected_radiance(
+                                distant,
+                                surface.model,
+                                surface.roughness,
+                                surface.shininess,
+                                ray.point,
+                                ray.direction,
+                                0.0,
+                            )
+                            near = wp.vec4(beyond[0], beyond[1], beyond[2], 1.0)
+                    reflected += near
+                    if wp.static(lobes > 0):
+                        if alpha >= SHARP:
+                            level = level_from_alpha(
+                                wp.static(RAY_WIDTH / (math.sqrt(max(lobes, 1)) * side)) * ray.spread,
+                                distant.level_height,
+                            )
+                            turned = ray.direction
+                            if wp.static(config.distant.emitters):
+                                turned = correct_parallax(distant.emitters, ray.point, turned)
+                            beyond = sample_levels(distant.levels, turned, level, distant.level_height)
+                            missed = (1.0 - near[3]) * beyond
+                            transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
+        if wp.static(config.distant.diffuse != "none"):
+            near_out.irradiance[i, j] = total
+        if wp.static(config.distant.specular):
+            near_out.reflected[i, j] = reflected / wp.max(leaving, 1.0)
+            near_out.transmitted[i, j] = transmitted / wp.max(leaving, 1.0)
 
     return near_field_kernel
 

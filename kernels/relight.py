@@ -27,7 +27,7 @@ import warp as wp
 from warp_ar.kernels.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
 from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
-from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows
+from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows, slow_to_compile
 from warp_ar.kernels.receiver import (
     DEFAULT_REFLECTANCE,
     Matter,
@@ -180,6 +180,7 @@ def make_relight_kernel(config: RelightConfig) -> wp.Kernel:
     closest_proxy = make_trace(config.trace).closest_proxy
     direct_lighting = make_direct_lighting(config)
 
+    @slow_to_compile
     @wp.kernel(module="unique", enable_backward=False, cuda_max_registers=MOST_REGISTERS)
     def relight_kernel(
         # In:

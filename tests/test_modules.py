@@ -124,7 +124,7 @@ def test_no_kernel_is_translated_to_tell_whether_it_is_cached(monkeypatch, quali
     """Warp would, at every start, for values of ``wp.static`` that hang on a loop's variable."""
     found: list[wp.Kernel] = []
 
-    def listed(kernels, device, progress=None):
+    def listed(kernels, device, progress=None, **_):
         found.extend(kernels)
         raise _Listed
 
@@ -200,7 +200,7 @@ if sys.argv[1] == "once":
 from warp_ar.engine import scheduler
 from warp_ar.engine.pipeline import Pipeline
 
-def named(kernels, device, progress=None):
+def named(kernels, device, progress=None, **_):
     for kernel in kernels:
         print(kernel.module.get_module_identifier(1))
     print(calls)

@@ -41,8 +41,10 @@ def hurry_compilers(device: str) -> None:
 
     from warp_ar.device import start_warp
     from warp_ar.engine.modules import parse_headers_ahead, remember_references
+    from warp_ar.engine.tiers import begin_quickly
 
     start_warp()
     remember_references()
+    begin_quickly()
     if device == "cpu" or not wp.is_cuda_available():
         parse_headers_ahead()

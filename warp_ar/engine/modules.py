@@ -26,6 +26,7 @@ from typing import Any
 import warp as wp
 
 from warp_ar.device import compiling, exclusive, usable_cores
+from warp_ar.engine.tiers import QUICK_FLAGS, choose, compile_better, digest
 
 Progress = Callable[[int, int], None]
 """Told how many of how many modules are compiled, first with 0; not called where all were compiled before."""
@@ -36,23 +37,35 @@ _HEADER_WAIT = 10.0
 """Seconds that a thread waits for another's headers before it parses them itself."""
 
 
-def load_modules(kernels: Iterable[wp.Kernel], device: Any, progress: Progress | None = None) -> None:
+def load_modules(
+    kernels: Iterable[wp.Kernel],
+    device: Any,
+    progress: Progress | None = None,
+    *,
+    blocks: Iterable[tuple[wp.Kernel, int]] = (),
+) -> None:
     """Compile the modules of ``kernels`` where they are not in the cache, and load them.
 
     Args:
         kernels: Of a plan, in the order of its stages.
         device: Warp device.
         progress: Told after each module; on the caller's thread.
+        blocks: Kernels that CUDA runs in blocks of another size than its usual one, and that size.
     """
-    found = dict.fromkeys(kernel.module for kernel in kernels)
+    kernels, blocks = list(kernels), list(blocks)
+    found: dict[tuple[Any, int | None], None] = dict.fromkeys((kernel.module, None) for kernel in kernels)
+    found |= dict.fromkeys(((kernel.module, size) for kernel, size in blocks))
     with compiling():
-        missing = [module for module in found if not _is_cached(module, device)]
+        choose([*kernels, *(kernel for kernel, _ in blocks)], device)
+        missing = [variant for variant in found if not _is_cached(*variant, device)]
         if missing:
             # The last stages have the longest kernels: begun last they would keep one thread busy alone.
             _compile(missing[::-1], device, progress)
-        for module in found:
+        for module, size in found:
             with exclusive(device):
-                _load(module, device)
+                _load(module, device, size)
+        if device.is_cpu:
+            compile_better(_Headers([]).store)
 
 
 def parse_headers_ahead() -> None:
@@ -100,29 +113,32 @@ def _is_own(module: Any) -> bool:
     return str(module.__name__).startswith("warp_ar.")
 
 
-def _compile(modules: list[Any], device: Any, progress: Progress | None) -> None:
+def _compile(variants: list[tuple[Any, int | None]], device: Any, progress: Progress | None) -> None:
+    """Compile modules, each for a size of block; None means the usual one."""
     cores = usable_cores()
     while _AHEAD:
         _AHEAD.pop().join()
-    headers = _Headers({_flags(module) for module in modules}) if device.is_cpu else None
+    headers = _Headers({_flags(module) for module, _ in variants}) if device.is_cpu else None
 
-    modules = sorted(modules, key=_has_flags)
+    variants = _by_flags(variants)
 
-    def work(module: Any) -> None:
+    def work(module: Any, size: int | None) -> None:
         with headers.shared(_flags(module)) if headers is not None else contextlib.nullcontext():
             if device.is_cpu:
                 _load(module, device)
-            else:
+            elif size is None:
                 wp.compile_aot_module(module, device=device)
+            else:
+                _compile_blocks(module, device, size)
 
     if progress is not None:
-        progress(0, len(modules))
+        progress(0, len(variants))
     try:
-        with ThreadPoolExecutor(min(cores, len(modules)), "warp_ar-compile") as pool:
-            for done, job in enumerate(as_completed([pool.submit(work, module) for module in modules]), 1):
+        with ThreadPoolExecutor(min(cores, len(variants)), "warp_ar-compile") as pool:
+            for done, job in enumerate(as_completed([pool.submit(work, *variant) for variant in variants]), 1):
                 job.result()
                 if progress is not None:
-                    progress(done, len(modules))
+                    progress(done, len(variants))
     finally:
         if headers is not None:
             headers.close()
@@ -134,17 +150,27 @@ def _flags(module: Any) -> str:
     return str(wp.config.cpu_compiler_flags if own is None else own)
 
 
-def _has_flags(module: Any) -> bool:
-    return module.options.get("cpu_compiler_flags") is not None
+def _by_flags(variants: list[tuple[Any, int | None]]) -> list[tuple[Any, int | None]]:
+    """Modules of the same flags after each other: first what is marked as slow, which else has Warp's flags."""
+    quick = any(module.options.get("cpu_compiler_flags") == QUICK_FLAGS for module, _ in variants)
+    order = {QUICK_FLAGS: 0, None: 2 if quick else 0}
+    return sorted(variants, key=lambda variant: order.get(variant[0].options.get("cpu_compiler_flags"), 1))
 
 
-def _load(module: Any, device: Any) -> None:
-    wp.load_module(module, device=device, block_dim=1 if device.is_cpu else None)
+def _compile_blocks(module: Any, device: Any, size: int) -> None:
+    """Compile a module for CUDA blocks of a size that is not its usual one, as its first launch would."""
+    compile_module = getattr(module, "_compile", None)
+    if compile_module is not None:
+        compile_module(device, options=module.resolve_options(wp.config, block_dim=size))
 
 
-def _is_cached(module: Any, device: Any) -> bool:
+def _load(module: Any, device: Any, size: int | None = None) -> None:
+    wp.load_module(module, device=device, block_dim=1 if device.is_cpu else size)
+
+
+def _is_cached(module: Any, size: int | None, device: Any) -> bool:
     """Whether a module's binary is there; asking hashes what it is made of, which loading needs anyway."""
-    name = module.get_module_identifier(1 if device.is_cpu else None)
+    name = module.get_module_identifier(1 if device.is_cpu else size)
     return bool(wp.config.cache_kernels) and (Path(wp.config.kernel_cache_dir) / name).is_dir()
 
 
@@ -182,6 +208,11 @@ class _Headers:
         parsed = folders.get(threading.get_ident()) if isinstance(folders, dict) else None
         if parsed is not None and not _headers_in(self._store):
             _copy_headers(Path(parsed.name), self._store)
+
+    @property
+    def store(self) -> Path | None:
+        """Folder in which they are kept; None where they are not."""
+        return None if self._folder_of_thread is None else self._store
 
     @property
     def missing(self) -> bool:
@@ -241,15 +272,15 @@ class _Headers:
 
     def _rename(self, own: Path, flags: str) -> None:
         """Have headers that were parsed with other flags of LLVM found with these."""
-        wanted = _digest(flags)
+        wanted = digest(flags)
         headers = _headers_in(own)
         if any(wanted in path.name for path in headers):
             return
         for other in self._flags:
             if _clang_flags(other) == _clang_flags(flags):
                 for path in headers:
-                    if _digest(other) in path.name:
-                        _copy_file(path, own / path.name.replace(_digest(other), wanted))
+                    if digest(other) in path.name:
+                        _copy_file(path, own / path.name.replace(digest(other), wanted))
 
     def close(self) -> None:
         """When the threads are done: remove what Warp keeps for each of them."""
@@ -293,14 +324,6 @@ def _runtime() -> Any:
 def _clang_flags(flags: str) -> list[str]:
     """Flags without those of LLVM and of its passes."""
     return [word for word in flags.split() if not word.startswith("-mllvm=") and not word.endswith("vectorize")]
-
-
-def _digest(flags: str) -> str:
-    """By which Warp names headers: FNV-1a of the flags, a zero byte behind each."""
-    value = 0xCBF29CE484222325
-    for byte in "".join(f"{word}\0" for word in flags.split()).encode():
-        value = (value ^ byte) * 0x100000001B3 % (1 << 64)
-    return f"{value:016x}"
 
 
 def _headers_in(folder: Path) -> list[Path]:

@@ -183,9 +183,11 @@ class Scheduler:
                         if noted:  # else it did its work by other means, as it will in each frame
                             notes[id(step)] = noted
         found = [*self._first_launches, *(note for each in notes.values() for note in each)]
-        kernels = [note.kernel for note in found if note.kernel is not None and self._loads_ahead(note)]
+        launched = [(note.kernel, note.block_dim) for note in found if note.kernel is not None]
+        kernels = [kernel for kernel, size in launched if self._has_usual_blocks(kernel, size)]
+        blocks = [(kernel, size) for kernel, size in launched if not self._has_usual_blocks(kernel, size)]
         own = [serve_kernel] if self._threads > 1 and self.device.is_cpu else []
-        load_modules([*own, *kernels, *host_kernels], self.device, progress)
+        load_modules([*own, *kernels, *host_kernels], self.device, progress, blocks=blocks)
         with wp.ScopedDevice(self.device), translating(self.device):
             for note in self._first_launches:
                 note.do()
@@ -202,9 +204,9 @@ class Scheduler:
                 )
         self._prepared = True
 
-    def _loads_ahead(self, note: Note) -> bool:
-        """On CUDA a module is compiled for a size of block; those of another than the usual load as they launch."""
-        return bool(self.device.is_cpu) or note.block_dim == note.kernel.module.options["block_dim"]
+    def _has_usual_blocks(self, kernel: wp.Kernel, size: int) -> bool:
+        """Whether a launch takes its module as that is compiled unasked; on CUDA blocks of another size do not."""
+        return bool(self.device.is_cpu) or size == kernel.module.options["block_dim"]
 
     def warm_up(self, progress: Progress | None = None) -> None:
         """Have every kernel compiled and loaded; on CUDA launch everything once, on whatever the arrays hold.
