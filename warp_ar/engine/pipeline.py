@@ -192,6 +192,7 @@ class Pipeline(Closing):
                 self._arrays,
                 self.device,
                 follows_gain=follows,
+                watches_ball=self.plan.features.recovered and not exposures,
                 linear=self.plan.needs("linear_frame"),
             )
             self._scheduler = Scheduler(

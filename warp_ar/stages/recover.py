@@ -243,6 +243,7 @@ class Recover(Stage):
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
         self._asks = now.frames <= EVERY_FRAME or (since > EVERY_SECONDS and (rested or now.waited >= EVERY_FRAME))
+        self._asks = self._asks and not self._arrays["ball_covered"]()
         if self._asks:
             now.waited, now.last = 0, seconds
 
