@@ -15,8 +15,8 @@ from warp_ar.stages.base import Arrays
 
 LIGHT_ARRAYS = ("environment_radiance", "environment_confidence", "environment_clipped")
 """What is remembered of the environment."""
-SCALED_ARRAYS = ("environment_radiance", "recover_recovered")
-"""Remembered radiance."""
+SCALED_ARRAYS = ("environment_radiance", "filled_radiance", "recover_recovered")
+"""Remembered radiance; the filled map is, while something covers a ball."""
 
 
 class CarriedLight:

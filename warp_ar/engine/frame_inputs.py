@@ -17,6 +17,7 @@ from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
+from warp_ar.input.cover import BallCover
 from warp_ar.input.drift import ExposureDrift
 from warp_ar.input.own_markers import Places
 from warp_ar.input.plate import Plate, decode_deep
@@ -68,6 +69,7 @@ class FrameInputs:
         device: Any,
         *,
         follows_gain: bool = False,
+        watches_ball: bool = False,
         linear: bool = False,
     ) -> None:
         """Allocate, and add to ``arrays`` what stages read.
@@ -78,6 +80,7 @@ class FrameInputs:
             arrays: Of the pipeline, empty.
             device: Warp device, the current one.
             follows_gain: Whether a drift of the camera's exposure and white balance is looked for.
+            watches_ball: Whether frames in which something covers a ball are told.
             linear: Whether some stage reads frames as linear radiance.
         """
         shape = (camera.height, camera.width)
@@ -99,6 +102,9 @@ class FrameInputs:
         self.saturation = SaturationLevels()
         """Codes at which channels saturate, as frames have told so far."""
         self._drift = ExposureDrift(scene, camera) if follows_gain and scene.has_marker else None
+        self._cover = BallCover(scene, camera) if watches_ball and scene.has_marker and scene.probes else None
+        self.covered = False
+        """Whether something covers a ball in the frame: it then tells nothing of the light."""
         self._saturation_is_known = False
         self._encoded = 0.0, self.saturation.levels.copy()
         self._bent = 0.0
@@ -131,6 +137,7 @@ class FrameInputs:
         add("reach", self.reach)
         add("seconds", lambda: float(params["time"][0]))
         add("gain", lambda: self.gain)
+        add("ball_covered", lambda: self.covered)
 
     @property
     def gain(self) -> npt.NDArray[np.float64]:
@@ -158,6 +165,8 @@ class FrameInputs:
 
     def continue_from(self, other: FrameInputs) -> None:
         """Go on with what another pipeline's frames have told of the same camera's gain and tone curve."""
+        if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
+            self._cover = other._cover
         if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
             return
         self._drift = other._drift
@@ -225,7 +234,9 @@ class FrameInputs:
         params["frame_index"][0] = frame.index
         params["environment_reset"][0] = reset
         self.block.upload()
-        self._note_saturation(frame)
+        self.covered = self._is_covered(frame, reset=reset)
+        if not self.covered:
+            self._note_saturation(frame)
         if self._take_picture(frame):
             touched.append("frame")
         if self._take_plate(frame):
@@ -238,6 +249,15 @@ class FrameInputs:
         self.saturation.levels = np.asarray(levels)
         self._saturation_is_known = True
         self._write_decode()
+
+    def _is_covered(self, frame: SeenFrame, *, reset: bool) -> bool:
+        """Whether something covers a ball, if the frame is on the host and light of former frames is known."""
+        if self._cover is None or frame.pose is None or isinstance(frame.image, wp.array):
+            return False
+        if reset:
+            self._cover.forget()
+        discs = ball_discs(self._probes, self._camera, frame.pose)
+        return self._cover.observe(frame.image, discs, frame.pose, frame.seconds, self.gain)
 
     def _note_saturation(self, frame: SeenFrame) -> None:
         """Look where channels saturate, if the frame is on the host and shows a ball."""

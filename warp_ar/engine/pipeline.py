@@ -209,7 +209,15 @@ class Pipeline(Closing):
         self._arrays = Arrays()
         self._light = CarriedLight(self._arrays, wanted="environment" in self.plan.request.outputs)
         deep = self.plan.needs("linear_frame")
-        self.inputs = FrameInputs(self.scene, self.camera, self._arrays, self.device, follows_gain=follows, linear=deep)
+        self.inputs = FrameInputs(
+            self.scene,
+            self.camera,
+            self._arrays,
+            self.device,
+            follows_gain=follows,
+            watches_ball=self.plan.features.recovered and not self.plan.request.exposures,
+            linear=deep,
+        )
         self._scheduler = Scheduler(self.plan, self._arrays, self.device, bands=bands, profile=profile, culling=culling)
         short = self.plan.needs("short_frames")
         self._short = ShortFrames(self.plan.features, self._arrays, self.device) if short else None

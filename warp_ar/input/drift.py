@@ -89,7 +89,7 @@ class ExposureDrift:
         """What frames are of: the same frames tell those that watch the same, the same."""
         self._camera = camera
         self._plain = decode_table(camera.transfer).astype(np.float64)
-        self._points, self._is_card, self._is_ink = _still_points(scene)
+        self._points, self._is_card, self._is_ink = still_points(scene)
         self._first = np.full((len(self._points), 3), np.nan)
         self._first_gain = np.ones_like(self._first)
         self._moving, self._last, self._disagreed = False, -np.inf, 0
@@ -119,7 +119,7 @@ class ExposureDrift:
         if not self._moving and abs(seconds - self._last) < STEADY_SECONDS:
             return False
         self._last = seconds
-        codes = self._shown(image, pose)
+        codes = codes_around(image, self._camera, pose, self._points)
         before, contrast = self.gain, self.contrast
         if self._asks_contrast and not np.isfinite(self._first).any():
             self.contrast = self._print_contrast(codes)
@@ -210,27 +210,34 @@ class ExposureDrift:
                 return float(contrast)
         return float(CONTRASTS[-1])
 
-    def _shown(self, image: NDArray[np.uint8], pose: Pose) -> Array:
-        """Mean codes around points, NaN where they are not seen or do not tell, (n, 3)."""
-        camera = self._camera
-        result = np.full((len(self._points), 3), np.nan)
-        local = self._points @ pose.rotation.T + pose.translation
-        ahead = np.flatnonzero(local[:, 2] > 1e-6)
-        if len(ahead) == 0:
-            return result
-        zero = np.zeros(3)
-        pixels = cv2.projectPoints(local[ahead], zero, zero, camera.matrix(), np.array(camera.distortion))[0][:, 0]
-        at = np.round(np.clip(pixels, -1e6, 1e6)).astype(np.int64)
-        inside = ((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1)
-        ahead, at = ahead[inside], at[inside]
-        around = at[:, None] + _OFFSETS
-        codes = image[around[..., 1], around[..., 0]]
-        tells = ((codes > DARK) & (codes < BRIGHT)).all(axis=(1, 2))
-        result[ahead[tells]] = codes[tells].mean(axis=1)
+
+def codes_around(image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array) -> Array:
+    """Mean codes around points, NaN where they are not seen or do not tell, (n, 3).
+
+    Args:
+        image: uint8 RGB (height, width, 3).
+        camera: Of the frame.
+        pose: ``camera_from_world``.
+        points: Metres, (n, 3).
+    """
+    result = np.full((len(points), 3), np.nan)
+    local = points @ pose.rotation.T + pose.translation
+    ahead = np.flatnonzero(local[:, 2] > 1e-6)
+    if len(ahead) == 0:
         return result
+    zero = np.zeros(3)
+    pixels = cv2.projectPoints(local[ahead], zero, zero, camera.matrix(), np.array(camera.distortion))[0][:, 0]
+    at = np.round(np.clip(pixels, -1e6, 1e6)).astype(np.int64)
+    inside = ((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1)
+    ahead, at = ahead[inside], at[inside]
+    around = at[:, None] + _OFFSETS
+    codes = image[around[..., 1], around[..., 0]]
+    tells = ((codes > DARK) & (codes < BRIGHT)).all(axis=(1, 2))
+    result[ahead[tells]] = codes[tells].mean(axis=1)
+    return result
 
 
-def _still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+def still_points(scene: Scene) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """Points of the card and of planes, not under boxes or beside balls, (n, 3); which are its paper, which its ink."""
     cells, white, _, outline = printed_cells(scene.marker)
     low, high = outline.min(axis=0)[:2], outline.max(axis=0)[:2]

@@ -53,7 +53,7 @@ class Accumulate(Stage):
         }
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
-        """Change first, then the mean."""
+        """Change first, then the mean; neither of a frame in which something covers a ball."""
         height = self.request.quality.environment_height
         radiance, confidence, clipped = (arrays[name] for name in self.wiring.reads[:3])
 
@@ -80,4 +80,7 @@ class Accumulate(Stage):
                 rows=rows,
             )
 
-        return [Pass(measure), Pass(follow, rows=height)]
+        def tells() -> bool:
+            return not arrays["ball_covered"]()
+
+        return [Pass(measure, enabled=tells), Pass(follow, rows=height, enabled=tells)]

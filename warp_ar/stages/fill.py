@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -55,6 +56,7 @@ class Fill(Stage):
         """Down the pyramid, up again, and on CPU, where reading costs nothing, the change since readers last ran."""
         self._arrays = arrays
         self._on_cpu = device.is_cpu
+        self._is_filled = self._holds = False
         height = self.request.quality.environment_height
         # What one exposure gives is no more than this. Of merged ones, lamps are spread into the unseen no further.
         most = math.inf
@@ -95,7 +97,14 @@ class Fill(Stage):
             )
 
         passes = [Pass(seed, rows=height), Pass(see, rows=height), Pass(push_pull), Pass(finish, rows=height)]
-        return [*passes, Pass(measure, rows=height)] if self._on_cpu else passes
+        if self._on_cpu:
+            passes.append(Pass(measure, rows=height))
+        return [dataclasses.replace(one, enabled=lambda: not self._holds) for one in passes]
+
+    def begin(self) -> None:
+        """Keep the last map where something covers a ball: it covers what the frame shows behind it as well."""
+        self._holds = self._is_filled and self._arrays["ball_covered"]()
+        self._is_filled = True
 
     def changed(self, name: str) -> bool:
         """Whether some texel moved by more than ``CHANGE_FLOOR + CHANGE_SHARE * value`` since readers last ran.

@@ -268,6 +268,7 @@ class Recover(Stage):
         self._asks = now.frames <= EVERY_FRAME or (since > interval and (rested or now.waited >= EVERY_FRAME))
         if self.request.real_time and now.pending is not None and not self._arrives:
             self._asks = False
+        self._asks = self._asks and not self._arrays["ball_covered"]()
         if self._asks:
             now.waited, now.last = 0, seconds
 

@@ -1,0 +1,200 @@
+"""A hand, or whatever else, that comes between the camera and a mirror ball: what the ball then shows is no light.
+
+What covers a ball covers the surface beside it in the picture as well, and leaves the light alone. So a ball is taken
+to be covered in a frame where, against the frames before,
+
+- points all over the card and the planes show on the median what they showed, within ``QUIET``: the light is the same;
+- of points of planes that are seen beside the ball, ``NEAR_SHARE`` have changed by more than ``CHANGED``;
+- of the ball's disc in the picture, ``DISC_SHARE`` has.
+
+Points keep their places in the world, the disc's cells their places in the disc: a camera that moves turns what the
+ball mirrors, but not what planes show. An emitter that changes is seen in the median, or neither beside the ball. What
+stays for longer than ``PATIENCE`` belongs to the scene and is believed. Changes are logarithms per channel, with the
+camera's own gain taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from warp_ar.input.drift import codes_around, still_points
+from warp_ar.kernels.color import decode_table
+from warp_ar.scene import Camera, Scene
+from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.pose import Pose
+
+Array = NDArray[np.float64]
+
+QUIET = 0.07
+"""Logarithm by which the median of all points may have changed."""
+CHANGED = 0.4
+"""Logarithm, in the channel that changed most, from which a point or a cell has changed."""
+NEAR_SHARE = 0.15
+"""Share of the points beside a ball that have."""
+DISC_SHARE = 0.15
+"""Share of a ball's cells that have."""
+EVERY = 3
+"""Of the points all over, one of so many is looked at."""
+LEAST_POINTS = 24
+"""Points that must be seen again, all over."""
+LEAST_NEAR = 8
+"""Points that must be seen again beside a ball."""
+PATIENCE = 1.5
+"""Seconds after which what covers a ball is taken for a part of the scene."""
+MEMORY = 0.3
+"""Time constant in seconds with which remembered codes follow frames."""
+RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
+"""Radii of the circles on planes around a ball on which points lie, over the ball's."""
+BESIDE = (1.1, 3.0)
+"""Distances in the picture from a ball's centre at which points are beside it, over the radius of its disc."""
+CELLS = 16
+"""Cells along a ball's disc."""
+DARK = 0.02
+"""Radiance that is added before the logarithm: below it is noise."""
+
+
+class BallCover:
+    """Tells, frame after frame, whether something covers a ball."""
+
+    def __init__(self, scene: Scene, camera: Camera) -> None:
+        """Choose points.
+
+        Args:
+            scene: With a marker and a ball.
+            camera: Of the frames.
+        """
+        self.watches = (camera, scene.marker, scene.proxies, scene.probes)
+        """What frames are of: the same frames tell those that watch the same, the same."""
+        self._camera = camera
+        self._table = decode_table(camera.transfer).astype(np.float64)
+        self._points = np.concatenate([still_points(scene)[0][::EVERY], _points_around(scene)])
+        middle = 2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0
+        self._in_disc = np.hypot(middle, middle[:, None]).ravel() < 0.9
+        self.forget()
+
+    def forget(self) -> None:
+        """Take the next frame for the first."""
+        self._shown: Array | None = None
+        self._discs: list[Array] = []
+        self._last = self._since = 0.0
+        self._covered = False
+
+    def observe(
+        self,
+        image: NDArray[np.uint8],
+        discs: Sequence[tuple[float, float, float]],
+        pose: Pose,
+        seconds: float,
+        gain: Array,
+    ) -> bool:
+        """Look at a frame.
+
+        Args:
+            image: uint8 RGB (height, width, 3).
+            discs: Centre x, y and radius of each ball in the picture, pixels.
+            pose: ``camera_from_world``.
+            seconds: When it was taken.
+            gain: Of the camera, RGB.
+
+        Returns:
+            Whether a ball is covered.
+        """
+        shown = self._logarithm(codes_around(image, self._camera, pose, self._points), gain)
+        own = [self._logarithm(self._cells(image, disc), gain) for disc in discs]
+        if self._shown is None or len(own) != len(self._discs):
+            self._shown, self._discs, self._last, self._covered = shown, own, seconds, False
+            return False
+        was, self._covered = self._covered, self._is_covered(shown, own, discs, pose)
+        if self._covered and not was:
+            self._since = seconds
+        if self._covered and abs(seconds - self._since) > PATIENCE:
+            self._shown, self._discs, self._covered = shown, own, False
+        if not self._covered:
+            rate = 1.0 - np.exp(-abs(seconds - self._last) / MEMORY)
+            self._shown = _follow(self._shown, shown, rate)
+            self._discs = [_follow(before, now, rate) for before, now in zip(self._discs, own, strict=True)]
+        self._last = seconds
+        return self._covered
+
+    def _is_covered(
+        self, shown: Array, own: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
+    ) -> bool:
+        """Whether a ball is, by what points and discs show now and what they are remembered to show."""
+        assert self._shown is not None
+        change = shown - self._shown
+        seen = ~np.isnan(change).any(axis=1)
+        if seen.sum() < LEAST_POINTS:
+            return False
+        median = np.median(change[seen], axis=0)
+        if np.abs(median).max() > QUIET:
+            return False
+        is_other = np.abs(change[seen] - median).max(axis=1) > CHANGED
+        if not is_other.any():
+            return False
+        local = self._points[seen] @ pose.rotation.T + pose.translation
+        zero = np.zeros(3)
+        at = cv2.projectPoints(local, zero, zero, self._camera.matrix(), np.array(self._camera.distortion))[0][:, 0]
+        for (x, y, radius), before, now in zip(discs, self._discs, own, strict=True):
+            away = np.hypot(at[:, 0] - x, at[:, 1] - y) / radius
+            near = (away > BESIDE[0]) & (away < BESIDE[1])
+            if near.sum() < LEAST_NEAR or is_other[near].mean() < NEAR_SHARE:
+                continue
+            cells = np.abs(now - before).max(axis=1)[self._in_disc]
+            if (np.nan_to_num(cells) > CHANGED).mean() >= DISC_SHARE:
+                return True
+        return False
+
+    def _cells(self, image: NDArray[np.uint8], disc: tuple[float, float, float]) -> Array:
+        """Mean codes of a disc's cells, NaN beyond the picture, (cells, 3)."""
+        x, y, radius = disc
+        radius = max(radius, 1.0)
+        if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):
+            return np.full((CELLS * CELLS, 3), np.nan)
+        scale = 2.0 * radius / CELLS
+        # Half a cell of blur by sampling four places in each.
+        steps = np.arange(2 * CELLS) * 0.5 + 0.25
+        u, v = np.meshgrid(x - radius + scale * steps, y - radius + scale * steps)
+        column, row = np.asarray(np.round(u), np.int64), np.asarray(np.round(v), np.int64)
+        inside = (row >= 0) & (column >= 0) & (row < image.shape[0]) & (column < image.shape[1])
+        codes = np.full((*inside.shape, 3), np.nan)
+        codes[inside] = image[row[inside], column[inside]]
+        return np.asarray(codes.reshape(CELLS, 2, CELLS, 2, 3).mean(axis=(1, 3)).reshape(-1, 3))
+
+    def _logarithm(self, codes: Array, gain: Array) -> Array:
+        """Of the radiance that codes stand for at gain 1, (n, 3)."""
+        values = np.stack([np.interp(codes[:, c], np.arange(256), self._table[:, c]) for c in range(3)], -1)
+        return np.asarray(np.log(values / gain + DARK))
+
+
+def _follow(before: Array, now: Array, rate: float) -> Array:
+    """What is remembered, drawn toward what is seen now, where that is seen."""
+    followed = np.where(np.isnan(before), now, before + rate * (now - before))
+    return np.asarray(np.where(np.isnan(followed), before, followed))
+
+
+def _points_around(scene: Scene) -> Array:
+    """Points of planes around balls, none under a box, (n, 3)."""
+    turn = np.arange(24) * np.pi / 12
+    circle = np.stack([np.cos(turn), np.sin(turn)], -1)
+    found = [np.zeros((0, 3))]
+    for plane in scene.proxies:
+        if plane.shape != "plane" or plane.marker is not None:
+            continue
+        rotation, at = rotation_matrix(plane.rotate), np.array(plane.at)
+        for probe in scene.probes:
+            if probe.marker is not None:
+                continue
+            middle = (rotation.T @ (np.array(probe.center) - at))[:2]
+            local = np.concatenate([middle + ratio * probe.radius * circle for ratio in RINGS])
+            local = local[(np.abs(local) < 0.5 * np.array(plane.size)).all(axis=1)]
+            points = at + np.column_stack([local, np.zeros(len(local))]) @ rotation.T
+            for box in scene.proxies:
+                if box.shape == "box" and box.marker is None:
+                    within = (points - np.array(box.at)) @ rotation_matrix(box.rotate)
+                    points = points[~(np.abs(within) < 0.5 * np.array(box.size) + 0.01).all(axis=1)]
+            found.append(points)
+    return np.concatenate(found)
