@@ -86,13 +86,25 @@ class VisibleObjects:
 @wp.func
 def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
     """World point in the shape's coordinates."""
+    if shape.stretch != 0.0:
+        return shape.inverse * (point - shape.position) / shape.scale
     return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
 
 
 @wp.func
 def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
     """World direction in the shape's coordinates, divided by the scale so that t keeps its meaning."""
+    if shape.stretch != 0.0:
+        return shape.inverse * direction / shape.scale
     return wp.transpose(shape.rotation) * direction / shape.scale
+
+
+@wp.func
+def to_world_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
+    """Unit normal of the shape in the world: normals go by the inverse's transpose."""
+    if shape.stretch != 0.0:
+        return wp.normalize(wp.transpose(shape.inverse) * normal)
+    return shape.rotation * normal
 
 
 @wp.func
@@ -511,12 +523,14 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
                             normal = bumped(scene, shape, hit, normal, to_local_vector(shape, direction))
                 arm = shape.rotation * (shape.scale * p)
                 hit.point = arm + shape.position
-                hit.normal = shape.rotation * normal
-                hit.geometric_normal = shape.rotation * geometric
+                hit.normal = to_world_normal(shape, normal)
+                hit.geometric_normal = to_world_normal(shape, geometric)
                 # World coordinates are rounded once on the way out and twice on the way back into the shape; within the
                 # shape, rotating there and back, placing the point and testing the surface again take some 20 roundings
                 # of its size.
                 size = shape.scale * wp.length(shape.extent)
+                if shape.stretch != 0.0:
+                    size *= shape.stretch  # what is rounded along the shortest way counts along the longest
                 hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
         return hit
 

@@ -35,6 +35,7 @@ from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names
 from warp_ar.scene.object_materials import look_of as materials_of
+from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements
 from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
 from warp_ar.signature import sign_png
 from warp_ar.srgb import decode_srgb, encode_srgb
@@ -113,10 +114,14 @@ class Shot:
     def bodies(self) -> list[Body]:
         """Virtual objects, then proxies, by the names of ``surface_names``."""
         names, scene = surface_names(self.scene), self.scene
-        items: Sequence[Object | Proxy] = (*scene.objects, *scene.proxies)
+        items: Sequence[ObjectShape | Proxy] = (*object_shapes(scene), *scene.proxies)
         return [self._body(name, item) for name, item in zip(names, items, strict=False)]
 
-    def _body(self, name: str, item: Object | Proxy) -> Body:
+    def _body(self, name: str, shape: ObjectShape | Proxy) -> Body:
+        item = shape if isinstance(shape, Proxy) else shape.item
+        if isinstance(shape, ObjectShape) and shape.moving is not None and shape.mesh is not None:
+            placed = [part_placements(shape.item, shape.moving, seconds)[shape.part] for seconds in self.seconds]
+            return Body(name, shape.mesh, look_of(shape.item, shape.mesh), False, tuple(placed))
         mesh = mesh_of(item)
         if isinstance(item, Proxy):
             at = (placement(rotation_matrix(item.rotate), np.array(item.at)),)
@@ -232,8 +237,8 @@ def texture_file(path: Path, name: str) -> Path:
 def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
     """All of them, by the names of their bodies."""
     found = {}
-    for name, item in zip(surface_names(scene), scene.objects, strict=False):
-        mesh = mesh_of(item)
+    for name, shape in zip(surface_names(scene), object_shapes(scene), strict=False):
+        item, mesh = shape.item, shape.mesh or mesh_of(shape.item)
         if mesh.uvs is not None and look_of(item, mesh).texture is not None:
             found[name] = texture_file(path, name)
     return found

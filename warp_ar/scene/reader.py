@@ -44,6 +44,7 @@ from warp_ar.scene.description import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Play,
     PoseSpec,
     Probe,
     Proxy,
@@ -62,7 +63,7 @@ from warp_ar.scene.keys import (
     PROXY_KEYS,
     keys_of,
 )
-from warp_ar.scene.mesh_files import MESH_SUFFIXES
+from warp_ar.scene.mesh_files import GLTF_SUFFIXES, MESH_SUFFIXES
 from warp_ar.scene.messages import LARGEST, MOST_PIXELS, SMALLEST, nearest
 from warp_ar.scene.pose_file import check_rotation, load_poses, pose_of_position, rotation_of_quaternion
 from warp_ar.scene.table import Table
@@ -313,7 +314,27 @@ def _read_object(table: _Table) -> Object:
         scale=table.number("scale", Object.scale, low=SMALLEST),
         material=_read_material(table) if "material" in table else Object.material,
         animate=_read_animation(table),
+        play=_read_play(table, shape),
         marker=_read_own_marker(table),
+    )
+
+
+def _read_play(parent: _Table, shape: str) -> Play | None:
+    if "play" not in parent:
+        return None
+    if shape != "mesh" or _read_mesh_path(parent).suffix.lower() not in GLTF_SUFFIXES:
+        parent.fail("play", f"plays an animation of a file; give one that ends in {' or '.join(GLTF_SUFFIXES)}")
+    table = parent.inner("play", parent.data["play"], keys_of(Play))
+    animation: str | int = Play.animation
+    if isinstance(table.data.get("animation"), str):
+        animation = table.text("animation", right="an animation's name, or its number from 0 on")
+    elif "animation" in table:
+        animation = table.integer("animation", low=0)
+    return Play(
+        animation=animation,
+        loop=table.flag("loop", Play.loop),
+        start=table.number("start", Play.start, unit="seconds"),
+        speed=table.number("speed", Play.speed, low=SMALLEST),
     )
 
 

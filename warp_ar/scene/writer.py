@@ -14,6 +14,7 @@ from warp_ar.scene.description import (
     CapturedLight,
     Light,
     Object,
+    Play,
     PoseSpec,
     Probe,
     Proxy,
@@ -80,7 +81,10 @@ def dumps_scene(scene: Scene, folder: str | Path | None = None) -> str:
             raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
         model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
         lines += ["", "[[object]]", *table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
-        lines += [*animation(item), *own_marker(item)]
+        lines += animation(item)
+        if item.play is not None:
+            lines += [f"play = {value({key: getattr(item.play, key) for key in keys_of(Play)})}"]
+        lines += own_marker(item)
         lines += [
             "",
             "[object.material]",
