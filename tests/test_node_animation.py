@@ -250,9 +250,9 @@ def test_a_scene_file_says_it(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.ply").write_bytes(b"ply")
     head = "schema = 1\n[camera]\nwidth = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\n[marker]\nsize = 0.08\n"
     text = head + '[[object]]\nshape = "mesh"\nfile = "a.glb"\n[object.play]\nanimation = "go"\nloop = false\nstart = 2'
-    scene = loads_scene(text, tmp_path)
+    scene = loads_scene(text, tmp_path / "s.toml")
     assert scene.objects[0].play == Play("go", loop=False, start=2.0)
-    assert loads_scene(dumps_scene(scene, tmp_path), tmp_path).objects == scene.objects
+    assert loads_scene(dumps_scene(scene, tmp_path), tmp_path / "s.toml").objects == scene.objects
     for wrong, message in (
         (text.replace("a.glb", "a.ply"), r"play .*give one that ends in \.glb or \.gltf"),
         (text.replace('"go"', "-1"), r"object\.play\.animation = -1"),
@@ -260,7 +260,7 @@ def test_a_scene_file_says_it(tmp_path: pathlib.Path) -> None:
         (text.replace("start", "speed").replace("2", "0").replace("schema = 1", "schema = 1"), "speed"),
     ):
         with pytest.raises(SceneError, match=message):
-            loads_scene(wrong, tmp_path)
+            loads_scene(wrong, tmp_path / "s.toml")
 
 
 def accessor(made: Gltf, key: str) -> dict[str, Any]:

@@ -274,10 +274,10 @@ class _Builder:
             "roughnessFactor": look.roughness,
         }
         if look.texture is not None and textured:
-            image = self._add_image(encode_texture(look.texture))
-            self._tree.setdefault("textures", []).append({"source": image})
-            surface["baseColorTexture"] = {"index": len(self._tree["textures"]) - 1}
+            surface["baseColorTexture"] = self._add_texture(look.texture)
         material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        if any(look.emission):
+            self._add_emission(material, look, textured=textured)
         if look.specular is not None:
             self._use("KHR_materials_specular")
             factor = max(look.specular) / _DIELECTRIC
@@ -285,9 +285,24 @@ class _Builder:
             strength = min(1.0, factor)
             color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in look.specular]
             specular = {"specularFactor": strength, "specularColorFactor": color}
-            material["extensions"] = {"KHR_materials_specular": specular}
+            material.setdefault("extensions", {})["KHR_materials_specular"] = specular
         self._tree.setdefault("materials", []).append(material)
         return len(self._tree["materials"]) - 1
+
+    def _add_texture(self, picture: npt.NDArray[np.uint8]) -> dict[str, int]:
+        image = self._add_image(encode_texture(picture))
+        self._tree.setdefault("textures", []).append({"source": image})
+        return {"index": len(self._tree["textures"]) - 1}
+
+    def _add_emission(self, material: dict[str, Any], look: Look, *, textured: bool) -> None:
+        """Factors go to 1 at most; what is beyond is the strength's."""
+        material["emissiveFactor"] = list(_bounded(look.emission))
+        if look.glow is not None and textured:
+            material["emissiveTexture"] = self._add_texture(look.glow)
+        if max(look.emission) > 1.0:
+            self._use("KHR_materials_emissive_strength")
+            strength = {"emissiveStrength": max(look.emission)}
+            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = strength
 
     def _add_image(self, png: bytes) -> int:
         self._tree.setdefault("images", []).append({"bufferView": self._view(png), "mimeType": "image/png"})
