@@ -1,8 +1,9 @@
 """A mesh file as Mitsuba's path tracer shows it: its ``principled`` with the file's factors and textures.
 
-Metallic-roughness is ``principled`` with ``specular`` 0.5 (F0 = 0.04); normal maps are ``normalmap``, cut into triangles
-that carry their picture and those that carry its mirror image; alpha is ``mask``; what emits is an area light. Not
-shown: occlusion textures (paths find it), vertex colours beside a texture, wrap modes other than repeat and clamp.
+Metallic-roughness is ``principled`` with ``specular`` 0.5 (F0 = 0.04); normal maps are ``normalmap``, cut into
+triangles that carry their picture and those that carry its mirror image; alpha is ``mask``; what emits is an area
+light. Not shown: occlusion textures (paths find it), vertex colours beside a texture, the second wrap mode where two
+differ, the second set of texture coordinates.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def render_mitsuba(mesh: Mesh, camera: Camera, pose: Pose, radiance: Array, samp
         )
 
     path = {"type": "path", "max_depth": DEPTH}
-    emits = any("emitter" in shape for shape in shapes.values())
+    emits = any(shape.is_emitter() for shape in shapes.values())
     whole = shot(shapes, sky, {**path, "hide_emitters": not emits}, samples)
     if not emits:
         return np.maximum(whole[..., :3], 0.0), np.clip(whole[..., 3], 0.0, 1.0)
