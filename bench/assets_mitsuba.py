@@ -93,7 +93,8 @@ def _shape(mesh: Mesh, mine: Array, material: MeshMaterial, *, flip: bool, close
     colored = mesh.colors is not None and material.base is None
     made = mi.Mesh("part", len(used), len(faces), has_vertex_normals=True, has_vertex_texcoords=True, props=props)
     if colored:
-        made.add_attribute("vertex_color", 3, mesh.colors[used, :3].astype(np.float32).ravel())  # type: ignore[index]
+        colors = mesh.colors[used, :3] * np.array(material.surface.base_color)  # type: ignore[index, union-attr]
+        made.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     values = mi.traverse(made)
     values["vertex_positions"] = mesh.vertices[used].ravel()
     values["vertex_normals"] = mesh.normals[used].ravel()

@@ -255,9 +255,9 @@ def test_a_scene_file_says_it(tmp_path: pathlib.Path) -> None:
     assert loads_scene(dumps_scene(scene, tmp_path), tmp_path / "s.toml").objects == scene.objects
     for wrong, message in (
         (text.replace("a.glb", "a.ply"), r"play .*give one that ends in \.glb or \.gltf"),
-        (text.replace('"go"', "-1"), r"object\.play\.animation = -1"),
+        (text.replace('"go"', "-1"), r"object\[0\]\.play\.animation = -1"),
         (text.replace("loop", "lop"), r'did you mean "loop"'),
-        (text.replace("start", "speed").replace("2", "0").replace("schema = 1", "schema = 1"), "speed"),
+        (text.replace("start = 2", "speed = 0"), r"play\.speed = 0"),
     ):
         with pytest.raises(SceneError, match=message):
             loads_scene(wrong, tmp_path / "s.toml")

@@ -96,6 +96,7 @@ def trace_config(scene: scenes.Scene) -> TraceConfig:
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
         proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
         detail=any(look.holed or look.bumpy for look in looks),
+        stretched=any(item.play is not None for item in scene.objects),
     )
 
 
