@@ -110,4 +110,3 @@ def shape_label(shape: ObjectShape) -> str:
     """Words for a shape, as in the name of its matte."""
     name = shape.item.file.stem if shape.item.file else shape.item.shape
     return f"object_{shape.index}_{name}" + (f"_part_{shape.part}" if shape.part else "")
-
