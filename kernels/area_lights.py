@@ -214,11 +214,17 @@ def draw_on_triangle(
     p = wp.mesh_get_point(shape.mesh, 3 * face) - eye
     q = wp.mesh_get_point(shape.mesh, 3 * face + 1) - eye
     r = wp.mesh_get_point(shape.mesh, 3 * face + 2) - eye
+    facing = float(1.0)
+    if shape.stretch != 0.0:  # angles are the world's: the triangle is taken there, but for its scale
+        p = shape.rotation * p
+        q = shape.rotation * q
+        r = shape.rotation * r
+        facing = wp.where(wp.determinant(shape.rotation) < 0.0, -1.0, 1.0)
     across = wp.cross(q - p, r - p)
     doubled = wp.length(across)
     if doubled <= 0.0:
         return sample
-    normal = across / doubled
+    normal = facing * across / doubled
     height = -wp.dot(normal, p)  # of the point over the triangle's plane
     if (front and height <= 0.0) or wp.abs(height) <= LEAST_HEIGHT * wp.sqrt(doubled):
         return sample
@@ -252,7 +258,9 @@ def draw_on_triangle(
     material = shape.material
     if scene.triangle_materials.shape[0] > 0:
         material += scene.triangle_materials[corner / 3]
-    sample.wi = wp.normalize(shape.rotation * wi)
+    sample.wi = wp.normalize(wi)
+    if shape.stretch == 0.0:
+        sample.wi = wp.normalize(shape.rotation * wi)
     sample.distance = t * shape.scale
     sample.irradiance_normal = angle * emitted_radiance(scene, scene.materials[material], at)
     return sample
@@ -303,6 +311,10 @@ def light_as_point(scene: RayScene, light: AreaLight, point: wp.vec3) -> AreaSam
     sample.wi = away / distance
     share = 0.25 * (1.0 - flat) + wp.max(-wp.dot(shape.rotation * light.facing, sample.wi), 0.0)
     scale = shape.scale * shape.scale
+    if shape.stretch != 0.0:  # areas that face one way go by the cofactors; of all ways, by their mean
+        volume = wp.abs(wp.determinant(shape.rotation))
+        facing = volume * (wp.transpose(shape.inverse) * light.facing)
+        share = 0.25 * (1.0 - flat) * wp.pow(volume, 2.0 / 3.0) + wp.max(-wp.dot(facing, sample.wi), 0.0)
     sample.irradiance_normal = scale * share / (distance * distance) * light.power
     sample.distance = NEARLY * wp.max(distance - (1.0 - flat) * radius, 0.0)
     sample.object = light.object

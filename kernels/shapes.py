@@ -40,15 +40,45 @@ class Contact:
 
 
 @wp.func
+def to_rigid_point(shape: Shape, point: wp.vec3) -> wp.vec3:
+    """World point in the coordinates of a shape that is not stretched."""
+    return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
+
+
+@wp.func
+def to_rigid_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
+    """World direction in the coordinates of a shape that is not stretched; as ``to_local_vector``."""
+    return wp.transpose(shape.rotation) * direction / shape.scale
+
+
+@wp.func
 def to_local_point(shape: Shape, point: wp.vec3) -> wp.vec3:
     """World point in the shape's coordinates."""
-    return wp.transpose(shape.rotation) * (point - shape.position) / shape.scale
+    if shape.stretch != 0.0:
+        return shape.inverse * (point - shape.position) / shape.scale
+    return to_rigid_point(shape, point)
 
 
 @wp.func
 def to_local_vector(shape: Shape, direction: wp.vec3) -> wp.vec3:
     """World direction in the shape's coordinates, divided by the scale so that t keeps its meaning."""
-    return wp.transpose(shape.rotation) * direction / shape.scale
+    if shape.stretch != 0.0:
+        return shape.inverse * direction / shape.scale
+    return to_rigid_vector(shape, direction)
+
+
+@wp.func
+def to_world_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
+    """Unit normal of the shape in the world: normals go by the inverse's transpose."""
+    if shape.stretch != 0.0:
+        return wp.normalize(wp.transpose(shape.inverse) * normal)
+    return shape.rotation * normal
+
+
+@wp.func
+def to_rigid_normal(shape: Shape, normal: wp.vec3) -> wp.vec3:
+    """Unit normal of a shape that is not stretched in the world."""
+    return shape.rotation * normal
 
 
 @wp.func

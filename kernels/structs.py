@@ -86,7 +86,9 @@ class Shape:
     """A proxy or a virtual object: point_world = rotation (scale point_local) + position."""
 
     kind: wp.int32  # PLANE, BOX, MESH or SPHERE
-    rotation: wp.mat33
+    rotation: wp.mat33  # of a stretched MESH any linear map under which no vector grows
+    stretch: wp.float32  # 0: a rotation; else how much longer the longest image of a unit vector is than the shortest
+    inverse: wp.mat33  # of a stretched MESH's ``rotation``; else unused
     position: wp.vec3
     scale: wp.float32
     extent: (

@@ -31,6 +31,10 @@ from warp_ar.kernels.shapes import (
     sphere_uv,
     to_local_point,
     to_local_vector,
+    to_rigid_normal,
+    to_rigid_point,
+    to_rigid_vector,
+    to_world_normal,
 )
 from warp_ar.kernels.structs import BOX, MESH, PLANE, SPHERE, Hit, Probe, RayScene, Shape
 
@@ -87,16 +91,27 @@ class TraceConfig:
     """Kinds among the proxies."""
     detail: bool = False
     """Whether any object's triangles let rays pass or have normal maps."""
+    stretched: bool = False
+    """Whether any object may be stretched."""
 
     def general(self) -> TraceConfig:
         """For any scene with such triangles or without: each shape's kind is asked for as it is met."""
-        return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail)
+        return TraceConfig(ALL_KINDS, ALL_KINDS, self.detail, self.stretched)
 
 
 @functools.cache
-def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+def _ways(stretched: bool) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """Into a shape's coordinates, points and vectors, and normals out of them."""
+    if stretched:
+        return to_local_point, to_local_vector, to_world_normal
+    return to_rigid_point, to_rigid_vector, to_rigid_normal
+
+
+@functools.cache
+def _make_closest(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
     """Closest hit among shapes of the given kinds."""
-    label = "_".join(map(str, (*kinds, int(detail))))
+    label = "_".join(map(str, (*kinds, int(detail), int(stretched))))
+    local_point, local_vector, world_normal = _ways(stretched)
 
     @wp.func(name=f"closest_hit_{label}", module="unique")
     def closest_hit(
@@ -116,8 +131,8 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
             contact = Contact()
             for index in range(shapes.shape[0]):
                 shape = shapes[index]
-                o = to_local_point(shape, origin)
-                d = to_local_vector(shape, direction)
+                o = local_point(shape, origin)
+                d = local_vector(shape, direction)
                 t = FAR
                 if wp.static(SPHERE in kinds):
                     if shape.kind == SPHERE:
@@ -147,7 +162,7 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 
             if hit.shape >= 0:
                 shape = shapes[hit.shape]
-                p = to_local_point(shape, origin) + hit.t * to_local_vector(shape, direction)
+                p = local_point(shape, origin) + hit.t * local_vector(shape, direction)
                 geometric = wp.vec3(0.0, 0.0, 1.0)
                 normal = wp.vec3(0.0, 0.0, 1.0)
                 # Each kind puts the point back onto its surface: the error of t, large for a far origin, ends here.
@@ -192,15 +207,18 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
                         hit.corner = corner
                         hit.weights = wp.vec2(contact.u, contact.v)
                         if wp.static(detail):
-                            normal = bumped(scene, shape, hit, normal, to_local_vector(shape, direction))
+                            normal = bumped(scene, shape, hit, normal, local_vector(shape, direction))
                 arm = shape.rotation * (shape.scale * p)
                 hit.point = arm + shape.position
-                hit.normal = shape.rotation * normal
-                hit.geometric_normal = shape.rotation * geometric
+                hit.normal = world_normal(shape, normal)
+                hit.geometric_normal = world_normal(shape, geometric)
                 # World coordinates are rounded once on the way out and twice on the way back into the shape; within the
                 # shape, rotating there and back, placing the point and testing the surface again take some 20 roundings
                 # of its size.
                 size = shape.scale * wp.length(shape.extent)
+                if wp.static(stretched):
+                    if shape.stretch != 0.0:
+                        size *= shape.stretch  # what is rounded along the shortest way counts along the longest
                 hit.error = ROUNDING * (8.0 * wp.max(wp.abs(hit.point)) + 32.0 * size)
         return hit
 
@@ -208,14 +226,15 @@ def _make_closest(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 
 
 @functools.cache
-def _make_meets(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+def _make_meets(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
     """Whether a ray meets a shape of one of the given kinds."""
-    label = "_".join(map(str, (*kinds, int(detail))))
+    label = "_".join(map(str, (*kinds, int(detail), int(stretched))))
+    local_point, local_vector, _ = _ways(stretched)
 
     @wp.func(name=f"meets_{label}", module="unique")
     def meets(scene: RayScene, shape: Shape, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
-        o = to_local_point(shape, origin)
-        d = to_local_vector(shape, direction)
+        o = local_point(shape, origin)
+        d = local_vector(shape, direction)
         if wp.static(SPHERE in kinds):
             if shape.kind == SPHERE:
                 return intersect_sphere(shape.extent[0], o, d, t_max) < t_max
@@ -237,10 +256,10 @@ def _make_meets(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 
 
 @functools.cache
-def _make_any(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+def _make_any(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
     """Whether a ray meets any of the shapes of the given kinds."""
-    meets = _make_meets(kinds, detail)
-    label = "_".join(map(str, (*kinds, int(detail))))
+    meets = _make_meets(kinds, detail, stretched)
+    label = "_".join(map(str, (*kinds, int(detail), int(stretched))))
 
     @wp.func(name=f"any_hit_{label}", module="unique")
     def any_hit(
@@ -256,9 +275,9 @@ def _make_any(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 
 
 @functools.cache
-def _make_any_of_both(kinds: tuple[int, ...], detail: bool) -> wp.Function:
+def _make_any_of_both(kinds: tuple[int, ...], detail: bool, stretched: bool) -> wp.Function:
     """Whether a ray meets any object or proxy, both of the given kinds: one loop, for the walks in it are long code."""
-    meets = _make_meets(kinds, detail)
+    meets = _make_meets(kinds, detail, stretched)
 
     @wp.func(module="unique")
     def occluded(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> wp.bool:
@@ -279,9 +298,10 @@ def _make_any_of_both(kinds: tuple[int, ...], detail: bool) -> wp.Function:
 @functools.cache
 def make_trace(config: TraceConfig) -> Trace:
     """Functions that trace rays through a scene with the kinds of shape in ``config``; equal configs share them."""
-    closest_shape_object = _make_closest(config.objects, config.detail)
-    closest_shape_proxy = _make_closest(config.proxies, False)
-    any_object, any_proxy = _make_any(config.objects, config.detail), _make_any(config.proxies, False)
+    closest_shape_object = _make_closest(config.objects, config.detail, config.stretched)
+    closest_shape_proxy = _make_closest(config.proxies, False, False)
+    any_object = _make_any(config.objects, config.detail, config.stretched)
+    any_proxy = _make_any(config.proxies, False, False)
 
     @wp.func(module="unique")
     def closest_object(scene: RayScene, origin: wp.vec3, direction: wp.vec3, t_max: wp.float32) -> Hit:
@@ -300,7 +320,7 @@ def make_trace(config: TraceConfig) -> Trace:
         return any_proxy(scene, scene.proxies, origin, direction, t_max)
 
     if config.objects == config.proxies:
-        occluded = _make_any_of_both(config.objects, config.detail)
+        occluded = _make_any_of_both(config.objects, config.detail, config.stretched)
     else:
 
         @wp.func(module="unique")

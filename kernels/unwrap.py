@@ -34,7 +34,7 @@ from warp_ar.kernels.color import decode, is_saturated, saturation_codes
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
-from warp_ar.kernels.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_local_point, to_local_vector
+from warp_ar.kernels.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_rigid_point, to_rigid_vector
 from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
@@ -123,8 +123,8 @@ def make_project_corners_kernel(config: ProjectConfig) -> wp.Kernel:
         # Proxies grow by `pad` metres, the rim's width: what lies right beside them in the picture may show them.
         for index in range(scene.proxies.shape[0]):
             shape = scene.proxies[index]
-            o = to_local_point(shape, origin)
-            d = to_local_vector(shape, ray)
+            o = to_rigid_point(shape, origin)
+            d = to_rigid_vector(shape, ray)
             half = shape.extent + wp.vec3(1.0, 1.0, 1.0) * (pad / shape.scale)
             if wp.static(PLANE in kinds):
                 if shape.kind == PLANE:

@@ -34,7 +34,7 @@ from warp_ar.scene.ray_scene import HostScene
 
 CAMERA = Camera(width=64, height=48, fx=600.0, fy=620.0, cx=30.5, cy=24.0)
 DETAIL = TraceConfig((0,), ()).general()
-trace = make_trace(dataclasses.replace(DETAIL, detail=True))
+trace = make_trace(dataclasses.replace(DETAIL, detail=True, stretched=True))
 closest_object, occluded_by_objects = trace.closest_object, trace.occluded_by_objects
 surface_at = make_surface((LAMBERT, PHONG, METALLIC_ROUGHNESS), True)
 # Codes of 8 bits come back as they are; a few float32 products on the way.

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import trimesh
 
+from tests.gltf_files import Gltf
 from tests.layer_rig import POSES, make_scene
 from warp_ar.errors import SinkError
 from warp_ar.output.gltf_file import quaternions, write_glb
-from warp_ar.output.shot import Look, Shot, look_of, mesh_of, placement
+from warp_ar.output.shot import Look, Shot, look_of, mesh_of, placement, texture_files
 from warp_ar.output.usd_file import write_usd
 from warp_ar.scene import Camera, Light, Object
-from warp_ar.scene.description import Animation, PhongMaterial
+from warp_ar.scene.description import Animation, EmissiveMaterial, PhongMaterial
 from warp_ar.scene.geometry import rotation_matrix
+from warp_ar.scene.mesh_files import load_mesh
 
 # USD keeps a camera's lens in float32: 1e-7 of a picture of 64 pixels, and frusta of float64.
 PIXELS = 1e-4
@@ -269,3 +271,52 @@ def test_what_cannot_be_written_is_said(shot, tmp_path):
     for write, name in ((write_usd, "shot.usda"), (write_glb, "shot.glb")):
         with pytest.raises(SinkError, match=rf"{name} cannot be written"):
             write(tmp_path / "missing" / name, shot)
+
+
+def test_emission_is_told(tmp_path):
+    """What emits keeps its radiance: above 1 too, with its picture, in the file's own material and the scene's."""
+    made = Gltf()
+    picture = np.random.default_rng(2).integers(0, 256, (4, 4, 3)).astype(np.uint8)
+    made.material(
+        emissiveFactor=[0.5, 0.25, 1.0],
+        emissiveTexture={"index": made.texture(picture)},
+        extensions={"KHR_materials_emissive_strength": {"emissiveStrength": 6.0}},
+    )
+    made.node(made.square(0))
+    scene = make_scene(
+        objects=(
+            Object("mesh", file=made.save(tmp_path / "screen.glb")),
+            Object("sphere", radius=0.02, material=EmissiveMaterial((1.0, 0.5, 0.25), 0.5)),
+            Object("sphere", radius=0.02),
+        ),
+        proxies=(),
+        lights=(),
+    )
+    told = Shot(scene, 24.0, (POSES[0],))
+    write_glb(tmp_path / "shot.glb", told)
+    mesh = load_mesh(tmp_path / "shot.glb")
+    first, second, third = mesh.materials
+    np.testing.assert_allclose(first.emission, (3.0, 1.5, 6.0), rtol=1e-6)
+    assert first.emissive is not None
+    np.testing.assert_array_equal(mesh.images[first.emissive.image][..., :3], picture)
+    assert (second.emission, second.emissive, third.emission) == ((0.5, 0.25, 0.125), None, (0.0, 0.0, 0.0))
+
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    from pxr import UsdShade
+
+    path = tmp_path / "usd" / "shot.usda"
+    path.parent.mkdir()
+    written = write_usd(path, told)
+    assert set(written) == {path, *texture_files(scene, path).values()}
+    stage = usd.Stage.Open(str(path))
+
+    def value(where, name):
+        return tuple(UsdShade.Shader(stage.GetPrimAtPath(f"/shot/materials/{where}")).GetInput(name).Get())
+
+    assert value("object_0_screen/emission", "scale") == (3.0, 1.5, 6.0, 1.0)
+    source = UsdShade.Shader(stage.GetPrimAtPath("/shot/materials/object_0_screen/surface")).GetInput("emissiveColor")
+    assert source.HasConnectedSource()
+    assert value("object_1_sphere/surface", "emissiveColor") == (0.5, 0.25, 0.125)
+    assert not UsdShade.Shader(stage.GetPrimAtPath("/shot/materials/object_2_sphere/surface")).GetInput("emissiveColor")
+    saved = cv2.imread(str(texture_files(scene, path)["object_0_screen_emission"]))
+    np.testing.assert_array_equal(saved[..., ::-1], picture)

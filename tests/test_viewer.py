@@ -260,6 +260,10 @@ def test_edits_are_checked_as_the_file_is() -> None:
     assert moved.lights[0].at == (0.1, 0.2, 0.3)
     assert dataclasses.replace(moved, lights=scene.lights) == scene
     assert edits.set_value(scene, "object", 1, "roughness", 0.7).objects[1].material.roughness == 0.7
+    shining = edits.set_value(scene, "object", 1, "model", "emissive")
+    for key, value in (("intensity", 3.0), ("color", (1.0, 0.5, 0.2))):
+        shining = edits.set_value(shining, "object", 1, key, value)
+        assert getattr(shining.objects[1].material, key) == value
     assert edits.set_value(scene, "object", 0, "model", "mirror").objects[0].material == MirrorMaterial((0.5, 0.4, 0.3))
     assert isinstance(edits.set_value(scene, "object", 0, "model", "phong").objects[0].material, PhongMaterial)
     assert edits.set_value(scene, "exposure", 0, "scale", "auto").exposure == Exposure("auto")

@@ -164,7 +164,7 @@ class PathTracer:
         """The scene as paths meet it."""
         local = LocalScene()
         device, shape = self.device, (self.camera.height, self.camera.width)
-        objects = np.zeros(len(self.scene.objects), np.dtype(structs.Shape.numpy_dtype()))
+        objects = np.zeros(self._host.shape_count, np.dtype(structs.Shape.numpy_dtype()))
         lights = np.zeros(len(self.scene.lights), np.dtype(structs.Light.numpy_dtype()))
         self._host.write_objects(objects, seconds)
         self._host.write_lights(lights, seconds)

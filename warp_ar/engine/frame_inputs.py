@@ -87,7 +87,7 @@ class FrameInputs:
         self._camera, self._arrays = camera, arrays
         self.host_scene = HostScene(scene, device)
         self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
-        self.block = FrameBlock(device, len(scene.lights), len(scene.objects), len(scene.proxies))
+        self.block = FrameBlock(device, len(scene.lights), self.host_scene.shape_count, len(scene.proxies))
         self.host_scene.ray_scene.objects = self.block.device_array("objects")
         self.host_scene.ray_scene.proxies = self.block.device_array("proxies")
         self.host_scene.write_proxies(self.block.host("proxies"))

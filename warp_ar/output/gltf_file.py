@@ -35,6 +35,8 @@ _FLOAT, _INDEX = 5126, 5125
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _Y_UP = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
 """Quaternion, x first, that turns z up to y up."""
+_EVEN = 1e-6
+"""Relative difference of the axes' lengths below which a placement is a turn and one scale for all frames."""
 _DIELECTRIC = 0.04
 """Reflectance straight on of what is no metal."""
 
@@ -161,17 +163,49 @@ class _Builder:
         if not placements:
             return
         matrices = np.stack(list(placements.values()))
+        lengths = np.linalg.norm(matrices[:, :3, :3], axis=1)
+        if np.ptp(lengths) > _EVEN * lengths.max():
+            self._place_stretched(index, node, placements, matrices)
+            return
         scale = np.cbrt(np.linalg.det(matrices[0, :3, :3]))
         turns = quaternions(matrices[:, :3, :3] / scale)
         node["translation"], node["rotation"] = matrices[0, :3, 3].tolist(), turns[0].tolist()
         if abs(scale - 1.0) > 1e-12:
             node["scale"] = [float(scale)] * 3
-        if len(matrices) > 1:
-            times = self._time_accessor(tuple(frame / self._shot.fps for frame in placements))
-            for path, values in (("translation", matrices[:, :3, 3]), ("rotation", turns)):
-                self._samplers.append({"input": times, "interpolation": "LINEAR", "output": self._key_values(values)})
-                target = {"node": index, "path": path}
-                self._channels.append({"sampler": len(self._samplers) - 1, "target": target})
+        self._add_keys(index, placements, {"translation": matrices[:, :3, 3], "rotation": turns})
+
+    def _add_keys(self, index: int, placements: dict[int, Matrix], values: dict[str, npt.NDArray[Any]]) -> None:
+        """Keyframes of a node, if it has more than one placement."""
+        if len(placements) < 2:
+            return
+        times = self._time_accessor(tuple(frame / self._shot.fps for frame in placements))
+        for path, keys in values.items():
+            self._samplers.append({"input": times, "interpolation": "LINEAR", "output": self._key_values(keys)})
+            self._channels.append({"sampler": len(self._samplers) - 1, "target": {"node": index, "path": path}})
+
+    def _place_stretched(
+        self, index: int, node: dict[str, Any], placements: dict[int, Matrix], matrices: npt.NDArray[np.float64]
+    ) -> None:
+        """Any linear map is U S V^T: a node turns by V^T, and one above it, in its place in the tree, by U S."""
+        inner = {key: node.pop(key) for key in ("mesh",) if key in node}
+        self._tree["nodes"].append({"name": f"{node['name']}_inner", **inner})
+        child = len(self._tree["nodes"]) - 1
+        node["children"] = [child]
+        outer, scales, turned = np.linalg.svd(matrices[:, :3, :3])
+        # Both must be rotations: a mirror goes into the last scale.
+        for way in (outer, turned):
+            mirrored = np.linalg.det(way) < 0.0
+            scales[mirrored, 2] *= -1.0
+            if way is outer:
+                way[mirrored, :, 2] *= -1.0
+            else:
+                way[mirrored, 2, :] *= -1.0
+        values = {"translation": matrices[:, :3, 3], "rotation": quaternions(outer), "scale": scales}
+        turns = quaternions(turned)
+        node.update({key: keys[0].tolist() for key, keys in values.items()})
+        self._tree["nodes"][child]["rotation"] = turns[0].tolist()
+        self._add_keys(index, placements, values)
+        self._add_keys(child, placements, {"rotation": turns})
 
     def _time_accessor(self, seconds: tuple[float, ...]) -> int:
         if seconds not in self._times:
@@ -240,10 +274,10 @@ class _Builder:
             "roughnessFactor": look.roughness,
         }
         if look.texture is not None and textured:
-            image = self._add_image(encode_texture(look.texture))
-            self._tree.setdefault("textures", []).append({"source": image})
-            surface["baseColorTexture"] = {"index": len(self._tree["textures"]) - 1}
+            surface["baseColorTexture"] = self._add_texture(look.texture)
         material: dict[str, Any] = {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}
+        if any(look.emission):
+            self._add_emission(material, look, textured=textured)
         if look.specular is not None:
             self._use("KHR_materials_specular")
             factor = max(look.specular) / _DIELECTRIC
@@ -251,9 +285,24 @@ class _Builder:
             strength = min(1.0, factor)
             color = [0.0 if strength == 0.0 else value / (_DIELECTRIC * strength) for value in look.specular]
             specular = {"specularFactor": strength, "specularColorFactor": color}
-            material["extensions"] = {"KHR_materials_specular": specular}
+            material.setdefault("extensions", {})["KHR_materials_specular"] = specular
         self._tree.setdefault("materials", []).append(material)
         return len(self._tree["materials"]) - 1
+
+    def _add_texture(self, picture: npt.NDArray[np.uint8]) -> dict[str, int]:
+        image = self._add_image(encode_texture(picture))
+        self._tree.setdefault("textures", []).append({"source": image})
+        return {"index": len(self._tree["textures"]) - 1}
+
+    def _add_emission(self, material: dict[str, Any], look: Look, *, textured: bool) -> None:
+        """Factors go to 1 at most; what is beyond is the strength's."""
+        material["emissiveFactor"] = list(_bounded(look.emission))
+        if look.glow is not None and textured:
+            material["emissiveTexture"] = self._add_texture(look.glow)
+        if max(look.emission) > 1.0:
+            self._use("KHR_materials_emissive_strength")
+            strength = {"emissiveStrength": max(look.emission)}
+            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = strength
 
     def _add_image(self, png: bytes) -> int:
         self._tree.setdefault("images", []).append({"bufferView": self._view(png), "mimeType": "image/png"})

@@ -24,17 +24,20 @@ from warp_ar.scene.description import (
     EmissiveMaterial,
     FileMaterial,
     Light,
+    Material,
     MetallicRoughnessMaterial,
     MirrorMaterial,
     Object,
     PhongMaterial,
     Proxy,
 )
+from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh, make_mesh, rotation_matrix
 from warp_ar.scene.mesh_cache import load_kept_mesh
 from warp_ar.scene.mesh_files import load_texture
 from warp_ar.scene.names import surface_names
 from warp_ar.scene.object_materials import look_of as materials_of
+from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements
 from warp_ar.scene.shapes import box_mesh, disk_mesh, sphere_mesh, torus_mesh, tube_mesh
 from warp_ar.signature import sign_png
 from warp_ar.srgb import decode_srgb, encode_srgb
@@ -59,6 +62,10 @@ class Look:
     """Reflectance straight on where it is given; None: by ``metallic``, 0.04 for what is no metal."""
     texture: npt.NDArray[np.uint8] | None = None
     """Of the base colour: RGB, sRGB-encoded, row 0 at the top."""
+    emission: RGB = (0.0, 0.0, 0.0)
+    """Radiance that it sends out; multiplies ``glow``."""
+    glow: npt.NDArray[np.uint8] | None = None
+    """Picture of the emission: RGB, sRGB-encoded, row 0 at the top."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,10 +120,14 @@ class Shot:
     def bodies(self) -> list[Body]:
         """Virtual objects, then proxies, by the names of ``surface_names``."""
         names, scene = surface_names(self.scene), self.scene
-        items: Sequence[Object | Proxy] = (*scene.objects, *scene.proxies)
+        items: Sequence[ObjectShape | Proxy] = (*object_shapes(scene), *scene.proxies)
         return [self._body(name, item) for name, item in zip(names, items, strict=False)]
 
-    def _body(self, name: str, item: Object | Proxy) -> Body:
+    def _body(self, name: str, shape: ObjectShape | Proxy) -> Body:
+        item = shape if isinstance(shape, Proxy) else shape.item
+        if isinstance(shape, ObjectShape) and shape.moving is not None and shape.mesh is not None:
+            placed = [part_placements(shape.item, shape.moving, seconds)[shape.part] for seconds in self.seconds]
+            return Body(name, shape.mesh, look_of(shape.item, shape.mesh), False, tuple(placed))
         mesh = mesh_of(item)
         if isinstance(item, Proxy):
             at = (placement(rotation_matrix(item.rotate), np.array(item.at)),)
@@ -173,7 +184,16 @@ def look_of(item: Object, mesh: Mesh) -> Look:
     A Phong lobe of exponent n becomes GGX of alpha = sqrt(2 / (n + 2)), which is as wide, and its colour the
     reflectance straight on; a mirror becomes a metal without roughness.
     """
-    material = materials_of(item).materials[0].surface
+    first = materials_of(item).materials[0]
+    glow = None if first.emissive is None or mesh.uvs is None else mesh.images[first.emissive.image][..., :3]
+    if isinstance(item.material, EmissiveMaterial) and item.material.image is not None:
+        glow = load_emission(item.material.image)[0]
+    look = _reflection_of(first.surface, mesh)
+    return dataclasses.replace(look, emission=first.emission, glow=glow if any(first.emission) else None)
+
+
+def _reflection_of(material: Material, mesh: Mesh) -> Look:
+    """What ``look_of`` says of reflected light."""
     assert not isinstance(material, FileMaterial | EmissiveMaterial)
     if isinstance(material, PhongMaterial):
         alpha = math.sqrt(2.0 / (material.shininess + 2.0))
@@ -224,18 +244,21 @@ def encode_texture(texture: npt.NDArray[np.uint8]) -> bytes:
     return sign_png(data.tobytes())
 
 
-def texture_file(path: Path, name: str) -> Path:
-    """Where the texture of a body goes that cannot lie in the file itself."""
-    return path.with_name(f"{path.stem}_{name}.png")
+def texture_file(path: Path, name: str, kind: str = "") -> Path:
+    """Where a texture of a body goes that cannot lie in the file itself; ``kind``: "emission" for that of its light."""
+    return path.with_name("_".join(part for part in (path.stem, name, kind) if part) + ".png")
 
 
 def texture_files(scene: Scene, path: Path) -> dict[str, Path]:
-    """All of them, by the names of their bodies."""
+    """All of them, by the names of their bodies and what they are of."""
     found = {}
-    for name, item in zip(surface_names(scene), scene.objects, strict=False):
-        mesh = mesh_of(item)
-        if mesh.uvs is not None and look_of(item, mesh).texture is not None:
+    for name, shape in zip(surface_names(scene), object_shapes(scene), strict=False):
+        item, mesh = shape.item, shape.mesh or mesh_of(shape.item)
+        look = look_of(item, mesh)
+        if mesh.uvs is not None and look.texture is not None:
             found[name] = texture_file(path, name)
+        if mesh.uvs is not None and look.glow is not None:
+            found[f"{name}_emission"] = texture_file(path, name, "emission")
     return found
 
 

@@ -172,31 +172,42 @@ def _write_look(pxr: Any, stage: Any, body: Body, prim: Any, path: Path) -> list
         shader.CreateInput("useSpecularWorkflow", sdf.Int).Set(1)
         shader.CreateInput("specularColor", sdf.Color3f).Set(pxr.Gf.Vec3f(*look.specular))
     written = []
-    diffuse = shader.CreateInput("diffuseColor", sdf.Color3f)
-    if look.texture is None or body.mesh.uvs is None:
-        diffuse.Set(pxr.Gf.Vec3f(*look.base_color))
-    else:
-        picture = texture_file(path, body.name)
+    colors = [("diffuseColor", "texture", look.base_color, look.texture, texture_file(path, body.name))]
+    if any(look.emission):
+        own = texture_file(path, body.name, "emission")
+        colors.append(("emissiveColor", "emission", look.emission, look.glow, own))
+    for name, node, factor, values, picture in colors:
+        color = shader.CreateInput(name, sdf.Color3f)
+        if values is None or body.mesh.uvs is None:
+            color.Set(pxr.Gf.Vec3f(*factor))
+            continue
         try:
-            write_whole(picture, encode_texture(look.texture))
+            write_whole(picture, encode_texture(values))
         except OSError as error:
             raise SinkError(f"{picture} cannot be written: {reason(error)}") from error
         written.append(picture)
-        reader = pxr.UsdShade.Shader.Define(stage, f"{where}/st")
-        reader.CreateIdAttr("UsdPrimvarReader_float2")
-        reader.CreateInput("varname", sdf.String).Set("st")
-        texture = pxr.UsdShade.Shader.Define(stage, f"{where}/texture")
-        texture.CreateIdAttr("UsdUVTexture")
-        texture.CreateInput("file", sdf.Asset).Set(f"./{picture.name}")
-        texture.CreateInput("sourceColorSpace", sdf.Token).Set("sRGB")
-        texture.CreateInput("wrapS", sdf.Token).Set("repeat")
-        texture.CreateInput("wrapT", sdf.Token).Set("repeat")
-        texture.CreateInput("scale", sdf.Float4).Set(pxr.Gf.Vec4f(*look.base_color, 1.0))
-        texture.CreateInput("st", sdf.Float2).ConnectToSource(reader.CreateOutput("result", sdf.Float2))
-        diffuse.ConnectToSource(texture.CreateOutput("rgb", sdf.Float3))
+        texture = _texture(pxr, stage, where, node, picture)
+        texture.CreateInput("scale", sdf.Float4).Set(pxr.Gf.Vec4f(*factor, 1.0))
+        color.ConnectToSource(texture.CreateOutput("rgb", sdf.Float3))
     material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
     pxr.UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
     return written
+
+
+def _texture(pxr: Any, stage: Any, where: str, name: str, picture: Path) -> Any:
+    """A picture, read by the texture coordinates ``st``."""
+    sdf = pxr.Sdf.ValueTypeNames
+    reader = pxr.UsdShade.Shader.Define(stage, f"{where}/st")
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", sdf.String).Set("st")
+    texture = pxr.UsdShade.Shader.Define(stage, f"{where}/{name}")
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", sdf.Asset).Set(f"./{picture.name}")
+    texture.CreateInput("sourceColorSpace", sdf.Token).Set("sRGB")
+    texture.CreateInput("wrapS", sdf.Token).Set("repeat")
+    texture.CreateInput("wrapT", sdf.Token).Set("repeat")
+    texture.CreateInput("st", sdf.Float2).ConnectToSource(reader.CreateOutput("result", sdf.Float2))
+    return texture
 
 
 def _write_light(pxr: Any, stage: Any, where: str, light: Light, shot: Shot) -> None:

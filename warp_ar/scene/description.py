@@ -273,6 +273,27 @@ class Animation:
 
 
 @dataclasses.dataclass(frozen=True)
+class Play:
+    """How an animation of a glTF file's nodes is played."""
+
+    animation: str | int = 0
+    """Name of the animation in the file, or its number from 0 on."""
+    loop: bool = True
+    """Whether it begins anew after its last key; else it holds that pose."""
+    start: float = 0.0
+    """Time at which it begins, in seconds after the first frame; before, it holds its first pose."""
+    speed: float = 1.0
+    """Seconds of the animation per second."""
+
+    def time_at(self, seconds: float, duration: float) -> float:
+        """Time of the animation, ``seconds`` after the first frame; ``duration`` is that of its last key."""
+        passed = max((seconds - self.start) * self.speed, 0.0)
+        if not self.loop:
+            return min(passed, duration)
+        return math.fmod(passed, duration) if duration > 0.0 else 0.0
+
+
+@dataclasses.dataclass(frozen=True)
 class PhongMaterial:
     """Diffuse plus a cosine lobe about the mirror direction."""
 
@@ -365,6 +386,8 @@ class Object:
     """How it reflects light."""
     animate: Animation | None = None
     """How it moves."""
+    play: Play | None = None
+    """An animation of its glTF file that moves the file's nodes; without, they stand as at the start."""
     marker: Marker | None = None
     """A marker or board of its own, in whose frame it stands; while that is lost it is not there."""
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)

@@ -20,10 +20,12 @@ import numpy.typing as npt
 from warp_ar.errors import SceneError
 from warp_ar.files import limits, too_much
 from warp_ar.pictures import decode_picture, picture_size
+from warp_ar.scene.gltf_animation import animation_names, read_animation
 from warp_ar.scene.gltf_arrays import GltfArrays
 from warp_ar.scene.gltf_materials import SUPPORTED, GltfMaterials
 from warp_ar.scene.mesh_assets import Assets, fail, image_bytes, objects, read_gltf
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart
+from warp_ar.scene.node_animation import Anchor, NodeTrack
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _UP: Final = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -45,20 +47,39 @@ class GltfContents:
     """Pictures that materials name, RGBA."""
     notes: list[str]
     """What is not shown."""
+    carriers: list[int] = dataclasses.field(default_factory=list)
+    """Number of the anchor that each part hangs on, and in whose coordinates it is; -1: in the world."""
+    anchors: tuple[Anchor, ...] = ()
+    """Nodes that the animation moves."""
+    duration: float = 0.0
+    """Of the animation, in seconds."""
 
 
-def load_gltf(path: Path, data: bytes, assets: Assets) -> GltfContents:
+def load_gltf(path: Path, data: bytes, assets: Assets, *, animation: str | int | None = None) -> GltfContents:
     """Read the triangles of a file's scene, with materials.
 
     Args:
         path: The file, for messages.
         data: Its bytes.
         assets: Finds the files that it names.
+        animation: Name or number of the animation that is to move it; None: all stands as at the start.
 
     Raises:
         SceneError: It is damaged, too large, names what is missing, or cannot be read without an extension.
     """
-    return _Reader(path, data, assets).contents()
+    return _Reader(path, data, assets).contents(animation)
+
+
+@dataclasses.dataclass
+class _Rig:
+    """What an animation moves."""
+
+    anchors: list[Anchor] = dataclasses.field(default_factory=list)
+    places: dict[int, tuple[int, npt.NDArray[np.float64]]] = dataclasses.field(default_factory=dict)
+    """By node that moves: its anchor, and its transform below that."""
+    below: dict[int, tuple[int, npt.NDArray[np.float64]]] = dataclasses.field(default_factory=dict)
+    """Likewise of all nodes; those that stand still have anchor -1."""
+    duration: float = 0.0
 
 
 class _Reader:
@@ -77,13 +98,15 @@ class _Reader:
         self._decoded: list[npt.NDArray[np.uint8]] = []
         self._pixels = self._elements = 0
         self._notes: dict[str, None] = {}
+        self._parents: dict[int, int] = {}
 
-    def contents(self) -> GltfContents:
+    def contents(self, animation: str | int | None) -> GltfContents:
         """All that the scene shows."""
         self._look_at_extensions()
-        for key in ("animations", "cameras"):
-            if objects(self._path, self._header, key):
-                self._note(key)
+        if animation is None and animation_names(self._path, self._header):
+            self._note("animations (an object's key play names one)")
+        if objects(self._path, self._header, "cameras"):
+            self._note("cameras")
         if len(self._nodes) > _MOST_PLACES:
             fail(self._path, f"it has {len(self._nodes):,} nodes; at most {_MOST_PLACES:,} are read: join them")
         parts: list[MeshPart] = []
@@ -95,11 +118,18 @@ class _Reader:
         )
         if places > _MOST_PLACES:
             fail(self._path, f"its nodes place {places:,} primitives; at most {_MOST_PLACES:,} are read: join them")
+        rig = _Rig() if animation is None else self._rig(animation, world)
+        carriers: list[int] = []
         for index, transform in world.items():
             node = self._nodes[index]
             if "mesh" in node:
-                parts += self._mesh(node, _UP @ transform, world)
-        return GltfContents(parts, self._decoded, list(self._notes))
+                place = rig.places.get(index)
+                if place is not None and "skin" in node:
+                    self._note("skins under an animation")
+                    place = None
+                parts += self._mesh(node, _UP @ transform if place is None else place[1], world)
+                carriers += [-1 if place is None else place[0]] * (len(parts) - len(carriers))
+        return GltfContents(parts, self._decoded, list(self._notes), carriers, tuple(rig.anchors), rig.duration)
 
     def _note(self, what: str) -> None:
         self._notes.setdefault(what)
@@ -153,39 +183,56 @@ class _Reader:
             if not (np.abs(found[index]) < LARGEST).all():
                 fail(self._path, f"node {index} has a transform that is not finite, or above {LARGEST:g}")
             children_of = self._indices(node.get("children"), f"children of node {index}", len(self._nodes))
+            self._parents.update(dict.fromkeys(children_of, index))
             waiting += [(child, found[index]) for child in reversed(children_of)]
         return found
 
     def _roots(self, scene: dict[str, Any]) -> list[int]:
         return self._indices(scene.get("nodes"), "the scene's nodes", len(self._nodes))
 
-    def _local(self, node: dict[str, Any], index: int) -> npt.NDArray[np.float64]:
-        def numbers(key: str, default: list[float]) -> npt.NDArray[np.float64]:
-            value = node.get(key, default)
-            sound = isinstance(value, list) and len(value) == len(default)
-            if not sound or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
-                fail(self._path, f"node {index} has {key} {str(value)[:30]!r}; {len(default)} numbers are right")
-            return np.array([float(v) if abs(v) < LARGEST else np.inf for v in value])
+    def _numbers(self, node: dict[str, Any], index: int, key: str, default: list[float]) -> npt.NDArray[np.float64]:
+        value = node.get(key, default)
+        sound = isinstance(value, list) and len(value) == len(default)
+        if not sound or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
+            fail(self._path, f"node {index} has {key} {str(value)[:30]!r}; {len(default)} numbers are right")
+        return np.array([float(v) if abs(v) < LARGEST else np.inf for v in value])
 
+    def _local(self, node: dict[str, Any], index: int) -> npt.NDArray[np.float64]:
         if "matrix" in node:
-            return numbers("matrix", [0.0] * 16).reshape(4, 4).T
-        x, y, z, w = numbers("rotation", [0.0, 0.0, 0.0, 1.0])
-        length = float(np.sqrt(x * x + y * y + z * z + w * w))
+            return self._numbers(node, index, "matrix", [0.0] * 16).reshape(4, 4).T
+        with np.errstate(invalid="ignore", over="ignore"):  # the caller asks whether it is finite
+            return self._track(node, index).transform_at(0.0)
+
+    def _track(self, node: dict[str, Any], index: int) -> NodeTrack:
+        """A node's translation, rotation and scale."""
+        rotation = self._numbers(node, index, "rotation", [0.0, 0.0, 0.0, 1.0])
+        length = float(np.sqrt((rotation * rotation).sum()))
         if not 0.0 < length < np.inf:
             fail(self._path, f"node {index} has a rotation without length")
-        x, y, z, w = x / length, y / length, z / length, w / length
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        result = np.eye(4)
-        with np.errstate(invalid="ignore"):
-            result[:3, :3] = rotation * numbers("scale", [1.0, 1.0, 1.0])
-        result[:3, 3] = numbers("translation", [0.0, 0.0, 0.0])
-        return result
+        scale = self._numbers(node, index, "scale", [1.0, 1.0, 1.0])
+        return NodeTrack(self._numbers(node, index, "translation", [0.0, 0.0, 0.0]), rotation / length, scale, {})
+
+    def _rig(self, wanted: str | int, world: dict[int, npt.NDArray[np.float64]]) -> _Rig:
+        """The nodes that an animation moves, and what hangs on them."""
+        animation = read_animation(self._path, self._header, self._arrays, wanted, self._note)
+        rig = _Rig(duration=animation.duration)
+        numbers: dict[int, int] = {}
+        for index in world:  # each after its parent
+            carrier, below = rig.below.get(self._parents.get(index, -1), (-1, _UP))
+            node, samplers = self._nodes[index], animation.samplers.get(index)
+            if samplers is None:
+                rig.below[index] = carrier, below @ self._local(node, index)
+            else:
+                if "matrix" in node:
+                    fail(self._path, f"an animation moves node {index}, which has a matrix; translation, rotation and "
+                         "scale are right")  # fmt: skip
+                track = dataclasses.replace(self._track(node, index), samplers=samplers)
+                numbers[index] = len(rig.anchors)
+                rig.anchors.append(Anchor(carrier, below, track))
+                rig.below[index] = numbers[index], np.eye(4)
+            if rig.below[index][0] >= 0:
+                rig.places[index] = rig.below[index]
+        return rig
 
     # ---- meshes --------------------------------------------------------------------------------------------------
 

@@ -50,6 +50,7 @@ def trace_config(scene: scenes.Scene) -> TraceConfig:
         objects=tuple(sorted({shape_kind(item) for item in scene.objects})),
         proxies=tuple(sorted({shape_kind(item) for item in scene.proxies})),
         detail=any(look.holed or look.bumpy for look in looks),
+        stretched=any(item.play is not None for item in scene.objects),
     )
 
 
@@ -65,6 +66,7 @@ def skeleton(scene: scenes.Scene) -> Any:
             item.shape,
             item.marker,
             mesh_key(item),
+            item.play and item.play.animation,
             type(item.material),
             tuple(value for value in vars(item.material).values() if isinstance(value, Path)),
             any(map(reflects_diffusely, look_of(item).materials)),

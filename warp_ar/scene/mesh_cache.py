@@ -19,6 +19,7 @@ from warp_ar.cache_folder import cache_folder
 from warp_ar.scene import (
     geometry,
     gltf,
+    gltf_animation,
     gltf_arrays,
     gltf_materials,
     mesh_assets,
@@ -26,9 +27,22 @@ from warp_ar.scene import (
     mesh_materials,
     mesh_parts,
     mtl,
+    node_animation,
 )
 
-_CODE = (geometry, gltf, gltf_arrays, gltf_materials, mesh_assets, mesh_files, mesh_materials, mesh_parts, mtl)
+_CODE = (
+    geometry,
+    gltf,
+    gltf_animation,
+    gltf_arrays,
+    gltf_materials,
+    mesh_assets,
+    mesh_files,
+    mesh_materials,
+    mesh_parts,
+    mtl,
+    node_animation,
+)
 """What decides how a file is read."""
 WHOLE = (".ply", ".stl", ".off", ".glb")
 """Formats without files beside them."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import logging
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,11 +20,13 @@ from warp_ar.errors import SceneError
 from warp_ar.files import is_file, read_bytes
 from warp_ar.pictures import read_picture
 from warp_ar.scene.geometry import Mesh, creased_normals, smooth_normals
-from warp_ar.scene.gltf import load_gltf
+from warp_ar.scene.gltf import GltfContents, load_gltf
 from warp_ar.scene.mesh_assets import Assets, check_counts
 from warp_ar.scene.mesh_materials import MeshMaterial
 from warp_ar.scene.mesh_parts import LARGEST, MeshPart, join_parts
+from warp_ar.scene.moving_mesh import moving_mesh
 from warp_ar.scene.mtl import read_library_material
+from warp_ar.scene.node_animation import MovingMesh
 from warp_ar.srgb import decode_srgb
 
 FloatArray = npt.NDArray[np.float32]
@@ -30,6 +34,9 @@ ByteArray = npt.NDArray[np.uint8]
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 """Mesh files that :func:`load_mesh` reads."""
+
+GLTF_SUFFIXES: Final = (".glb", ".gltf")
+"""Those of glTF."""
 
 CREASE: Final = 40.0
 """Degrees: where a file of a drawing format (OBJ, STL, OFF) has no normals, an edge that turns more is sharp."""
@@ -108,8 +115,42 @@ def files_beside(path: Path) -> dict[str, bytes]:
     return _load(path)[1].known
 
 
+def load_moving_mesh(path: Path, animation: str | int) -> MovingMesh:
+    """Read a glTF file and one of its animations.
+
+    Args:
+        path: The file.
+        animation: Name of the animation, or its number from 0 on.
+
+    Raises:
+        SceneError: As :func:`load_mesh`; or there is no such animation, or it is damaged.
+    """
+    contents = _read_file(path, animation)[0]
+    with _said_in_words(path):
+        return moving_mesh(f"{path}", contents)
+
+
 def _load(path: Path) -> tuple[Mesh, Assets]:
     """A mesh, and what it was read from."""
+    contents, assets = _read_file(path)
+    with _said_in_words(path):
+        return join_parts(f"{path}", contents.parts, contents.images, contents.notes), assets
+
+
+@contextlib.contextmanager
+def _said_in_words(path: Path) -> Iterator[None]:
+    """Turn what readers raise on damaged files into a SceneError."""
+    try:
+        yield
+    except SceneError:
+        raise
+    except _LOADER_ERRORS as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
+
+
+def _read_file(path: Path, animation: str | int | None = None) -> tuple[GltfContents, Assets]:
+    """Parts of a file, one or more, and what they were read from."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
     if not is_file(path):
@@ -118,22 +159,16 @@ def _load(path: Path) -> tuple[Mesh, Assets]:
     suffix = path.suffix.lower()
     assets = Assets(path, library_first=suffix == ".obj")
     check_counts(path, data)
-    images: list[ByteArray] = []
-    notes: list[str] = []
-    try:
-        if suffix in (".glb", ".gltf"):
-            contents = load_gltf(path, data, assets)
-            parts, images, notes = contents.parts, contents.images, contents.notes
+    with _said_in_words(path):
+        if suffix in GLTF_SUFFIXES:
+            contents = load_gltf(path, data, assets, animation=animation)
         else:
-            parts = _read_parts(path, data, assets, images, notes)
-        if not parts:
+            images: list[ByteArray] = []
+            notes: list[str] = []
+            contents = GltfContents(_read_parts(path, data, assets, images, notes), images, notes)
+        if not contents.parts:
             raise SceneError(f"{path}: holds no triangle; a mesh with faces is needed (a point cloud has none)")
-        return join_parts(f"{path}", parts, images, notes), assets
-    except SceneError:
-        raise
-    except _LOADER_ERRORS as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise SceneError(f"{path}: the mesh cannot be read; is the file whole? ({reason})") from error
+        return contents, assets
 
 
 def _read_parts(path: Path, data: bytes, assets: Assets, images: list[ByteArray], notes: list[str]) -> list[MeshPart]:

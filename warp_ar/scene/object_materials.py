@@ -29,8 +29,9 @@ from warp_ar.scene.description import (
 from warp_ar.scene.emissive_picture import load_emission
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.mesh_cache import load_kept_mesh
-from warp_ar.scene.mesh_files import mesh_from_trimesh
+from warp_ar.scene.mesh_files import load_moving_mesh, mesh_from_trimesh
 from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.node_animation import MovingMesh
 
 _LOG = logging.getLogger(__name__)
 _NO_FILE = (MeshMaterial(),)
@@ -64,7 +65,7 @@ def object_from_trimesh(source: Any, **fields: Any) -> Object:
 
 
 def mesh_of(item: Object) -> Mesh | None:
-    """The mesh that an object of shape ``mesh`` shows; None for other shapes.
+    """The mesh that an object of shape ``mesh`` shows, at rest if it moves; None for other shapes.
 
     Raises:
         SceneError: Its file cannot be read.
@@ -74,7 +75,35 @@ def mesh_of(item: Object) -> Mesh | None:
     if item.mesh is not None:
         return item.mesh
     assert item.file is not None
-    return file_mesh(item.file)
+    moving = moving_mesh_of(item)
+    return file_mesh(item.file) if moving is None else moving.rest
+
+
+def moving_mesh_of(item: Object) -> MovingMesh | None:
+    """What an object plays, kept as ``file_mesh`` keeps a mesh; None: its nodes stand still.
+
+    Raises:
+        SceneError: Its file has no such animation, or cannot be read.
+    """
+    if item.play is None or item.file is None or item.mesh is not None:
+        return None
+    return _read_moving(item.file, _stamp(item.file), item.play.animation)
+
+
+@functools.lru_cache(maxsize=8)
+def _read_moving(path: Path, stamp: tuple[int, int], animation: str | int) -> MovingMesh:
+    moving = load_moving_mesh(path, animation)
+    if moving.rest.notes:
+        _say(path, moving.rest.notes)
+    return moving
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0  # reading it says what is wrong
+    return status.st_mtime_ns, status.st_size
 
 
 def file_mesh(path: Path) -> Mesh:
@@ -83,12 +112,7 @@ def file_mesh(path: Path) -> Mesh:
     Raises:
         SceneError: It cannot be read.
     """
-    try:
-        status = path.stat()
-        stamp = status.st_mtime_ns, status.st_size
-    except OSError:
-        stamp = 0, 0  # reading it says what is wrong
-    return _read_mesh(path, stamp)
+    return _read_mesh(path, _stamp(path))
 
 
 @functools.lru_cache(maxsize=4)

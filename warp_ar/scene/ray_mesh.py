@@ -15,6 +15,7 @@ from warp_ar import scene as scenes
 from warp_ar.kernels.wide_bvh import build_wide_bvh
 from warp_ar.scene.geometry import Mesh
 from warp_ar.scene.object_materials import file_mesh
+from warp_ar.scene.object_shapes import ObjectShape
 from warp_ar.scene.shapes import box_mesh, disk_mesh, rect_mesh, silhouette_tolerance, torus_mesh, tube_mesh
 
 FloatArray = npt.NDArray[np.float64]
@@ -98,8 +99,10 @@ def shared_ray_mesh(mesh: Mesh, device: Any) -> RayMesh:
     return known
 
 
-def mesh_key(item: scenes.Object | scenes.Proxy) -> Any:
+def mesh_key(item: ObjectShape | scenes.Object | scenes.Proxy) -> Any:
     """What a mesh is made from: a file, or the radii and tolerance of a torus; None for what rays meet analytically."""
+    if isinstance(item, ObjectShape):
+        return mesh_key(item.item) if item.mesh is None else item.mesh
     if item.shape == "mesh":
         return item.mesh if isinstance(item, scenes.Object) and item.mesh is not None else item.file
     if not isinstance(item, scenes.Object):

@@ -22,7 +22,9 @@ from warp_ar.scene.area_lights import make_area_table
 from warp_ar.scene.geometry import Mesh, rotation_matrix
 from warp_ar.scene.kinds import light_kind, material_model, shape_kind
 from warp_ar.scene.mesh_materials import MeshMaterial
+from warp_ar.scene.mesh_parts import LARGEST
 from warp_ar.scene.object_materials import is_detailed, look_of, mesh_of
+from warp_ar.scene.object_shapes import ObjectShape, object_shapes, part_placements, split_linear
 from warp_ar.scene.pose import Pose
 from warp_ar.scene.ray_mesh import (
     FloatArray,
@@ -58,7 +60,8 @@ class HostScene:
         self._meshes: dict[Any, tuple[Mesh, RayMesh, int]] = {}
         self._corners = 0
         textures = TexturePack()
-        self._objects = self._shape_records(scene.objects, device)
+        self._shapes = object_shapes(scene)
+        self._objects = self._shape_records(self._shapes, device)
         self._proxies = self._shape_records(scene.proxies, device)
         self._fixed_proxies = self._proxies.copy()
         self._textures = textures
@@ -99,8 +102,9 @@ class HostScene:
 
     def _write_area_lights(self, device: Any) -> None:
         """The table of what emits; numbers of a scene with the same ``skeleton`` may change it."""
-        keys = map(mesh_key, self.scene.objects)
-        table = make_area_table(self.scene.objects, [None if key is None else self._meshes[key][0] for key in keys])
+        keys = map(mesh_key, self._shapes)
+        meshes = [None if key is None else self._meshes[key][0] for key in keys]
+        table = make_area_table([shape.item for shape in self._shapes], meshes)
         self.has_area_lights = len(table.lights) > 0
         if not self.has_area_lights:
             return
@@ -149,7 +153,8 @@ class HostScene:
     def update(self, scene: scenes.Scene) -> None:
         """Take the numbers of another scene with the same ``skeleton``: poses, sizes, materials, lights."""
         self.scene = scene
-        self._objects = self._shape_records(scene.objects, self.ray_scene.materials.device)
+        self._shapes = object_shapes(scene)
+        self._objects = self._shape_records(self._shapes, self.ray_scene.materials.device)
         self._place_objects()
         self.ray_scene.materials.assign(self._material_records())
         self._lit = None
@@ -158,15 +163,21 @@ class HostScene:
         self._lights_edited = True
         self._write_area_lights(self.ray_scene.materials.device)
 
+    @property
+    def shape_count(self) -> int:
+        """How many records ``write_objects`` writes: one per object, or per part of one that its file moves."""
+        return len(self._shapes)
+
     def _place_objects(self) -> None:
         looks = [look_of(item) for item in self.scene.objects]
         counts = [len(look.materials) for look in looks]
-        self._objects["material"] = np.cumsum([0, *counts])[:-1]
-        self._objects["holed"] = [look.holed for look in looks]
+        starts = np.cumsum([0, *counts])
+        self._objects["material"] = [starts[shape.index] for shape in self._shapes]
+        self._objects["holed"] = [looks[shape.index].holed for shape in self._shapes]
         # Centres in local coordinates: a mesh is stored about the middle of its bounding box, wherever its origin was.
         self._centers = [
             record["scale"] * self._meshes[key][1].center if key is not None else np.zeros(3)
-            for record, key in zip(self._objects, map(mesh_key, self.scene.objects), strict=True)
+            for record, key in zip(self._objects, map(mesh_key, self._shapes), strict=True)
         ]
 
     def _material_records(self) -> npt.NDArray[Any]:
@@ -176,15 +187,16 @@ class HostScene:
             self._fill_material(record, item, material)
         return records
 
-    def _shape_records(self, items: Sequence[scenes.Object | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
+    def _shape_records(self, shapes: Sequence[ObjectShape | scenes.Proxy], device: Any) -> npt.NDArray[Any]:
         """Records of ``structs.Shape`` with all that does not move."""
-        records = np.zeros(len(items), _dtype(structs.Shape))
-        for record, item in zip(records, items, strict=True):
+        records = np.zeros(len(shapes), _dtype(structs.Shape))
+        for record, shape in zip(records, shapes, strict=True):
+            item = shape.item if isinstance(shape, ObjectShape) else shape
             scale = getattr(item, "scale", 1.0)
             rotation = rotation_matrix(item.rotate)
             position = np.array(item.at)
             record["kind"], record["scale"], record["material"] = shape_kind(item), scale, -1
-            key = mesh_key(item)
+            key = mesh_key(shape)
             if key is not None:
                 _, mesh, record["first_vertex"] = self._load(key, device)
                 record["mesh"], record["tree"] = mesh.mesh.id, mesh.tree_address
@@ -201,7 +213,8 @@ class HostScene:
         """Mesh of a file or torus and where its corners start, made once."""
         if key not in self._meshes:
             mesh = make_mesh(key)
-            ray_mesh = shared_ray_mesh(mesh, device) if isinstance(key, Path) else make_ray_mesh(mesh, device)
+            shared = isinstance(key, Path) or any(key is shape.mesh for shape in self._shapes)
+            ray_mesh = shared_ray_mesh(mesh, device) if shared else make_ray_mesh(mesh, device)
             self._meshes[key] = (mesh, ray_mesh, self._corners)
             self._corners += len(ray_mesh.normals)
         return self._meshes[key]
@@ -247,15 +260,22 @@ class HostScene:
         """Write the virtual objects as they stand ``seconds`` after the first frame.
 
         Args:
-            records_out: Records of ``structs.Shape``, one per object.
+            records_out: Records of ``structs.Shape``, ``shape_count`` of them.
             seconds: Time since the first frame.
             places: ``world_from_marker`` of the markers that something rides on; None where one is lost.
 
         Returns:
             Whether anything is not where ``records_out`` had it.
         """
-        for record, item, center in zip(self._objects, self.scene.objects, self._centers, strict=True):
-            if item.animate is not None or item.marker is not None or seconds == 0.0:
+        placed: dict[int, FloatArray] = {}
+        for record, shape, center in zip(self._objects, self._shapes, self._centers, strict=True):
+            item = shape.item
+            if shape.moving is not None:
+                if shape.index not in placed:
+                    placed[shape.index] = part_placements(item, shape.moving, seconds)
+                center = self._meshes[shape.mesh][1].center
+                _place_part(record, item, placed[shape.index][shape.part], center, places)
+            elif item.animate is not None or item.marker is not None or seconds == 0.0:
                 rotation, position = item.pose_at(seconds)
                 _place(record, item, rotation, position + rotation @ center, places)
         return _update(records_out, self._objects)
@@ -403,6 +423,31 @@ def _place(
         record["position"], record["scale"] = _AWAY, _AWAY_SCALE
         return
     record["rotation"], record["position"] = place.rotation @ rotation, place.apply(position)
+
+
+def _place_part(
+    record: Any,
+    item: scenes.Object,
+    placement: FloatArray,
+    center: FloatArray,
+    places: Mapping[scenes.Marker, Pose | None],
+) -> None:
+    """Put a part of an object where ``placement`` (4, 4) has it, its middle at ``center`` in its own coordinates."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        linear, position = placement[:3, :3], placement[:3, :3] @ center + placement[:3, 3]
+        if item.marker is not None:
+            place = places.get(item.marker)
+            if place is None:
+                linear = np.zeros((3, 3))
+            else:
+                linear, position = place.rotation @ linear, place.apply(position)
+    way = split_linear(linear)
+    if way.scale == 0.0 or not (np.abs(position) < LARGEST).all():
+        record["position"], record["scale"], record["stretch"] = _AWAY, _AWAY_SCALE, 0.0
+        record["rotation"] = np.eye(3)
+        return
+    record["scale"], record["rotation"], record["position"] = way.scale, way.rotation, position
+    record["stretch"], record["inverse"] = way.stretch, way.inverse
 
 
 def _factor(color: scenes.Color) -> tuple[tuple[float, float, float], Path | None]:

@@ -16,8 +16,10 @@ from warp_ar.scene.description import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Play,
 )
 from warp_ar.scene.keys import AREA_LIGHT_KEYS, LIGHT_KEYS, MATERIALS, OBJECT_KEYS, keys_of
+from warp_ar.scene.mesh_files import GLTF_SUFFIXES
 from warp_ar.scene.messages import SMALLEST
 from warp_ar.scene.read_physical import _read_mesh_path, read_own_marker
 from warp_ar.scene.scene_table import SceneTable
@@ -44,6 +46,7 @@ def read_object(table: SceneTable) -> Object:
         scale=table.number("scale", Object.scale, low=SMALLEST),
         material=_read_material(table) if "material" in table else Object.material,
         animate=_read_animation(table),
+        play=_read_play(table, shape),
         marker=read_own_marker(table),
     )
 
@@ -116,6 +119,25 @@ def _read_area_light(table: SceneTable, kind: str) -> AreaLight:
         two_sided=table.flag("two_sided", AreaLight.two_sided),
         animate=_read_animation(table),
         marker=read_own_marker(table),
+    )
+
+
+def _read_play(parent: SceneTable, shape: str) -> Play | None:
+    if "play" not in parent:
+        return None
+    if shape != "mesh" or _read_mesh_path(parent).suffix.lower() not in GLTF_SUFFIXES:
+        parent.fail("play", f"plays an animation of a file; give one that ends in {' or '.join(GLTF_SUFFIXES)}")
+    table = parent.inner("play", parent.data["play"], keys_of(Play))
+    animation: str | int = Play.animation
+    if isinstance(table.data.get("animation"), str):
+        animation = table.text("animation", right="an animation's name, or its number from 0 on")
+    elif "animation" in table:
+        animation = table.integer("animation", low=0)
+    return Play(
+        animation=animation,
+        loop=table.flag("loop", Play.loop),
+        start=table.number("start", Play.start, unit="seconds"),
+        speed=table.number("speed", Play.speed, low=SMALLEST),
     )
 
 

@@ -29,6 +29,7 @@ from warp_ar.scene.description import (
     MirrorMaterial,
     Object,
     PhongMaterial,
+    Play,
     Probe,
     Proxy,
     ProxyMaterial,
@@ -84,6 +85,7 @@ SECTIONS: Final[tuple[Section, ...]] = (
         "How a virtual object reflects light, or sends it out.",
         (PhongMaterial, MetallicRoughnessMaterial, LambertMaterial, MirrorMaterial, EmissiveMaterial),
     ),
+    Section("object.play", False, "How an animation of the object's glTF file is played.", (Play,)),
     Section("object.animate", False, "Motion of an object; a light's `animate` has the same keys.", (Animation,)),
     Section(
         "light",
@@ -158,6 +160,11 @@ _EXAMPLES: Final[dict[tuple[str, str], tuple[str, str, str]]] = {
     ("object.material", "intensity"): ("camera values", "4.0", 'model = "emissive"'),
     ("object.material", "image"): ("-", '"picture.png"', 'model = "emissive"'),
     ("object.material", "two_sided"): ("-", "true", 'model = "emissive"'),
+    ("object", "play"): ("-", "{ animation = 0 }", 'shape = "mesh"\nfile = "watch.glb"'),
+    ("object.play", "animation"): ("-", '"Open"', ""),
+    ("object.play", "loop"): ("-", "false", ""),
+    ("object.play", "start"): ("seconds", "2.0", ""),
+    ("object.play", "speed"): ("-", "0.5", ""),
     ("object.animate", "turn"): ("degrees per second", "[0.0, 0.0, 30.0]", ""),
     ("object.animate", "pivot"): ("metres", "[0.0, 0.0, 0.0]", "turn = [0.0, 0.0, 30.0]"),
     ("object.animate", "sway"): ("metres", "[0.02, 0.0, 0.0]", ""),
@@ -289,7 +296,9 @@ def example_scene(key: Key) -> str:
         lines += ["[camera]", _INTRINSICS]
     if key.section not in ("", "marker"):
         lines += ["[marker]", "size = 0.08"]
-    if key.section.startswith("object."):
+    if key.section == "object.play":
+        lines += ["[[object]]", 'shape = "mesh"', 'file = "watch.glb"']
+    elif key.section.startswith("object."):
         lines += ["[[object]]", 'shape = "sphere"', "radius = 0.03"]
     if key.section.startswith("proxy."):
         lines += ["[[proxy]]", 'shape = "plane"', "size = [1.6, 1.2]"]

@@ -14,6 +14,7 @@ from warp_ar.scene.description import (
     CapturedLight,
     Light,
     Object,
+    Play,
     PoseSpec,
     Probe,
     Proxy,
@@ -105,7 +106,10 @@ class _Writer:
                 raise SceneError("object: a mesh in memory cannot be written; export it, and give the object its file")
             model = next(name for name, kind in MATERIALS.items() if isinstance(item.material, kind))
             lines += ["", "[[object]]", *self.table(item, ("shape", *OBJECT_KEYS[item.shape], "at", "rotate", "scale"))]
-            lines += [*self.animation(item), *self.own_marker(item)]
+            lines += self.animation(item)
+            if item.play is not None:
+                lines += [f"play = {self.value({key: getattr(item.play, key) for key in keys_of(Play)})}"]
+            lines += self.own_marker(item)
             keys = keys_of(type(item.material))
             lines += ["", "[object.material]", f"model = {self.value(model)}", *self.table(item.material, keys)]
         for light in scene.lights:

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.kernels.motion import find_motion, remember
 from warp_ar.kernels.structs import FrameParams, Shape
+from warp_ar.scene.object_shapes import object_shapes
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 
@@ -35,7 +36,7 @@ class Motion(Stage):
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The motion, and the frame before."""
         width, height = self.request.size
-        count = max(1, len(self.request.scene.objects))
+        count = max(1, len(object_shapes(self.request.scene)))
         return {
             "motion": ArraySpec((height, width), wp.vec2),
             "motion_params": ArraySpec((1,), FrameParams, FrameParams()),

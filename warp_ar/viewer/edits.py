@@ -54,7 +54,16 @@ _KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     "exposure": ("scale",),
     "marker": ("dictionary", "id", "size"),
 }
-_MATERIAL_KEYS: Final = ("base_color", "diffuse", "specular", "shininess", "metallic", "roughness")
+_MATERIAL_KEYS: Final = (
+    "base_color",
+    "diffuse",
+    "specular",
+    "shininess",
+    "metallic",
+    "roughness",
+    "color",
+    "intensity",
+)
 _MODELS: Final[Mapping[str, type[Material]]] = {
     "lambert": LambertMaterial,
     "phong": PhongMaterial,

@@ -210,12 +210,14 @@ export class ScenePanel {
       ...Object.entries(MODELS).map(([value, text]) => el("option", { value, selected: value === material.model }, text)));
     rows.push(el("div", { class: "row" }, el("span", {}, "Material"), model));
     const number = (label, key, limits) => key in material && rows.push(slider(label, limits, material[key], (value) => set(key, value, material)));
-    for (const [label, key] of [["Colour", "base_color"], ["Diffuse", "diffuse"], ["Specular", "specular"]]) {
+    for (const [label, key] of [["Colour", "base_color"], ["Diffuse", "diffuse"], ["Specular", "specular"], ["Light", "color"]]) {
       if (key in material) rows.push(color(label, material[key], (value) => set(key, value, material)));
     }
     number("Metallic", "metallic", { low: 0, high: 1, step: 0.01 });
     number("Roughness", "roughness", { low: 0, high: 1, step: 0.01 });
     number("Shininess", "shininess", { low: 0, high: 1000, curve: 3, step: 1 });
+    // Of what emits: 1 is what the camera clips.
+    number("Emission", "intensity", { low: 0, high: Math.max(20, material.intensity ?? 0), curve: 3, step: 0.01 });
     return rows;
   }
 
