@@ -244,7 +244,7 @@ class Controller:
             self._chosen = True
             return True
         self.settings = self._target = self._before
-        self._entry_factor: float | None = None
+        self._entry_factor = None
         self.restart()
         return False
 
