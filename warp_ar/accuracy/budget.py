@@ -153,7 +153,7 @@ class Controller:
         self._factor: float | None = None
         self._times: collections.deque[float] = collections.deque(maxlen=WINDOWS[-1])
         self._skip = SETTLE
-        self._entry_factor = None
+        self._entry_factor: float | None = None
         self._held_since = -HELD_SECONDS
         self._chosen = running is None
         self.fits = True
