@@ -12,7 +12,6 @@ the same for emitters at finite distances. ``kernels/recover_cells.py`` has the 
 for what is missing in the clipped ones.
 """
 
-
 import functools
 
 import warp as wp
