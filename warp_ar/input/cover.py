@@ -29,8 +29,8 @@ from warp_ar.scene.pose import Pose
 
 Array = NDArray[np.float64]
 
-QUIET = 0.07
-"""Logarithm by which the median of all points may have changed."""
+QUIET = 0.15
+"""Logarithm by which the median of all points may have changed: a gain that is followed and a tone curve leave 0.1."""
 CHANGED = 0.4
 """Logarithm, in the channel that changed most, from which a point or a cell has changed."""
 NEAR_SHARE = 0.15
