@@ -92,14 +92,15 @@ class Hands:
         """Nothing serious hinders anybody in this step, and a finger hits what it wants."""
         self.page.screenshot(path=self._folder / f"{self._name}_{self._count}_{step}.png")
         self._count += 1
-        # On a phone the picture stays on top, and what is half scrolled beneath it is no small target.
-        y = self.page.evaluate("window.scrollY")
-        self.page.evaluate("window.scrollTo(0, 0)")
-        assert serious_findings(self.page) == [], step
+        found = serious_findings(self.page)
+        if self._phone:
+            # The picture stays on top, and axe takes what is half scrolled beneath it for a small target; all targets
+            # are measured below, against more than axe asks for.
+            found = [one for one in found if one[0] != "target-size"]
+        assert found == [], step
         if self._phone:
             assert self.page.evaluate(SMALL) == [], step
             assert self.page.evaluate("document.documentElement.scrollWidth") <= 390, "wider than the phone"
-        self.page.evaluate(f"window.scrollTo(0, {y})")
 
     def words(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
