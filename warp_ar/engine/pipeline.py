@@ -5,9 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-import numbers
 import os
-import pathlib
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,11 +17,12 @@ import warp as wp
 
 from warp_ar.closing import Closing
 from warp_ar.device import exclusive, resolve_device, translating
+from warp_ar.engine.arguments import check_exposure, check_frames, check_number, read_scene
 from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
 from warp_ar.engine.graph import make_plan
-from warp_ar.engine.layers import LayerArrays, check_outputs, expand_outputs, layer_arrays, neutral_layers
+from warp_ar.engine.layers import LayerArrays, layer_arrays, neutral_layers
 from warp_ar.engine.modules import Progress
 from warp_ar.engine.result import TRACK, Rendered, Result
 from warp_ar.engine.scheduler import Scheduler, StageTiming
@@ -35,7 +34,7 @@ from warp_ar.input.own_markers import OwnMarkers, Places, own_markers
 from warp_ar.input.plate import Plate, as_plate, check_plate, codes8
 from warp_ar.input.tracking import Tracker, TrackState
 from warp_ar.light.captured import has_places
-from warp_ar.scene import Pose, Scene, load_scene
+from warp_ar.scene import Pose, Scene
 from warp_ar.scene.finite import check_finite
 from warp_ar.scene.kinds import skeleton
 from warp_ar.stages.base import Arrays
@@ -63,49 +62,6 @@ def resolve_quality(quality: str | Quality) -> Quality:
     if quality not in PRESETS:
         raise UsageError(f"quality {quality!r} is no preset; expected {', '.join(PRESETS)}")
     return PRESETS[quality]
-
-
-def _check_number(name: str, value: object, above: float = -math.inf) -> None:
-    """Raise UsageError if an argument is no finite number, or not above a bound."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
-        right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
-        raise UsageError(f"{name} = {value!r}: expected {right}")
-
-
-def _check_exposure(scene: Scene) -> None:
-    scale = scene.exposure.scale
-    if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
-        raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
-
-
-def _read_scene(scene: object) -> Scene:
-    """What was given as a scene, checked.
-
-    Raises:
-        SceneError: It cannot be read, or one of its numbers is not finite.
-        UsageError: It is none.
-    """
-    if isinstance(scene, str | os.PathLike):
-        scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
-    if not isinstance(scene, Scene):
-        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
-    _check_exposure(scene)
-    check_finite(scene)
-    return scene
-
-
-def _check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
-    """The outputs, expanded, of frames that can be lit.
-
-    Raises:
-        UsageError: An exposure is none, an output is unknown, or frames of several exposures are linear.
-    """
-    for exposure in exposures:
-        _check_number("exposures", exposure, above=0.0)
-    check_outputs(outputs)
-    if linear and exposures:
-        raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
-    return expand_outputs(outputs)
 
 
 class Pipeline(Closing):
@@ -167,8 +123,8 @@ class Pipeline(Closing):
             UsageError: An argument that cannot be used.
             SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
-        scene = _read_scene(scene)
-        outputs = _check_frames(exposures, outputs, linear)
+        scene = read_scene(scene)
+        outputs = check_frames(exposures, outputs, linear)
         self._closed, self._process = False, os.getpid()
         self.device, self.quality = resolve_device(device), resolve_quality(quality)
         self.camera = scene.camera if size is None else scene.camera.scaled_to(*size)
@@ -269,7 +225,7 @@ class Pipeline(Closing):
             UsageError: The pipeline is closed, or another process's.
         """
         self._check_usable()
-        _check_exposure(scene)
+        check_exposure(scene)
         check_finite(scene, leave=("pose",))  # which stays as it was, or calls for another pipeline
         self._finish()
         scene = dataclasses.replace(scene, camera=scene.camera.scaled_to(*self.size))
@@ -350,7 +306,7 @@ class Pipeline(Closing):
             UsageError: A frame has been lit, the pipeline is closed, or the time is not finite.
         """
         self._check_usable()
-        _check_number("seconds", seconds)
+        check_number("seconds", seconds)
         if self._begun:
             raise UsageError("start_clock comes before the first frame")
         self._start_time = self._last_time = seconds
@@ -423,9 +379,9 @@ class Pipeline(Closing):
         """Look at a frame and have it rendered, by this thread or, if ``ahead``, by another where it is the host's."""
         self._check_usable()
         if time_seconds is not None:
-            _check_number("time_seconds", time_seconds)
+            check_number("time_seconds", time_seconds)
         if exposure_time is not None:
-            _check_number("exposure_time", exposure_time, above=0.0)
+            check_number("exposure_time", exposure_time, above=0.0)
         if pose is not None and not (np.isfinite(pose.rotation).all() and np.isfinite(pose.translation).all()):
             raise UsageError("pose holds a number that is not finite; expected a rotation and a translation")
         plate, image = self._take_depth(image)

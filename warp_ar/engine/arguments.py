@@ -1,0 +1,58 @@
+"""What callers give a pipeline, checked: one line says what is wrong and what would be right."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import os
+import pathlib
+from collections.abc import Sequence
+
+from warp_ar.engine.layers import check_outputs, expand_outputs
+from warp_ar.errors import UsageError
+from warp_ar.scene import Scene, load_scene
+from warp_ar.scene.finite import check_finite
+
+
+def check_number(name: str, value: object, above: float = -math.inf) -> None:
+    """Raise UsageError if an argument is no finite number, or not above a bound."""
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
+        right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
+        raise UsageError(f"{name} = {value!r}: expected {right}")
+
+
+def check_exposure(scene: Scene) -> None:
+    """Raise UsageError if a scene's exposure is no number that a camera can have."""
+    scale = scene.exposure.scale
+    if scale != "auto" and (isinstance(scale, str) or not 0.0 <= scale < math.inf):
+        raise UsageError(f'exposure.scale = {scale!r}: expected a finite number, 0 or more, or "auto"')
+
+
+def read_scene(scene: object) -> Scene:
+    """What was given as a scene, checked.
+
+    Raises:
+        SceneError: It cannot be read, or one of its numbers is not finite.
+        UsageError: It is none.
+    """
+    if isinstance(scene, str | os.PathLike):
+        scene = load_scene(scene if isinstance(scene, str) else pathlib.Path(scene))
+    if not isinstance(scene, Scene):
+        raise UsageError(f"scene is {type(scene).__name__}; expected a Scene, a scene file, or a bundled name")
+    check_exposure(scene)
+    check_finite(scene)
+    return scene
+
+
+def check_frames(exposures: Sequence[float], outputs: tuple[str, ...], linear: bool) -> tuple[str, ...]:
+    """The outputs, expanded, of frames that can be lit.
+
+    Raises:
+        UsageError: An exposure is none, an output is unknown, or frames of several exposures are linear.
+    """
+    for exposure in exposures:
+        check_number("exposures", exposure, above=0.0)
+    check_outputs(outputs)
+    if linear and exposures:
+        raise UsageError("linear frames of several exposures cannot be merged; give them as 8-bit codes")
+    return expand_outputs(outputs)
