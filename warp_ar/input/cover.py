@@ -47,6 +47,8 @@ PATIENCE = 1.5
 """Seconds after which what covers a ball is taken for a part of the scene."""
 MEMORY = 0.3
 """Time constant in seconds with which remembered codes follow frames."""
+LOOK_SECONDS = 0.1
+"""Between two looks at the points while no ball's disc changes: they take four times as long as the discs."""
 RINGS = (1.2, 1.7, 2.4, 3.4, 5.0)
 """Radii of the circles on planes around a ball on which points lie, over the ball's."""
 BESIDE = (1.1, 3.0)
@@ -80,7 +82,7 @@ class BallCover:
         """Take the next frame for the first."""
         self._shown: Array | None = None
         self._discs: list[Array] = []
-        self._last = self._since = 0.0
+        self._last = self._looked = self._since = 0.0
         self._covered = False
 
     def observe(
@@ -103,10 +105,16 @@ class BallCover:
         Returns:
             Whether a ball is covered.
         """
-        shown = self._logarithm(codes_around(image, self._camera, pose, self._points), gain)
         own = [self._logarithm(self._cells(image, disc), gain) for disc in discs]
-        if self._shown is None or len(own) != len(self._discs):
-            self._shown, self._discs, self._last, self._covered = shown, own, seconds, False
+        known = self._shown is not None and len(own) == len(self._discs)
+        rests = known and not self._covered and not any(map(self._has_changed, self._discs, own))
+        if rests and abs(seconds - self._looked) < LOOK_SECONDS:
+            self._follow_discs(own, seconds)
+            return False
+        shown = self._logarithm(codes_around(image, self._camera, pose, self._points), gain)
+        if not known:
+            self._shown, self._discs, self._covered = shown, own, False
+            self._last = self._looked = seconds
             return False
         was, self._covered = self._covered, self._is_covered(shown, own, discs, pose)
         if self._covered and not was:
@@ -114,11 +122,21 @@ class BallCover:
         if self._covered and abs(seconds - self._since) > PATIENCE:
             self._shown, self._discs, self._covered = shown, own, False
         if not self._covered:
-            rate = 1.0 - np.exp(-abs(seconds - self._last) / MEMORY)
-            self._shown = _follow(self._shown, shown, rate)
-            self._discs = [_follow(before, now, rate) for before, now in zip(self._discs, own, strict=True)]
-        self._last = seconds
+            assert self._shown is not None
+            self._shown = _follow(self._shown, shown, _rate(seconds - self._looked))
+            self._follow_discs(own, seconds)
+        self._last = self._looked = seconds
         return self._covered
+
+    def _follow_discs(self, own: list[Array], seconds: float) -> None:
+        rate = _rate(seconds - self._last)
+        self._discs = [_follow(before, now, rate) for before, now in zip(self._discs, own, strict=True)]
+        self._last = seconds
+
+    def _has_changed(self, before: Array, now: Array) -> bool:
+        """Whether a ball's disc shows something else."""
+        cells = np.abs(now - before).max(axis=1)[self._in_disc]
+        return bool((np.nan_to_num(cells) > CHANGED).mean() >= DISC_SHARE)
 
     def _is_covered(
         self, shown: Array, own: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
@@ -143,8 +161,7 @@ class BallCover:
             near = (away > BESIDE[0]) & (away < BESIDE[1])
             if near.sum() < LEAST_NEAR or is_other[near].mean() < NEAR_SHARE:
                 continue
-            cells = np.abs(now - before).max(axis=1)[self._in_disc]
-            if (np.nan_to_num(cells) > CHANGED).mean() >= DISC_SHARE:
+            if self._has_changed(before, now):
                 return True
         return False
 
@@ -168,6 +185,11 @@ class BallCover:
         """Of the radiance that codes stand for at gain 1, (n, 3)."""
         values = np.stack([np.interp(codes[:, c], np.arange(256), self._table[:, c]) for c in range(3)], -1)
         return np.asarray(np.log(values / gain + DARK))
+
+
+def _rate(seconds: float) -> float:
+    """Share by which what is remembered follows within so long."""
+    return float(1.0 - np.exp(-abs(seconds) / MEMORY))
 
 
 def _follow(before: Array, now: Array, rate: float) -> Array:
