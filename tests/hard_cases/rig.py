@@ -361,6 +361,7 @@ def blind_camera() -> dict[str, Any]:
     return {
         "pose": None,
         "frame": wp.zeros((1, 1), dtype=wp.vec3ub),
+        "linear_frame": wp.zeros((0, 0), dtype=wp.vec3),
         "decode": wp.zeros(257, dtype=wp.vec3),
         "params": wp.zeros(1, dtype=FrameParams),
         "probes": wp.zeros(0, dtype=BallRecord),

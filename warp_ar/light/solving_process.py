@@ -19,6 +19,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol
 
 from warp_ar.device import usable_cores
@@ -84,7 +85,8 @@ class SolvingProcess:
 
     def __init__(self) -> None:
         """Start; returns at once."""
-        paths = [path for path in sys.path if path]
+        # Where this process finds what it imports, wherever it stands now and however it was begun.
+        paths = [str(Path(__file__).parents[2]), *(os.path.abspath(path) for path in sys.path)]
         code = f"import sys; sys.path[:] = {paths!r}; from {__name__} import serve; serve()"
         self._process = subprocess.Popen(
             [sys.executable, "-c", code],
