@@ -10,14 +10,7 @@ import pytest
 from tests.test_recover import DistantLight, lit_environment, scene  # noqa: F401
 from warp_ar.light.card import check_card
 from warp_ar.light.config import CONFIG, Kind
-from warp_ar.light.evidence import (
-    allowed_factor,
-    doubt_of,
-    light_beside,
-    likely_gain,
-    share_beside,
-    spread_directions,
-)
+from warp_ar.light.evidence import allowed_factor, doubt_of, likely_gain, spread_directions
 from warp_ar.light.recovery import Recovery, tie_channels
 
 EMITTER = ((-0.5, -0.6, 0.6), 0.985, 30.0)
@@ -80,53 +73,6 @@ def test_what_a_factor_leaves_is_no_worse_than_nothing(share):
     worse = np.linalg.norm(taken - missing, axis=1) > np.linalg.norm(missing, axis=1)
     assert worse.mean() <= CONFIG.evidence.share + 1.0 / 200
     assert likely_gain(taken, missing) >= -1e-9
-
-
-def planes(shown, *, kind=Kind.PLANE):
-    """Points of a plane along a line from a ball of radius 1 at the origin; one cell lights them all by 1."""
-    at = np.linspace(1.0, 20.0, len(shown))
-    return types.SimpleNamespace(
-        kind=np.full(len(shown), kind),
-        exact=np.ones((len(shown), 3), bool),
-        points=np.column_stack([at, np.zeros((len(at), 2))]),
-        captured=np.full((len(shown), 3), 0.5),
-        transfer=np.full((len(shown), 1), 0.5, np.float32),
-        missing=np.ones((1, 3)),
-        light=0.3 * np.asarray(shown)[:, None] * np.ones(3),
-    )
-
-
-def test_what_planes_show_beside_the_ball_is_compared_with_what_an_estimate_has_there():
-    far = np.linspace(1.0, 20.0, 60) > 5.0
-    center, found = np.zeros(3), np.ones(1)
-    assert light_beside(planes(np.ones(60)), 1, found, center, 1.0) == pytest.approx(0.0)
-    shaded = planes(np.where(far, 1.0, 0.5))
-    assert light_beside(shaded, 1, found, center, 1.0) == pytest.approx(np.log(0.5))
-    # An estimate that has less light there is in keeping with it.
-    shaded.transfer[~far] = 0.0
-    assert light_beside(shaded, 1, found, center, 1.0) == pytest.approx(0.0)
-    # Without points on both sides nothing is told.
-    assert light_beside(planes(np.ones(60), kind=Kind.FACE), 1, found, center, 1.0) == 0.0
-    assert light_beside(planes(np.where(far, 1.0, 0.5)[:10]), 1, found, center, 20.0) == 0.0
-
-
-def test_an_estimate_is_dropped_as_its_light_is_missing_beside_the_ball():
-    low, high = CONFIG.evidence.darker
-    assert [share_beside(x) for x in (1.0, 0.0, -low, -high, -1.0)] == pytest.approx([1.0, 1.0, 1.0, 0.0, 0.0])
-    assert share_beside(-0.5 * (low + high)) == pytest.approx(0.5)
-
-
-def test_light_at_the_card_that_the_ball_does_not_stand_in_is_not_recovered(device, scene):
-    """Clutter that the scene does not model shades the ball and the table around it."""
-    light = DistantLight(device, scene)
-    radiance, _, _ = lit_environment(EMITTER)
-    assert light.estimate(radiance)[0].factor == 1.0
-    away = np.linalg.norm(light.surfaces.points["position"] - np.array([-0.12, 0.03, 0.035]), axis=1)
-    on_table = light.surfaces.kinds[light.surfaces.surface] == Kind.PLANE
-    light.reflectance[on_table & (away < 5.0 * 0.035)] *= 0.5
-    estimate, _ = light.estimate(radiance)
-    assert (estimate.method, estimate.factor, estimate.emitters) == ("clipped", 0.0, ())
-    assert not estimate.recovered.any()
 
 
 def test_contrast_beyond_print_makes_the_card_doubtful():

@@ -195,13 +195,6 @@ class EvidenceConfig:
     lever: float = 2.0
     """Share of light from all directions that may be missing, over that which is missing at the card: what hardly
     lights the card is hardly known by it."""
-    beside: tuple[float, float] = (4.0, 7.0)
-    """Radii around a ball within which a plane is beside it, and beyond which it is away from it."""
-    beside_points: int = 6
-    """Points of planes that must be seen, of either."""
-    darker: tuple[float, float] = (0.17, 0.23)
-    """Logarithm by which planes beside the ball show less light than an estimate has there, against those away from it,
-    from which less of the estimate is taken, and none."""
     interval: float = 2.5
     """Standard deviations of the draws that an interval of irradiance reaches to either side."""
     found: float = 0.3

@@ -11,10 +11,6 @@ card for as white as it is said to be. So the problem is solved some times more,
 Paper is at most some thirty times as bright as the ink on it. Where it looks brighter still, the response is steeper
 than it is taken to be, as an S-shaped tone curve makes it, and the card is doubted by as much.
 
-**Light at the ball.** The card may stand in light that the ball does not: in the sun, with the ball in the shadow of
-clutter. What the card lacks is then put where the ball clips, and is not there. Planes tell: their points beside the
-ball then show less than the estimate has there, against points away from it, whatever they reflect (``light_beside``).
-
 Let X be the irradiance, over all directions, that an estimate adds, and D that which is really missing. The estimate is
 no worse than nothing as long as |X - D| <= |D|, which for the estimate a X is
 
@@ -142,36 +138,6 @@ def most_by_card(captured: Array, added: Array, share: float) -> float:
     if most >= 1.0 or size <= 0.0:
         return 1.0
     return min(most / (1.0 - most) * float(np.linalg.norm(captured)) / size, 1.0)
-
-
-def light_beside(problem: Problem, c: int, recovered: Array, center: Array, radius: float) -> float:
-    """How much more of an estimate's light planes show beside the ball than away from it, as a logarithm.
-
-    Args:
-        problem: The equations.
-        c: Channel.
-        recovered: Radiance that cells lack, by the estimate, (cells,).
-        center: Of the ball, metres, (3,).
-        radius: Of the ball, metres.
-
-    Returns:
-        Difference of the medians of the logarithm of shown over expected light; 0 where too few points tell.
-    """
-    config = CONFIG.evidence
-    told = (problem.kind == Kind.PLANE) & problem.exact[:, c]
-    away = np.linalg.norm(problem.points - center, axis=1)
-    parts = [told & (away < config.beside[0] * radius), told & (away > config.beside[1] * radius)]
-    if min(int(part.sum()) for part in parts) < config.beside_points:
-        return 0.0
-    expected = problem.captured[:, c] + problem.transfer @ (recovered * problem.missing[:, c]).astype(np.float32)
-    ratio = np.log(problem.light[:, c] / np.maximum(expected, 1e-6))
-    return float(np.median(ratio[parts[0]]) - np.median(ratio[parts[1]]))
-
-
-def share_beside(beside: float) -> float:
-    """Share of an estimate that is taken, 0 to 1, by ``light_beside``."""
-    low, high = CONFIG.evidence.darker
-    return float(np.clip((high + beside) / (high - low), 0.0, 1.0))
 
 
 def likely_gain(added: Array, missing: Array) -> float:

@@ -59,10 +59,8 @@ from warp_ar.light.evidence import (
     draw_missing,
     irradiance_form,
     irradiance_interval,
-    light_beside,
     likely_gain,
     most_by_card,
-    share_beside,
     spread_directions,
 )
 from warp_ar.light.fit import fit_channel
@@ -223,7 +221,7 @@ class Recovery:
             start = fit_channel(problem, c, problem.start(means[c]), CONFIG.solver.iterations).z
             self._evidence = _weigh(
                 problem, c, start, bounds, (recovered, by_card), self._blocks, doubt_of(card.contrast)
-            ).reduced(share_beside(light_beside(problem, c, recovered[:, c], self._center, self._radius)))
+            )
         evidence = self._evidence
         if evidence.method == "shading":
             self._held = self._estimate(problem, recovered, bounds, *evidence.parts, card, tuple(emitters))
@@ -301,10 +299,6 @@ class _Evidence:
     @property
     def parts(self) -> tuple[str, float]:
         return self.method, self.factor
-
-    def reduced(self, share: float) -> _Evidence:
-        """The same with a share of what was taken, 0 to 1."""
-        return dataclasses.replace(self, factor=share * self.factor)
 
 
 def _told_channel(problem: Problem) -> int:
