@@ -28,7 +28,7 @@ def folder(tmp_path):
     calibration = f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: {matrix}"
     (tmp_path / "camera.yml").write_text(calibration)
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0.0 0.1 0.6 1 a.png\n")
-    for name in ("light.exr", "picture.png"):
+    for name in ("light.exr", "picture.png", "watch.glb"):
         (tmp_path / name).write_bytes(b"read when it is needed")
     return tmp_path
 

@@ -291,8 +291,11 @@ def test_file_is_a_video_while_it_grows(tmp_path: pathlib.Path, name: str) -> No
             if index in {60, 90}:
                 copy = tmp_path / f"copy{index}{pathlib.Path(name).suffix}"
                 shutil.copy(tmp_path / name, copy)
-                with av.open(str(copy)) as container:
-                    counts.append(sum(1 for _ in container.decode(video=0)))
+                counts.append(0)
+                # The copy may end within a fragment; what comes before plays.
+                with av.open(str(copy)) as container, contextlib.suppress(av.error.InvalidDataError):
+                    for _ in container.decode(video=0):
+                        counts[-1] += 1
     # What is not on disk yet: half a second of fragment, the encoder's look-ahead, and the frames that wait.
     assert counts[0] >= 60 - 40
     assert counts[1] >= 90 - 40

@@ -124,6 +124,7 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
 
 def test_a_library_begins_with_the_better_ones(monkeypatch) -> None:
     monkeypatch.delenv(tiers.VARIABLE, raising=False)
+    monkeypatch.setattr(tiers, "_BESIDE", tiers._Beside())  # other tests of this process run commands
     assert tiers.tiers() == "one"
     monkeypatch.setattr(tiers._BESIDE, "default", "two")
     assert tiers.tiers() == "two"
@@ -168,6 +169,7 @@ def usual_kernel(values_out: wp.array[wp.int32]):
 
 def test_only_marked_kernels_are_compiled_quickly_and_none_twice(monkeypatch, tmp_path) -> None:
     device = resolve_device("cpu")
+    monkeypatch.setattr(tiers, "_BESIDE", tiers._Beside())
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setenv(tiers.VARIABLE, "quick")
     assert is_slow_to_compile(marked_kernel)
