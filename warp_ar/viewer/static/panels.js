@@ -377,7 +377,7 @@ export class TimePanel {
 
 const BUDGET = { low: 1, high: 1000 }; // milliseconds
 const AIM = 0.9; // the share of a budget that the program plans for
-const share = (ms) => Math.min(Math.max(Math.log(ms / BUDGET.low) / Math.log(BUDGET.high / BUDGET.low), 0), 1);
+const share = (ms) => Math.min(Math.max(Math.log(Math.max(ms, BUDGET.low) / BUDGET.low) / Math.log(BUDGET.high / BUDGET.low), 0), 1);
 const duration = (seconds) => (seconds < 90 ? `${Math.max(Math.round(seconds / 5) * 5, 5)} s` : `${Math.round(seconds / 60)} minutes`);
 const brief = (ms) => ms.toFixed(ms < 10 ? 1 : 0);
 const SVG = "http://www.w3.org/2000/svg";
