@@ -62,7 +62,11 @@ def make_parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=DEFAULT_FRAMES, metavar="N", help=f"frames per run (default: {DEFAULT_FRAMES})")
     add("--shrink", type=int, default=1, metavar="N", help="frames at an Nth of their width and height (default: 1)")
     add("--device", default="auto", metavar="auto|cpu|cuda:0", help="where the kernels run (default: auto)")
-    add("--quick", action="store_true", help="leave brute force out: seconds instead of minutes on CPU")
+    add(
+        "--quick",
+        action="store_true",
+        help="leave out brute force, and methods between two others: minutes instead of hours on CPU",
+    )
     add("--processor-time", action="store_true", help="on CPU count the work of one thread, not the time by the clock")
     add(
         "--out",

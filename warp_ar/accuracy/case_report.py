@@ -87,14 +87,9 @@ def settings_of(case: Case) -> tuple[Setting, ...]:
     return relevant_settings(case.scene, (case.scene.camera.width, case.scene.camera.height))
 
 
-def without_brute_force(setting: Setting) -> list[str]:
-    """Methods of a setting that end soon."""
-    return [method for method in setting.methods if method != "brute_force"]
-
-
 def work_units(case: Case, settings: Sequence[Setting], *, quick: bool = False) -> float:
     """Units of work that ``measure_case`` will report as done: runs of the case's frames, at most."""
-    methods = [without_brute_force(setting) if quick else setting.methods for setting in settings]
+    methods = [setting.measured if quick else setting.methods for setting in settings]
     units = sum(run_units(method) for own in methods for method in own)
     if case.name.endswith(SIZED):
         return units
@@ -118,13 +113,13 @@ def measure_case(
         device: Where.
         settings: What to turn.
         advance: Told of what is done, ``work_units`` in all.
-        quick: Leave brute force out.
+        quick: Leave brute force out, and what lies between two other methods.
         clock: Seconds, on CPU.
     """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
     for setting in settings:
-        methods = without_brute_force(setting) if quick else setting.methods
+        methods = setting.measured if quick else setting.methods
         own, shown = sweep(case, setting, device, methods=methods, clock=clock, advance=advance)
         rows += own
         pictures.update({(setting.name, method): image for method, image in shown.items()})
