@@ -1,6 +1,6 @@
 """Estimates of recovery in processes of their own, for pictures that are shown as they are made.
 
-A solution is a hundred milliseconds of small NumPy products that hold Python's lock; threads of the same process that
+A solution is 20 to 100 ms of small NumPy products that hold Python's lock; threads of the same process that
 launch kernels or look for markers then wait for it at each of their calls. In a process beside them it costs the frames
 the copies of its equations, some 12 MB. A process keeps nothing between two estimates: a solver goes there and comes
 back with what it learnt, so a process that dies costs one estimate, which is then made here.
@@ -179,7 +179,7 @@ class SolvingPool:
             self._drop(process)
             return solver, solve_by(solver, sides, trace)
         except BaseException:
-            self._drop(process)  # it may wait for an answer that will not come
+            self._drop(process)  # where the trace failed, it waits for an answer that will not come
             raise
         with self._changed:
             self._idle.append(process)
