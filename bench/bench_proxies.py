@@ -48,7 +48,7 @@ def with_boxes(scene: Scene, count: int) -> Scene:
 def frame_times(frames: Clip, device: str, quality: str) -> tuple[list[float], list[dict[str, float]], list[float]]:
     """Milliseconds of each frame and of its stages, and the upward irradiance that recovery reports at the end."""
     whole, stages = [], []
-    with Pipeline(frames.scene, device=device, quality=quality, profile=True, synchronous=True) as pipeline:
+    with Pipeline(frames.scene, device=device, quality=quality, profile=True, estimates="synchronous") as pipeline:
         pipeline.warm_up()
         for index in range(FRAMES):
             start = time.process_time()

@@ -101,7 +101,7 @@ def open_streams(
     for _ in range(count):
         wp.synchronize_device(device)
         begin, busy, before = time.perf_counter(), time.process_time(), used_memory(device)
-        stream = Stream(close.enter_context(Pipeline(frames.scene, device=str(device), real_time=True)))
+        stream = Stream(close.enter_context(Pipeline(frames.scene, device=str(device), estimates="real_time")))
         picture = stream.show(frames, 0, 0.0)
         spent = time.perf_counter() - begin, time.process_time() - busy
         costs.append((spent[0] * 1e3, spent[1] * 1e3, used_memory(device) - before))

@@ -226,7 +226,7 @@ OUTPUTS = ("image", "radiance", "environment")
 
 def lit(frame: Any, pose: Any = None, **more: Any) -> Any:
     with warp_ar.Pipeline(
-        "desk", device="cpu", quality="medium", size=(160, 120), outputs=OUTPUTS, synchronous=True, **more
+        "desk", device="cpu", quality="medium", size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
     ) as pipeline:
         result = pipeline(frame, pose=pose)
         return result.image, result.radiance, result.environment, result.layers

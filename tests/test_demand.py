@@ -19,6 +19,7 @@ from warp_ar.light.recovery import Estimate, Recovery
 from warp_ar.scene import Exposure, Light, Scene
 from warp_ar.stages.base import Reach, Wiring
 from warp_ar.stages.quality import PRESETS
+from warp_ar.stages.request import Estimates
 
 # --- The walk ---------------------------------------------------------------------------------------------------------
 
@@ -164,7 +165,9 @@ FRAMES = st.tuples(
 """Pose, whether objects can be seen, lights, picture, seconds since the frame before."""
 
 
-def run(path: Sequence[Frame], device: str, preset: str, *, culling: bool, synchronous: bool = True) -> list[Result]:
+def run(
+    path: Sequence[Frame], device: str, preset: str, *, culling: bool, estimates: Estimates = "synchronous"
+) -> list[Result]:
     """A pipeline over a path of frames, its pictures read."""
     results, now = [], 0.0
     with Pipeline(
@@ -172,7 +175,7 @@ def run(path: Sequence[Frame], device: str, preset: str, *, culling: bool, synch
         device=device,
         quality=QUALITIES[preset],
         bands=2,
-        synchronous=synchronous,
+        estimates=estimates,
         culling=culling,
     ) as pipeline:
         for pose, objects, lights, picture, step in path:
@@ -238,12 +241,14 @@ def number_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize(("preset", "synchronous"), [("paper", True), ("emitters", True), ("emitters", False)])
+@pytest.mark.parametrize(
+    ("preset", "estimates"), [("paper", "synchronous"), ("emitters", "synchronous"), ("emitters", "delayed")]
+)
 def test_what_comes_back_is_fresh(
-    monkeypatch: pytest.MonkeyPatch, device: str, preset: str, synchronous: bool, path: str
+    monkeypatch: pytest.MonkeyPatch, device: str, preset: str, estimates: Estimates, path: str
 ) -> None:
     number_estimates(monkeypatch)
-    results = assert_equal(PATHS[path], device, preset, synchronous=synchronous)
+    results = assert_equal(PATHS[path], device, preset, estimates=estimates)
     assert any(timing.left_out for result in results for timing in result.stages.values())
 
 
@@ -252,7 +257,7 @@ def test_recovery_asks_in_the_frame_that_needs_it_again(monkeypatch: pytest.Monk
     number_estimates(monkeypatch)
     asked, now = [], 0.0
     with Pipeline(
-        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, synchronous=True
+        scene_of(True, "on"), device="cpu", quality=QUALITIES["emitters"], bands=2, estimates="synchronous"
     ) as pipeline:
         for pose, objects, lights, picture, step in PATHS["long"]:
             pipeline.update(scene_of(objects, lights))

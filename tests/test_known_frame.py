@@ -25,7 +25,10 @@ def test_it_is_the_frame_that_the_pipeline_lit(known: KnownFrame) -> None:
     scene = load_scene("torus")
     assert scene.source is not None
     assert scene.source.path is not None
-    with open_source(scene.source.path) as source, Pipeline(scene, device="cpu", quality="low", synchronous=True) as p:
+    with (
+        open_source(scene.source.path) as source,
+        Pipeline(scene, device="cpu", quality="low", estimates="synchronous") as p,
+    ):
         frames = iter(source)
         p(next(frames).image, time_seconds=0.0)
         second = next(frames)

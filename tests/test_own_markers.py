@@ -118,7 +118,7 @@ def test_a_frame_shows_an_object_on_its_card(device: str) -> None:
         changed = np.argwhere(np.abs(image.astype(int) - frame).max(axis=-1) > 3)
         return changed.mean(axis=0)[::-1] if len(changed) else None
 
-    with Pipeline(scene, device=device, quality=PRESETS["low"], synchronous=True) as pipeline:
+    with Pipeline(scene, device=device, quality=PRESETS["low"], estimates="synchronous") as pipeline:
         for k, x in enumerate((0.10, 0.12)):
             card = camera_from_world.after(place(x, 0.02, 20.0))
             frame = render((WORLD, camera_from_world), (CARD, card))
@@ -192,7 +192,7 @@ def test_a_ball_on_its_card_may_be_moved(device: str) -> None:
     red, blue = (200, 20, 20), (20, 20, 200)
     quality = PRESETS["paper"]
     with Pipeline(
-        scene, device=device, quality=quality, outputs=("image", "environment"), synchronous=True
+        scene, device=device, quality=quality, outputs=("image", "environment"), estimates="synchronous"
     ) as pipeline:
         means = []
         for k, (x, color) in enumerate([(-0.12, red), *[(0.12, blue)] * 4, (None, red)]):

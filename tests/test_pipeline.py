@@ -361,6 +361,11 @@ def test_numbers_of_a_scene_that_are_not_finite_are_named(frames: Frames) -> Non
         assert (pipeline(frames[0]).image == before).all()
 
 
+def test_ways_to_wait_that_are_none_are_refused() -> None:
+    with pytest.raises(UsageError, match="estimates = True: expected 'synchronous', 'delayed', 'real_time'"):
+        Pipeline(make_scene(), device="cpu", estimates=True)  # type: ignore[arg-type]
+
+
 def test_impossible_exposures_are_refused(frames: Frames) -> None:
     for scale in (math.nan, math.inf, -1.0, "dark"):
         with pytest.raises(UsageError, match=r"exposure\.scale"):

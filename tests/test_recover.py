@@ -797,14 +797,14 @@ def spied_estimates(monkeypatch, seconds=0.0):
     monkeypatch.setattr(recovery.Recovery, "update", update)
 
 
-def shown_estimates(scene, device, count, turns=1, synchronous=False):
+def shown_estimates(scene, device, count, turns=1, estimates="delayed"):
     """Number of the estimate that each of ``count`` frames, 30 a second, was lit by; pipelines take turns."""
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     rng = np.random.default_rng(6)
     shown = []
     with contextlib.ExitStack() as stack:
         quality = PRESETS["low"].with_methods(recover="white_card")
-        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "synchronous": synchronous}
+        arguments = {"device": device, "quality": quality, "outputs": ("environment",), "estimates": estimates}
         pipelines = [stack.enter_context(Pipeline(scene, **arguments)) for _ in range(turns)]
         for index in range(count):
             now, before = pipelines[index % turns], pipelines[(index - 1) % turns]
@@ -828,7 +828,7 @@ def test_estimates_take_effect_a_fixed_time_later(scene, device, monkeypatch, se
 def test_an_estimate_that_is_waited_for_lights_its_own_frame(scene, device, monkeypatch):
     spied_estimates(monkeypatch, 0.05)
     expected = [1, 2, *[3] * 6, *[4] * 6, 5, 5]
-    assert shown_estimates(scene, device, len(expected), synchronous=True) == expected
+    assert shown_estimates(scene, device, len(expected), estimates="synchronous") == expected
 
 
 def what_is_seen(surroundings=0.4, table=0.3):
@@ -927,7 +927,7 @@ def test_the_stage_lets_an_estimate_stand(scene, device, monkeypatch):
     pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))
     quality = PRESETS["low"].with_methods(recover="white_card")
     lit = []
-    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), synchronous=True) as pipeline:
+    with Pipeline(scene, device=device, quality=quality, outputs=("environment",), estimates="synchronous") as pipeline:
         for index in range(100):
             result = pipeline(image, time_seconds=index / 30, pose=pose)
             lit.append(result.environment)

@@ -46,8 +46,10 @@ def test_layers_together_are_the_picture(device, quality, scale):
 def test_layers_change_nothing_of_the_picture(device):
     scene = make_scene(exposure=Exposure(0.7))
     with (
-        Pipeline(scene, device=device, quality="medium", synchronous=True) as plain,
-        Pipeline(scene, device=device, quality="medium", synchronous=True, outputs=("image", *LAYERS)) as layered,
+        Pipeline(scene, device=device, quality="medium", estimates="synchronous") as plain,
+        Pipeline(
+            scene, device=device, quality="medium", estimates="synchronous", outputs=("image", *LAYERS)
+        ) as layered,
     ):
         for one, other in zip(run(plain), run(layered), strict=True):
             np.testing.assert_array_equal(one.image, other.image)

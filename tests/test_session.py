@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_pipeline import make_scene
+from warp_ar import session as session_module
 from warp_ar.engine.pipeline import Pipeline
 from warp_ar.errors import SceneError, UsageError
 from warp_ar.scene import Camera, Light, SourceSpec
@@ -65,3 +66,27 @@ def test_what_cannot_be_shown_changes_nothing() -> None:
         pytest.raises(UsageError, match="chooses for itself"),
     ):
         session.change(quality="low")
+
+
+@pytest.mark.parametrize(
+    ("live", "quality", "expected"),
+    [
+        (False, "low", "synchronous"),
+        (True, "low", "real_time"),
+        (False, "auto", "delayed"),
+        (True, "auto", "real_time"),
+    ],
+)
+def test_no_frame_of_a_camera_waits_for_an_estimate(
+    monkeypatch: pytest.MonkeyPatch, live: bool, quality: str, expected: str
+) -> None:
+    open_it = session_module._open_source
+
+    def opened(*arguments: object):
+        source = open_it(*arguments)
+        source.live = live
+        return source
+
+    monkeypatch.setattr(session_module, "_open_source", opened)
+    with Session(scene(), device="cpu", quality=quality) as session:
+        assert session.pipeline.plan.request.estimates == expected

@@ -159,7 +159,7 @@ def test_frames_in_real_time_begin_alike_and_take_what_is_there(monkeypatch):
     monkeypatch.setattr(recover, "REST", -1.0)  # however long the first ones took
     with (
         Pipeline(scene, device="cpu") as usual,
-        Pipeline(scene, device="cpu", real_time=True) as live,
+        Pipeline(scene, device="cpu", estimates="real_time") as live,
     ):
         for frame in frames[: recover.EVERY_FRAME]:
             expected = usual(frame.image, time_seconds=frame.time).image

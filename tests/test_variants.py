@@ -26,7 +26,7 @@ def test_a_shared_kernel_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch,
         monkeypatch.setattr(variants, "shares_kernels", lambda device, shared=shared: shared)
         for stage in ("mirror_ball", "unwrap"):
             monkeypatch.setattr(f"warp_ar.stages.{stage}.shares_kernels", lambda device, shared=shared: shared)
-        with Pipeline(scene, device="cpu", quality=quality, synchronous=True) as pipeline:
+        with Pipeline(scene, device="cpu", quality=quality, estimates="synchronous") as pipeline:
             lit.append([pipeline(image, time_seconds=k / 24.0).image for k, image in enumerate(images)])
     np.testing.assert_array_equal(lit[0], lit[1])
     assert any((shown != image).any() for shown, image in zip(lit[0], images, strict=True)), "nothing was lit"

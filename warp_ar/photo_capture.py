@@ -258,7 +258,7 @@ def _unwrap(
             outputs=("environment",),
             exposures=times if len(times) > 1 else (),
             shown=times[index] if len(times) > 1 else None,
-            synchronous=True,
+            estimates="synchronous",
         )
     with pipeline:
         order = [*(k for k in range(len(times)) if k != index), index]

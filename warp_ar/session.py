@@ -148,6 +148,8 @@ class Session(Closing):
             given: dict[str, Any] = {"size": size, "outputs": outputs, "exposures": exposures, "shown": shown}
             if quality == AUTO:
                 budget = DEFAULT_BUDGET_MS if budget_ms is None else budget_ms
+                # A budget is kept by frames that do not wait, of recordings too.
+                given["estimates"] = "real_time" if self.source.live else "delayed"
                 self.pipeline = AutoPipeline(self.scene, budget_ms=budget, device=device, **given)
             else:
                 self.pipeline = self._open(Target(self.scene, resolve_quality(quality), **given), device)
@@ -167,9 +169,8 @@ class Session(Closing):
             device=device,
             keep=1,
             profile=False,
-            synchronous=not source.live,
+            estimates="real_time" if source.live else "synchronous",
             linear=linear,
-            real_time=source.live,
         )
         return self._switcher.open(target)
 

@@ -63,6 +63,7 @@ from warp_ar.engine.switcher import PipelineSwitcher, Target
 from warp_ar.errors import UsageError
 from warp_ar.scene import Pose, Scene
 from warp_ar.stages.quality import DEFAULT_BUDGET_MS, Quality
+from warp_ar.stages.request import Estimates
 
 AIM = 0.95
 """Share of the budget that is planned for."""
@@ -393,6 +394,7 @@ class AutoPipeline(Closing):
         exposures: Sequence[float] = (),
         shown: float | None = None,
         bands: int | None = None,
+        estimates: Estimates = "delayed",
         costs: Costs | None = None,
         folder: Path | None = None,
         clock: Callable[[], float] = time.perf_counter,
@@ -408,6 +410,7 @@ class AutoPipeline(Closing):
             exposures: As for ``Pipeline``.
             shown: As for ``Pipeline``.
             bands: Bands of rows per CPU pass; None means one per core.
+            estimates: As for ``Pipeline``.
             costs: Known costs; None reads or measures them.
             folder: Where costs are kept; None means the user's cache folder.
             clock: Seconds.
@@ -423,7 +426,7 @@ class AutoPipeline(Closing):
         self._errors = load_errors()
         self.settings = relevant_settings(scene, size or (scene.camera.width, scene.camera.height))
         self._base = {setting.name: chosen(BASE, setting) for setting in self.settings}
-        self._switcher = PipelineSwitcher(device=device, bands=bands, keep=_KEPT_PIPELINES - 1)
+        self._switcher = PipelineSwitcher(device=device, bands=bands, estimates=estimates, keep=_KEPT_PIPELINES - 1)
         self._target = Target(scene, turn(BASE, self._base), size, outputs, tuple(exposures), shown)
         self.pipeline = self._switcher.open(self._target)
         """The one that lights the next frame."""

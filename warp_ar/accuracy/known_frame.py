@@ -113,7 +113,7 @@ def light_up_to(
             outputs=("image", "environment", "pose"),
             exposures=frames.exposures,
             shown=shown,
-            synchronous=True,
+            estimates="synchronous",
         ) as pipeline,
     ):
         first: float | None = None

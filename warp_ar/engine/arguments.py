@@ -6,12 +6,14 @@ import math
 import numbers
 import os
 import pathlib
+import typing
 from collections.abc import Sequence
 
 from warp_ar.engine.layers import check_outputs, expand_outputs
 from warp_ar.errors import UsageError
 from warp_ar.scene import Scene, load_scene
 from warp_ar.scene.finite import check_finite
+from warp_ar.stages.request import Estimates
 
 
 def check_number(name: str, value: object, above: float = -math.inf) -> None:
@@ -19,6 +21,13 @@ def check_number(name: str, value: object, above: float = -math.inf) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value) or value <= above:
         right = "a finite number of seconds" if above == -math.inf else f"a finite number of seconds above {above:g}"
         raise UsageError(f"{name} = {value!r}: expected {right}")
+
+
+def check_estimates(estimates: object) -> None:
+    """Raise UsageError if an argument is no way to wait for light that is estimated."""
+    ways = typing.get_args(Estimates)
+    if estimates not in ways:
+        raise UsageError(f"estimates = {estimates!r}: expected {', '.join(map(repr, ways))}")
 
 
 def check_exposure(scene: Scene) -> None:

@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_ar.closing import Closing
 from warp_ar.device import exclusive, resolve_device, translating
-from warp_ar.engine.arguments import check_exposure, check_frames, check_number, read_scene
+from warp_ar.engine.arguments import check_estimates, check_exposure, check_frames, check_number, read_scene
 from warp_ar.engine.carried_light import CarriedLight
 from warp_ar.engine.frame_exchange import Borrowed, adopt_frame
 from warp_ar.engine.frame_inputs import FrameInputs, SeenFrame
@@ -40,7 +40,7 @@ from warp_ar.scene.kinds import skeleton
 from warp_ar.stages.base import Arrays
 from warp_ar.stages.captured import Captured
 from warp_ar.stages.quality import DEFAULT_PRESET, PRESETS, Quality
-from warp_ar.stages.request import Request
+from warp_ar.stages.request import Estimates, Request
 
 __all__ = ["DEFAULT_FRAME_INTERVAL", "TRACK", "Pipeline", "Result", "resolve_quality"]
 
@@ -85,12 +85,11 @@ class Pipeline(Closing):
         shown: float | None = None,
         bands: int | None = None,
         profile: bool = False,
-        synchronous: bool = False,
+        estimates: Estimates = "delayed",
         emitters: bool = False,
         follows_camera: bool | None = None,
         culling: bool = True,
         linear: bool = False,
-        real_time: bool = False,
     ) -> None:
         """Plan, allocate and build.
 
@@ -107,8 +106,10 @@ class Pipeline(Closing):
             shown: Which: seconds; None means the longest.
             bands: Bands of rows per CPU pass; None means one per core.
             profile: On CUDA wait for every frame and time each stage on the device.
-            synchronous: Whether a frame waits for the light that is estimated from it. A camera's frames should not:
-                that light then takes effect some frames later.
+            estimates: When light that is estimated from a frame takes effect: ``synchronous``: in that frame, which
+                waits for it; ``delayed``: a fixed time later, the same in every run; ``real_time``, for live cameras:
+                as soon as a process beside the frames has it. No frame waits then, and pictures of two runs may differ
+                for some frames.
             emitters: Whether ``take_light`` will say where the emitters of the scene's captured light are.
             follows_camera: Whether a drift of the camera's exposure and white balance, and its tone curve, are told
                 from frames one after another; None: if the scene says that the camera meters by itself. Light that
@@ -116,14 +117,13 @@ class Pipeline(Closing):
             culling: Whether stages that can change no pixel of a frame are left out of it; pictures are the same.
             linear: Whether frames have more than 8 bits: uint16 codes, or linear radiance as floats. Mirror balls and
                 surfaces are read, and the plate among the layers kept, at that depth; markers are found in 8 bits.
-            real_time: Whether no frame waits for light that is estimated beside the frames, by a process of its own: it
-                takes effect when it is there, so pictures of two runs may differ for some frames. For live cameras.
 
         Raises:
             UsageError: An argument that cannot be used.
             SceneError: The scene cannot be used, one of its numbers is not finite, or its camera does not fit ``size``.
         """
         scene = read_scene(scene)
+        check_estimates(estimates)
         outputs = check_frames(exposures, outputs, linear)
         self._closed, self._process = False, os.getpid()
         self.device, self.quality = resolve_device(device), resolve_quality(quality)
@@ -132,7 +132,7 @@ class Pipeline(Closing):
         self.size = (self.camera.width, self.camera.height)
         self.bracket = plan_bracket(exposures, shown)
         emitters |= self.scene.captured is not None and has_places(self.scene.captured.file)
-        form = outputs, self.bracket.ratios, synchronous, emitters, linear, real_time
+        form = outputs, self.bracket.ratios, estimates, emitters, linear
         self.plan = make_plan(Request(self.scene, self.quality, self.size, *form))
         with translating(self.device), wp.ScopedDevice(self.device):
             self._build(self._follows_gain(follows_camera, exposures), bands=bands, profile=profile, culling=culling)

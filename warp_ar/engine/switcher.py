@@ -53,7 +53,7 @@ class PipelineSwitcher:
             builder: Thread that builds; None makes one that ends with the switcher.
             keep: Pipelines that have lit frames and are kept for coming back to them.
             profile: As for ``Pipeline``: on CUDA only a pipeline that profiles knows what each stage takes.
-            **arguments: For every ``Pipeline``: ``device``, ``bands``, ``waits``.
+            **arguments: For every ``Pipeline``: ``device``, ``bands``, ``estimates``.
         """
         self._own_builder = ThreadPoolExecutor(1, "warp-ar-build") if builder is None else None
         self._builder = builder or self._own_builder

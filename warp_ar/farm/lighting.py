@@ -172,7 +172,7 @@ class Lighter(Closing):
                 quality=self._jobs.settings.quality,
                 size=size,
                 outputs=outputs,
-                synchronous=True,
+                estimates="synchronous",
                 follows_camera=False,
                 emitters=follows,
                 linear=linear,
@@ -196,7 +196,7 @@ class Lighter(Closing):
                 quality=self._jobs.settings.quality,
                 size=source.size,
                 outputs=outputs,
-                synchronous=True,
+                estimates="synchronous",
                 linear=linear,
             )
             with pipeline:

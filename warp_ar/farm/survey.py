@@ -249,7 +249,7 @@ def _look_at_frames(
             quality=jobs.settings.quality,
             size=source.size,
             outputs=outputs,
-            synchronous=True,
+            estimates="synchronous",
             follows_camera=False,
             linear=linear,
         )

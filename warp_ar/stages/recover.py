@@ -262,11 +262,11 @@ class Recover(Stage):
         since = abs(seconds - now.last) + 1e-3
         self._arrives = now.pending is not None and since > LATENCY
         interval = EVERY_SECONDS
-        if self.request.real_time:
+        if self._real_time:
             self._arrives = self._arrives and now.pending is not None and now.pending.done()
             interval = max(interval, (1.0 + REST) * now.took)
         self._asks = now.frames <= EVERY_FRAME or (since > interval and (rested or now.waited >= EVERY_FRAME))
-        if self.request.real_time and now.pending is not None and not self._arrives:
+        if self._real_time and now.pending is not None and not self._arrives:
             self._asks = False
         self._asks = self._asks and not self._arrays["ball_covered"]()
         if self._asks:
@@ -284,16 +284,21 @@ class Recover(Stage):
         self._equations.fetch(self._stream, self._frames_stream)
         now = self._progress
         now.gain = self._arrays["gain"]()
-        if self.request.real_time:
+        if self._real_time:
             POOL.prepare()
-        aside = self.request.real_time and not self._at_once()
+        aside = self._real_time and not self._at_once()
         now.pending = self._worker.submit(self._solve, now.solver, aside)
         if self._at_once():
             self._take(None)
 
+    @property
+    def _real_time(self) -> bool:
+        """Whether no frame waits for an estimate."""
+        return self.request.estimates == "real_time"
+
     def _at_once(self) -> bool:
         """Whether this frame's estimate, if it begins one, takes effect in it: a stream's first do."""
-        return self.request.synchronous or self._progress.frames <= EVERY_FRAME
+        return self.request.estimates == "synchronous" or self._progress.frames <= EVERY_FRAME
 
     def _solve(self, solver: recovery.Recovery, aside: bool) -> _Solved:
         """In the worker, or, if ``aside``, in a process beside it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Literal, TypeAlias
 
 from warp_ar.scene import Scene
 from warp_ar.stages.quality import Quality
@@ -44,6 +45,11 @@ PICTURE_LAYERS = ("plate", "objects", "shadow_ratio", "added_light", "mirror_bal
 """Those that make the picture."""
 
 
+Estimates: TypeAlias = Literal["synchronous", "delayed", "real_time"]
+"""When light that is estimated from a frame takes effect: in that frame, which waits for it; a fixed time later; or as
+soon as a process beside the frames has it, so that no frame waits and pictures of two runs may differ by when it is."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Request:
     """What a plan is made for; equal requests give equal plans."""
@@ -58,15 +64,12 @@ class Request:
     """Names of what the caller wants: ``image``, ``environment``, ``pose``, and any of ``LAYERS``."""
     exposures: tuple[float, ...] = ()
     """Exposures between which frames alternate, longest first, over the one that is shown; empty: only one."""
-    synchronous: bool = False
-    """Whether a frame waits for what is estimated from it; else that takes effect some frames later."""
+    estimates: Estimates = "delayed"
+    """When light that is estimated from a frame takes effect."""
     emitters: bool = False
     """Whether a captured light comes with its emitters' places, as ``Pipeline.take_light`` gives them."""
     linear: bool = False
     """Whether frames come as linear radiance too, of more than 8 bits."""
-    real_time: bool = False
-    """Whether no frame waits for what is estimated beside it, however long that takes: pictures of two runs may
-    differ by when it takes effect."""
 
     @property
     def resources(self) -> tuple[str, ...]:

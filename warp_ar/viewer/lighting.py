@@ -65,8 +65,8 @@ class Lighting:
         make_plan(Request(scene, target.quality, target.size, target.outputs, ratios))
         self.builder = ThreadPoolExecutor(1, "warp-ar-build")
         """Builds pipelines and does other work beside the frames."""
-        self._main = PipelineSwitcher(builder=self.builder, device=device, real_time=True)
-        self._second = PipelineSwitcher(builder=self.builder, device=device, real_time=True)
+        self._main = PipelineSwitcher(builder=self.builder, device=device, estimates="real_time")
+        self._second = PipelineSwitcher(builder=self.builder, device=device, estimates="real_time")
         self._good = controls.wanted
         self._followed: tuple[Wanted, str, Feed] | None = None
         self._now = target
