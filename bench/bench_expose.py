@@ -8,6 +8,7 @@ import warp as wp
 from bench.bench_composite import H, W, frame_and_layers
 from bench.common import measure, report
 from warp_ar.kernels import composite, expose, summed_area
+from warp_ar.kernels.structs import make_picture
 
 LAYERS = (("frame", composite.CompositeConfig()), ("layers", composite.CompositeConfig(virtual=True, added=True)))
 
@@ -22,6 +23,8 @@ def main(device: str) -> None:
     light = decode.numpy()[picture, np.arange(3)]
     declipped = wp.array(np.where(picture >= 254, 2.0 * light, light), dtype=wp.vec3, device=device)
     summed_area.sum_area(frame, table)
+    shown, exposure = make_picture(frame, decode, None), expose.make_exposure(encode, scale, codes)
+    clipped = expose.make_clipped_evidence(H, table, declipped)
     for name, layers in LAYERS:
         contenders = {}
         for method in expose.METHODS:
@@ -29,8 +32,7 @@ def main(device: str) -> None:
             def call(config: expose.ExposeConfig = expose.ExposeConfig(method, layers)) -> None:  # noqa: B008
                 expose.read_scale(params, scale)
                 expose.expose_codes(decode, encode, scale, codes)
-                inputs = (params, frame, decode, encode, over, table, scale, codes, image)
-                expose.expose(config, *inputs, declipped=declipped)
+                expose.expose(config, params, shown, over, clipped, exposure, image)
 
             call()
             if not layers.virtual:  # black stays black, nothing that was not clipped brightens

@@ -72,7 +72,7 @@ from warp_ar.kernels.codes import (
 from warp_ar.kernels.color import decode, encode, is_clipped
 from warp_ar.kernels.composite import CompositeConfig, Layers, compose, is_changed, make_read_layers
 from warp_ar.kernels.launch import Rows, launch, launch_rows
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, Picture
 from warp_ar.kernels.summed_area import box_mean
 
 wp.set_module_options({"enable_backward": False})
@@ -122,6 +122,24 @@ class ExposeConfig:
         known = dict.fromkeys((*METHODS, *BOXES))
         if self.method not in known:
             raise ValueError(f"method: {self.method!r} is none of {', '.join(known)}")
+
+
+@wp.struct
+class ClippedEvidence:
+    """What tells the radiance of pixels that clip; what a method does not read may be empty."""
+
+    summed_area: wp.array2d[wp.uint32]  # (H, W) the frame's summed-area table, for methods that look at boxes
+    max_box: wp.int32  # pixels: side of the largest box
+    declipped: wp.array2d[wp.vec3]  # (H, W) linear radiance with clipped pixels estimated, for ``declipped``
+
+
+@wp.struct
+class Exposure:
+    """A scale, and what it makes of codes."""
+
+    encode_table: wp.array[wp.vec3]  # of ``color.encode_table``
+    scale: wp.array[wp.float32]  # (1,), not negative
+    codes: wp.array[wp.vec3ub]  # (256,) of ``expose_codes`` for this scale
 
 
 @wp.func
@@ -203,8 +221,7 @@ def make_count_levels_kernel(config: CompositeConfig) -> wp.Kernel:
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
+        picture: Picture,
         layers: Layers,
         # Out:
         levels_out: wp.array2d[wp.int32],
@@ -217,12 +234,12 @@ def make_count_levels_kernel(config: CompositeConfig) -> wp.Kernel:
         if i < rect[0] or i >= rect[1]:
             return
         for j in range(rect[2], rect[3], _AUTO_STRIDE):
-            code = frame[i, j]
+            code = picture.frame[i, j]
             clipped = wp.max(wp.max(code[0], code[1]), code[2]) == wp.uint8(255)
             at = read_layers(params, layers, i, j)
             dark = at.added == wp.vec3(0.0, 0.0, 0.0)
             if not clipped and not at.objects[3] > 0.5 and not dark:
-                level = level_of(wp.max(compose(decode(decode_table, code), at)))
+                level = level_of(wp.max(compose(decode(picture.decode_table, code), at)))
                 levels_out[strip, level] = levels_out[strip, level] + 1
 
     return count_levels_kernel
@@ -259,23 +276,21 @@ def adapt_scale_kernel(
 
 @functools.cache
 def make_find_gain(method: str) -> wp.Function:
-    """``find_gain(code, i, j, table, max_box, s) -> float``: a clipped pixel's guessed radiance over what it shows.
+    """``find_gain(code, i, j, clipped, s) -> float``: a clipped pixel's guessed radiance over what it shows.
 
     It is 1 for pixels that do not clip, and on methods that look at no box.
     """
     box_gain = {"paper": paper_gain, "paper_mean": paper_mean_gain}.get(method, clipped_gain)
 
     @wp.func(module="unique")
-    def find_gain(
-        code: wp.vec3ub, i: wp.int32, j: wp.int32, table: wp.array2d[wp.uint32], max_box: wp.int32, s: wp.float32
-    ) -> wp.float32:
+    def find_gain(code: wp.vec3ub, i: wp.int32, j: wp.int32, clipped: ClippedEvidence, s: wp.float32) -> wp.float32:
         gain = float(1.0)
         if wp.static(method in BOXES):
             least = wp.float32(wp.min(wp.min(code[0], code[1]), code[2]))
             if least > KNEE and s < 1.0:
-                clipped = (least - KNEE) / (255.0 - KNEE)
-                mean = surrounding_mean(table, i, j, s, max_box)
-                gain = 1.0 + clipped * (box_gain(mean, s) - 1.0)
+                share = (least - KNEE) / (255.0 - KNEE)
+                mean = surrounding_mean(clipped.summed_area, i, j, s, clipped.max_box)
+                gain = 1.0 + share * (box_gain(mean, s) - 1.0)
         return gain
 
     return find_gain
@@ -294,15 +309,13 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         j: wp.int32,
         params: wp.array[FrameParams],
         decode_table: wp.array[wp.vec3],
-        encode_table: wp.array[wp.vec3],
         layers: Layers,
-        table: wp.array2d[wp.uint32],
-        max_box: wp.int32,
-        declipped: wp.array2d[wp.vec3],
-        s: wp.float32,
-        codes: wp.array[wp.vec3ub],
+        clipped: ClippedEvidence,
+        exposure: Exposure,
     ) -> wp.vec3ub:
-        gain = find_gain(code, i, j, table, max_box, s)
+        s = exposure.scale[0]
+        codes = exposure.codes
+        gain = find_gain(code, i, j, clipped, s)
         guessed = bool(gain != 1.0)
         if wp.static(config.method == "declipped"):
             guessed = s < 1.0 and wp.max(is_clipped(code)) > 0.0
@@ -312,29 +325,25 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
         radiance = gain * decode(decode_table, code)
         if wp.static(config.method == "declipped"):
             if guessed:
-                radiance = declipped[i, j]
-        return encode(encode_table, s * compose(radiance, at))
+                radiance = clipped.declipped[i, j]
+        return encode(exposure.encode_table, s * compose(radiance, at))
 
     @wp.kernel(module="unique", enable_backward=False)
     def expose_kernel(
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
-        encode_table: wp.array[wp.vec3],
+        picture: Picture,
         layers: Layers,
-        table: wp.array2d[wp.uint32],
-        max_box: wp.int32,
-        declipped: wp.array2d[wp.vec3],
-        scale: wp.array[wp.float32],
-        codes: wp.array[wp.vec3ub],
+        clipped: ClippedEvidence,
+        exposure: Exposure,
         run: wp.int32,
         # Out:
         image_out: wp.array2d[wp.vec3ub],
     ):
         i, part = wp.tid()
         i += row_start
+        frame = picture.frame
         if wp.static(warps):
             first = part // WARP_LANES * WARP_PIXELS
             own = load_codes(frame, i, first)
@@ -351,20 +360,7 @@ def make_expose_kernel(config: ExposeConfig, warps: bool) -> wp.Kernel:
                     code = get_code(own, k)
                 else:
                     code = frame[i, j]
-                code = exposed(
-                    code,
-                    i,
-                    j,
-                    params,
-                    decode_table,
-                    encode_table,
-                    layers,
-                    table,
-                    max_box,
-                    declipped,
-                    scale[0],
-                    codes,
-                )
+                code = exposed(code, i, j, params, picture.decode_table, layers, clipped, exposure)
                 if wp.static(warps):
                     set_code(own, k, code)
                 else:
@@ -381,6 +377,24 @@ def largest_box(height: int) -> int:
     return max(1, round(MAX_BOX * height))
 
 
+def make_clipped_evidence(height: int, summed_area: wp.array | None, declipped: wp.array | None) -> ClippedEvidence:
+    """What is known of the clipped pixels of a frame of ``height`` rows; None for what the method does not read."""
+    evidence = ClippedEvidence()
+    evidence.max_box = largest_box(height)
+    if summed_area is not None:
+        evidence.summed_area = summed_area
+    if declipped is not None:
+        evidence.declipped = declipped
+    return evidence
+
+
+def make_exposure(encode_table: wp.array, scale: wp.array, codes: wp.array) -> Exposure:
+    """The arrays of an exposure together."""
+    exposure = Exposure()
+    exposure.encode_table, exposure.scale, exposure.codes = encode_table, scale, codes
+    return exposure
+
+
 def read_scale(params: wp.array, scale_out: wp.array) -> None:
     """Write the fixed scale of ``params[0]``, not below 0, to ``scale_out``, (1,) float32."""
     launch(read_scale_kernel, 1, [params], [scale_out], device=params.device)
@@ -389,8 +403,7 @@ def read_scale(params: wp.array, scale_out: wp.array) -> None:
 def count_levels(
     config: CompositeConfig,
     params: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
+    picture: Picture,
     layers: Layers,
     levels_out: wp.array,
     *,
@@ -401,8 +414,7 @@ def count_levels(
     Args:
         config: Which layers there are; virtual light on the receiver must be among them.
         params: (1,) FrameParams.
-        frame: (H, W) vec3ub, RGB.
-        decode_table: (256,) vec3 of ``color.decode_table``.
+        picture: (H, W) the camera's; its rays are not read.
         layers: From ``make_layers``.
         levels_out: (ceil(H / AUTO_STRIDE), LEVELS) int32, one row per sampled row of the frame.
         rows: Band of rows of ``levels_out``; None means all.
@@ -410,10 +422,10 @@ def count_levels(
     launch_rows(
         make_count_levels_kernel(config),
         (levels_out.shape[0],),
-        [params, frame, decode_table, layers],
+        [params, picture, layers],
         [levels_out],
         rows=rows,
-        device=frame.device,
+        device=levels_out.device,
     )
 
 
@@ -430,16 +442,12 @@ def expose_codes(decode_table: wp.array, encode_table: wp.array, scale: wp.array
 def expose(
     config: ExposeConfig,
     params: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
-    encode_table: wp.array,
+    picture: Picture,
     layers: Layers,
-    table: wp.array | None,
-    scale: wp.array,
-    codes: wp.array,
+    clipped: ClippedEvidence,
+    exposure: Exposure,
     image_out: wp.array,
     *,
-    declipped: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write the picture at another exposure, layers composed.
@@ -447,36 +455,20 @@ def expose(
     Args:
         config: Method, and which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
-        frame: (H, W) vec3ub, the camera's frame, RGB, contiguous.
-        decode_table: (256,) vec3 of ``color.decode_table``.
-        encode_table: Table of ``color.encode_table``.
+        picture: (H, W) the camera's, contiguous; its rays are not read.
         layers: From ``make_layers``.
-        table: (H, W) uint32, the frame's summed-area table; needed by ``box``.
-        scale: (1,) float32, not negative.
-        codes: (256,) vec3ub of ``expose_codes`` for this ``scale``.
+        clipped: From ``make_clipped_evidence``.
+        exposure: From ``make_exposure``.
         image_out: (H, W) vec3ub, contiguous.
-        declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
         rows: Band of rows; None means all.
     """
-    height, width = frame.shape
-    threads, run = row_parts(frame.device, width)
+    (height, width), device = image_out.shape, image_out.device
+    threads, run = row_parts(device, width)
     launch_rows(
-        make_expose_kernel(config, by_warps(frame.device, width)),
+        make_expose_kernel(config, by_warps(device, width)),
         (height, threads),
-        [
-            params,
-            frame,
-            decode_table,
-            encode_table,
-            layers,
-            table,
-            largest_box(height),
-            declipped,
-            scale,
-            codes,
-            run,
-        ],
+        [params, picture, layers, clipped, exposure, run],
         [image_out],
         rows=rows,
-        device=frame.device,
+        device=device,
     )

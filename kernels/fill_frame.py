@@ -23,7 +23,7 @@ from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.launch import Rows, launch_rows
 from warp_ar.kernels.pixels import pixel_radiance
 from warp_ar.kernels.shapes import FAR
-from warp_ar.kernels.structs import FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import FrameParams, Picture, Probe, RayScene
 from warp_ar.kernels.trace import TraceConfig, make_trace
 
 wp.set_module_options({"enable_backward": False})
@@ -73,9 +73,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
     def fill_frame_kernel(
         # In:
         row_start: wp.int32,
-        frame: wp.array2d[wp.vec3ub],
-        table: wp.array[wp.vec3],
-        linear: wp.array2d[wp.vec3],
+        picture: Picture,
         params: wp.array[FrameParams],
         probes: wp.array[Probe],
         scene: RayScene,
@@ -90,6 +88,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
         if known[3] >= ENOUGH:
             return
         camera = params[0]
+        frame = picture.frame
         total = wp.vec3(0.0, 0.0, 0.0)
         count = wp.float32(0.0)
         side = wp.int32(SIDE)  # a variable: the loops stay loops
@@ -113,7 +112,7 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
                 inside = at[2] > 0.0 and row >= 0 and column >= 0 and row < frame.shape[0] and column < frame.shape[1]
                 if inside and not shaded and passes_balls(probes, camera.camera_position, ray, reach):
                     if not trace.occluded_by_proxies(scene, camera.camera_position, ray, (1.0 - CLOSE) * reach):
-                        total += pixel_radiance(frame, table, linear, row, column)
+                        total += pixel_radiance(frame, picture.decode_table, picture.linear, row, column)
                         count += 1.0
         if count > 0.0:
             weight = (1.0 - known[3]) * FRAME_TRUST * count / wp.float32(SIDE * SIDE)
@@ -125,38 +124,32 @@ def make_fill_frame_kernel(proxies: tuple[int, ...]) -> wp.Kernel:
 
 
 def fill_frame(
-    frame: wp.array,
-    decode_table: wp.array,
+    picture: Picture,
     params: wp.array,
     probes: wp.array,
     scene: RayScene,
     levels_out: wp.array,
-    height: int,
-    width: int,
+    shape: tuple[int, int],
     *,
     proxies: tuple[int, ...],
-    linear: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Put what the frame shows into a seeded fill pyramid, where balls left trust open.
 
     Args:
-        frame: ``wp.vec3ub`` (frame rows, columns), RGB codes.
-        decode_table: Linear value of each code, ``wp.vec3`` (256 or more).
+        picture: (frame rows, columns) the camera's; its rays are not read.
         params: ``FrameParams`` (1): the camera.
         probes: ``Probe`` (P), at least one: the map is the light at the first; all hide what is behind them.
         scene: Its proxies are seen where they are.
         levels_out: From ``fill.seed_fill``; its level 0 changes.
-        height: Of the map.
-        width: Of the map.
+        shape: Rows and columns of the map.
         proxies: Kinds of proxy in the scene.
-        linear: ``wp.vec3`` (frame rows, columns), linear radiance of a frame of more than 8 bits; empty or None: none.
         rows: Band of rows, None for all.
     """
     launch_rows(
         make_fill_frame_kernel(proxies),
-        (height, width),
-        [frame, decode_table, linear, params, probes, scene, height, width],
+        shape,
+        [picture, params, probes, scene, *shape],
         [levels_out],
         rows=rows,
         device=levels_out.device,

@@ -16,9 +16,9 @@ import warp as wp
 
 from warp_ar.kernels.color import decode, is_clipped
 from warp_ar.kernels.composite import Layers, make_read_layers
-from warp_ar.kernels.expose import ExposeConfig, largest_box, make_find_gain
+from warp_ar.kernels.expose import ClippedEvidence, ExposeConfig, make_find_gain
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, Picture
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,12 +45,9 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
         # In:
         row_start: wp.int32,
         params: wp.array[FrameParams],
-        frame: wp.array2d[wp.vec3ub],
-        decode_table: wp.array[wp.vec3],
+        picture: Picture,
         layers: Layers,
-        table: wp.array2d[wp.uint32],
-        max_box: wp.int32,
-        declipped: wp.array2d[wp.vec3],
+        clipped: ClippedEvidence,
         scale: wp.array[wp.float32],
         # Out:
         out: SeparateLayers,
@@ -58,14 +55,14 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
         i, j = wp.tid()
         i += row_start
         if out.plate.shape[0] > 0:
-            code = frame[i, j]
+            code = picture.frame[i, j]
             s = float(1.0)
             if scale.shape[0] > 0:
                 s = scale[0]
-            radiance = find_gain(code, i, j, table, max_box, s) * decode(decode_table, code)
+            radiance = find_gain(code, i, j, clipped, s) * decode(picture.decode_table, code)
             if wp.static(config.method == "declipped"):
                 if s < 1.0 and wp.max(is_clipped(code)) > 0.0:
-                    radiance = declipped[i, j]
+                    radiance = clipped.declipped[i, j]
             out.plate[i, j] = radiance
         at = read_layers(params, layers, i, j)
         if out.objects.shape[0] > 0:
@@ -83,11 +80,9 @@ def make_separate_layers_kernel(config: ExposeConfig) -> wp.Kernel:
 def separate_layers(
     config: ExposeConfig,
     params: wp.array,
-    frame: wp.array,
-    decode_table: wp.array,
+    picture: Picture,
     layers: Layers,
-    table: wp.array | None,
-    declipped: wp.array | None,
+    clipped: ClippedEvidence,
     scale: wp.array | None,
     out: SeparateLayers,
     *,
@@ -98,21 +93,18 @@ def separate_layers(
     Args:
         config: How ``expose`` estimates clipped pixels (``plain`` where it does not run), and which layers there are.
         params: (1,) FrameParams; its rectangles bound the layers.
-        frame: (H, W) vec3ub, the camera's frame, RGB.
-        decode_table: (256,) vec3 of ``color.decode_table``.
+        picture: (H, W) the camera's; its rays are not read.
         layers: From ``composite.make_layers``.
-        table: (H, W) uint32, the frame's summed-area table; needed by methods that look at boxes.
-        declipped: (H, W) vec3, linear radiance with clipped pixels estimated; needed by ``declipped``.
+        clipped: From ``expose.make_clipped_evidence``.
         scale: (1,) float32, the exposure scale; None means 1.
         out: (H, W) arrays of the layers that are asked for.
         rows: Band of rows; None means all.
     """
-    height, width = frame.shape
     launch_rows(
         make_separate_layers_kernel(config),
-        (height, width),
-        [params, frame, decode_table, layers, table, largest_box(height), declipped, scale],
+        picture.frame.shape,
+        [params, picture, layers, clipped, scale],
         [out],
         rows=rows,
-        device=frame.device,
+        device=picture.frame.device,
     )

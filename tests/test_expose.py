@@ -8,6 +8,7 @@ from tests.reference import composite as reference_composite
 from tests.reference import expose as reference
 from tests.test_composite import CONFIGS, H, make_arrays, make_layers, make_params, tables
 from warp_ar.kernels import color, expose, summed_area
+from warp_ar.kernels.structs import make_picture
 
 # How far `auto` may miss: one bin of an eighth of a stop, and the share that may clip.
 BIN = 2.0**0.125
@@ -37,19 +38,9 @@ def run(
     expose.expose_codes(decode, encode, scale_array, codes)
     over = make_arrays(virtual, added, ratio, mirror_ball)
     config = expose.ExposeConfig(method, layers)
-    expose.expose(
-        config,
-        params,
-        frame_array,
-        decode,
-        encode,
-        over,
-        table,
-        scale_array,
-        codes,
-        image,
-        declipped=wp.array(declipped(frame, transfer), dtype=wp.vec3),
-    )
+    picture, exposure = make_picture(frame_array, decode, None), expose.make_exposure(encode, scale_array, codes)
+    clipped = expose.make_clipped_evidence(height, table, wp.array(declipped(frame, transfer), dtype=wp.vec3))
+    expose.expose(config, params, picture, over, clipped, exposure, image)
     return image.numpy()
 
 
@@ -214,7 +205,7 @@ def auto(added, frame=None, frames=1, time_step=1.0 / 30, start=0.0, virtual=Non
     layers = expose.CompositeConfig(virtual is not None, True, mirror_ball=mirror_ball is not None)
     for _ in range(frames):
         over = make_arrays(virtual, added, None, mirror_ball)
-        expose.count_levels(layers, params, frame, decode, over, levels)
+        expose.count_levels(layers, params, make_picture(frame, decode, None), over, levels)
         expose.adapt_scale(params, levels, scale)
     return float(scale.numpy()[0])
 

@@ -56,14 +56,16 @@ def filled(device, frame, text, seed):
     probes["center"], probes["radius"], probes["reflectance"] = (0.0, 0.0, 0.1), 0.03, 0.85
     levels = wp.array(seed.reshape(-1, 4), dtype=wp.vec4, device=device)
     fill_frame(
-        wp.array(frame, dtype=wp.vec3ub, device=device),
-        wp.array(decode_table("linear"), dtype=wp.vec3, device=device),
+        structs.make_picture(
+            wp.array(frame, dtype=wp.vec3ub, device=device),
+            wp.array(decode_table("linear"), dtype=wp.vec3, device=device),
+            None,
+        ),
         wp.array(params, dtype=structs.FrameParams, device=device),
         wp.array(probes, dtype=structs.Probe, device=device),
         host.ray_scene,
         levels,
-        HEIGHT,
-        WIDTH,
+        (HEIGHT, WIDTH),
         proxies=trace_config(scene).proxies,
     )
     return levels.numpy().reshape(HEIGHT, WIDTH, 4)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tests.hard_cases import generators
 from tests.hard_cases.rig import METHODS, SIZE
 from warp_ar.kernels import color, composite, expose, summed_area
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, make_picture
 
 FRAMES = generators.frames(SIZE[1], SIZE[0])
 JUST_BELOW_1 = float(np.nextafter(np.float32(1), np.float32(0)))
@@ -105,13 +105,10 @@ def exposed(method, image, scale, device):
     expose.expose(
         expose.ExposeConfig(method),
         params,
-        frame,
-        decode,
-        encode,
+        make_picture(frame, decode, None),
         composite.make_layers(),
-        table,
-        factor,
-        codes,
+        expose.make_clipped_evidence(frame.shape[0], table, None),
+        expose.make_exposure(encode, factor, codes),
         out,
     )
     return out.numpy()

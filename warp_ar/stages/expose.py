@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_ar.kernels import expose
 from warp_ar.kernels.codes import by_warps
+from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.layers import composite_config, layers_of
@@ -73,7 +74,8 @@ class Expose(Stage):
             self.method if self.features.boxed else "declipped" if self.features.declipped else "plain", composed
         )
         expose.make_expose_kernel(config, by_warps(device, self.request.size[0]))
-        params, frame, decode, encode = (arrays[name] for name in ("params", "frame", "decode", "encode"))
+        params, decode, encode = (arrays[name] for name in ("params", "decode", "encode"))
+        picture = make_picture(arrays["frame"], decode, None)
         scale, codes = arrays["expose_scale"], arrays["expose_codes"]
         layers = layers_of(arrays)
         passes: list[Pass] = []
@@ -81,7 +83,7 @@ class Expose(Stage):
             levels = arrays["expose_levels"]
 
             def count(rows: Rows | None) -> None:
-                expose.count_levels(composed, params, frame, decode, layers, levels, rows=rows)
+                expose.count_levels(composed, params, picture, layers, levels, rows=rows)
 
             passes.append(Pass(count, rows=levels.shape[0]))
             passes.append(Pass(lambda rows: expose.adapt_scale(params, levels, scale)))
@@ -89,21 +91,15 @@ class Expose(Stage):
             passes.append(Pass(lambda rows: expose.read_scale(params, scale)))
         passes.append(Pass(lambda rows: expose.expose_codes(decode, encode, scale, codes)))
 
+        clipped = expose.make_clipped_evidence(
+            self.request.size[1],
+            arrays["summed_area"] if "summed_area" in self.wiring.reads else None,
+            arrays.get("declipped"),
+        )
+        exposure = expose.make_exposure(encode, scale, codes)
+
         def launch(rows: Rows | None) -> None:
-            expose.expose(
-                config,
-                params,
-                frame,
-                decode,
-                encode,
-                layers,
-                arrays["summed_area"] if "summed_area" in self.wiring.reads else None,
-                scale,
-                codes,
-                arrays["image"],
-                declipped=arrays.get("declipped"),
-                rows=rows,
-            )
+            expose.expose(config, params, picture, layers, clipped, exposure, arrays["image"], rows=rows)
 
         passes.append(Pass(launch, rows=self.request.size[1]))
         return passes

@@ -13,7 +13,7 @@ from warp_ar.kernels import change, fill, fill_frame
 from warp_ar.scene.kinds import trace_config
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.picture import frame_reads
+from warp_ar.stages.shared.picture import find_picture, frame_reads
 
 
 class Fill(Stage):
@@ -69,19 +69,17 @@ class Fill(Stage):
             )
 
         proxies = trace_config(self.request.scene).proxies
+        picture = find_picture(arrays)
 
         def see(rows: Rows | None) -> None:
             fill_frame.fill_frame(
-                arrays["frame"],
-                arrays["decode"],
+                picture,
                 arrays["params"],
                 arrays["probes"],
                 arrays["ray_scene"],
                 arrays["fill_levels"],
-                height,
-                2 * height,
+                (height, 2 * height),
                 proxies=proxies,
-                linear=arrays["linear_frame"],
                 rows=rows,
             )
 

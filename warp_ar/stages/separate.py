@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_ar.kernels.expose import ExposeConfig
+from warp_ar.kernels.expose import ExposeConfig, make_clipped_evidence
 from warp_ar.kernels.separate import SeparateLayers, make_separate_layers_kernel, separate_layers
+from warp_ar.kernels.structs import make_picture
 from warp_ar.stages.base import NOT_ASKED, Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring
 from warp_ar.stages.features import Features
 from warp_ar.stages.request import LAYERS, PICTURE_LAYERS
@@ -79,11 +80,13 @@ class Separate(Stage):
         plate = "plate" in self.wiring.writes
         inputs = (
             arrays["params"],
-            arrays["frame"],
-            arrays["decode"],
+            make_picture(arrays["frame"], arrays["decode"], None),
             layers,
-            arrays["summed_area"] if "summed_area" in reads else None,
-            arrays["declipped"] if "declipped" in reads else None,
+            make_clipped_evidence(
+                self.request.size[1],
+                arrays["summed_area"] if "summed_area" in reads else None,
+                arrays["declipped"] if "declipped" in reads else None,
+            ),
             arrays["expose_scale"] if plate and features.exposed else None,
         )
 
