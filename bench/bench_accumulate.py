@@ -8,7 +8,7 @@ import warp as wp
 from bench.common import measure, report_map
 from bench.environments import HEIGHTS, random_map
 from warp_ar.kernels import accumulate
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, make_environment_view
 
 TEXEL_BYTES = 3 * (12 + 4 + 12) + 2 * (12 + 4)
 """Radiance, confidence and clipped are read twice over and written."""
@@ -23,10 +23,11 @@ def run_height(height: int, device: str) -> None:
     clipped, total, share = (wp.zeros(shape, dtype=wp.vec3) for _ in range(3))
     confidence, change = wp.zeros(shape, dtype=wp.float32), wp.zeros(accumulate.change_shape(*shape), dtype=wp.vec2)
     params = wp.array(params, dtype=FrameParams)
+    view, environment = make_environment_view(*frame, clipped), make_environment_view(total, confidence, share)
 
     def run() -> None:
-        accumulate.measure_change(*frame, total, confidence, change)
-        accumulate.accumulate_environment(*frame, clipped, change, params, total, confidence, share)
+        accumulate.measure_change(view, environment, change)
+        accumulate.accumulate_environment(view, change, params, environment)
 
     run()  # right before fast
     assert (total.numpy()[known > 0] == radiance[known > 0]).all()

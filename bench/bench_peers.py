@@ -22,7 +22,7 @@ from bench.bench_unwrap import empty_scene
 from bench.common import measure, paired_ratio, report
 from warp_ar.kernels import summed_area, unwrap
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.structs import FrameParams, Probe
+from warp_ar.kernels.structs import FrameParams, Probe, make_environment_view
 from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
 from warp_ar.kernels.wide_bvh import walk_closest
 from warp_ar.scene.ray_mesh import make_ray_mesh
@@ -270,9 +270,11 @@ def bench_unwrap(device: str) -> None:
             radiance, clipped = (wp.zeros(shape, dtype=wp.vec3) for _ in range(2))
             confidence = wp.zeros(shape, dtype=wp.float32)
 
-            def ours(corners=corners, radiance=radiance, confidence=confidence, clipped=clipped) -> None:
+            view = make_environment_view(radiance, confidence, clipped)
+
+            def ours(corners=corners, view=view) -> None:
                 unwrap.project_corners(params, ball, rays, scene, corners, config=config)
-                unwrap.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method="bilinear")
+                unwrap.gather_probe(frame, table, ball, corners, view, method="bilinear")
 
             def theirs(height=height) -> Any:
                 return envmap.EnvironmentMap(smooth / np.float32(255), "sphere").convertTo("latlong", height).data

@@ -12,7 +12,7 @@ import warp as wp
 from bench.common import measure, paired_ratio, report
 from warp_ar.kernels import unwrap
 from warp_ar.kernels.color import decode_table
-from warp_ar.kernels.structs import BOX, FrameParams, Material, Probe, RayScene, Shape, Texture
+from warp_ar.kernels.structs import BOX, FrameParams, Material, Probe, RayScene, Shape, Texture, make_environment_view
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,11 +73,13 @@ def run_case(case: Case, device: Any) -> None:
     radiance, clipped = (wp.zeros(shape, dtype=wp.vec3) for _ in range(2))
     confidence = wp.zeros(shape, dtype=wp.float32)
 
+    view = make_environment_view(radiance, confidence, clipped)
+
     def project() -> None:
         unwrap.project_corners(params, ball, rays, scene, corners, config=config)
 
     def gather() -> None:
-        unwrap.gather_probe(frame, table, ball, corners, radiance, confidence, clipped, method=case.method)
+        unwrap.gather_probe(frame, table, ball, corners, view, method=case.method)
 
     # Right before fast: the map of a constant frame is constant.
     frame.fill_(wp.vec3ub(100, 100, 100))

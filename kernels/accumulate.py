@@ -25,7 +25,7 @@ from warp_ar.kernels.cooperative import warp_sum
 from warp_ar.kernels.guards import is_finite, light_confidence, smooth_ramp, usable_confidence
 from warp_ar.kernels.latlong import texel_solid_angle
 from warp_ar.kernels.launch import Rows, launch_rows
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import EnvironmentView, FrameParams
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,18 +49,16 @@ def measure_change_kernel(
     # In:
     row_start: wp.int32,
     lanes: wp.int32,
-    radiance: wp.array2d[wp.vec3],
-    confidence: wp.array2d[wp.float32],
-    environment: wp.array2d[wp.vec3],
-    environment_confidence: wp.array2d[wp.float32],
+    view: EnvironmentView,
+    environment: EnvironmentView,
     # Out:
     change_out: wp.array2d[wp.vec2],  # this frame's signed relative change, and the one before
 ):
     """Mean signed change of one sector a warp."""
     band_row, sector_column, lane = wp.tid()
     sector_row = row_start + band_row
-    height = radiance.shape[0]
-    width = radiance.shape[1]
+    height = view.radiance.shape[0]
+    width = view.radiance.shape[1]
     first_row = sector_row * height // change_out.shape[0]
     first_column = sector_column * width // change_out.shape[1]
     rows = (sector_row + 1) * height // change_out.shape[0] - first_row
@@ -70,9 +68,10 @@ def measure_change_kernel(
     for item in range(lane, rows * columns, lanes):
         i = first_row + item // columns
         j = first_column + item % columns
-        x = radiance[i, j]
-        m = environment[i, j]
-        weight = wp.min(light_confidence(x, confidence[i, j]), usable_confidence(m, environment_confidence[i, j]))
+        x = view.radiance[i, j]
+        m = environment.radiance[i, j]
+        certainty = usable_confidence(m, environment.confidence[i, j])
+        weight = wp.min(light_confidence(x, view.confidence[i, j]), certainty)
         if weight > 0.0:
             weight *= texel_solid_angle(i, height, width)
             new = brightness(x)
@@ -103,26 +102,23 @@ def lasting_change(change: wp.array2d[wp.vec2], row: wp.int32, column: wp.int32)
 def accumulate_environment_kernel(
     # In:
     row_start: wp.int32,
-    radiance: wp.array2d[wp.vec3],
-    confidence: wp.array2d[wp.float32],
-    clipped: wp.array2d[wp.vec3],
+    view: EnvironmentView,
     change: wp.array2d[wp.vec2],
     params: wp.array[FrameParams],
-    # Out:
-    environment_out: wp.array2d[wp.vec3],
-    confidence_out: wp.array2d[wp.float32],
-    clipped_out: wp.array2d[wp.vec3],
+    # In and out:
+    environment_out: EnvironmentView,
 ):
     """One texel a thread, in place."""
     band_row, j = wp.tid()
     i = row_start + band_row
-    x = radiance[i, j]
-    c = light_confidence(x, confidence[i, j])
+    x = view.radiance[i, j]
+    clipped = view.clipped
+    c = light_confidence(x, view.confidence[i, j])
     if wp.min(clipped[i, j]) < 0.0 or not is_finite(clipped[i, j]):
         c = 0.0
-    m = environment_out[i, j]
-    share = clipped_out[i, j]
-    k = usable_confidence(m, confidence_out[i, j])
+    m = environment_out.radiance[i, j]
+    share = environment_out.clipped[i, j]
+    k = usable_confidence(m, environment_out.confidence[i, j])
     if params[0].environment_reset != 0 or k == 0.0 or not is_finite(share):
         k = 0.0
         m = wp.vec3(0.0, 0.0, 0.0)
@@ -132,8 +128,8 @@ def accumulate_environment_kernel(
         time_step = 0.0
 
     # Sectors are blended bilinearly: no edges between them.
-    y = (wp.float32(i) + 0.5) * wp.float32(change.shape[0]) / wp.float32(radiance.shape[0]) - 0.5
-    z = (wp.float32(j) + 0.5) * wp.float32(change.shape[1]) / wp.float32(radiance.shape[1]) - 0.5
+    y = (wp.float32(i) + 0.5) * wp.float32(change.shape[0]) / wp.float32(clipped.shape[0]) - 0.5
+    z = (wp.float32(j) + 0.5) * wp.float32(change.shape[1]) / wp.float32(clipped.shape[1]) - 0.5
     row = wp.int32(wp.floor(y))
     column = wp.int32(wp.floor(z))
     fz = z - wp.floor(z)
@@ -150,9 +146,9 @@ def accumulate_environment_kernel(
         m = m + a * (x - m)
         share = share + a * (clipped[i, j] - share)
     k = k * wp.exp(-time_step / FORGET_TIME)
-    environment_out[i, j] = m
-    confidence_out[i, j] = k + a * (c - k)
-    clipped_out[i, j] = share
+    environment_out.radiance[i, j] = m
+    environment_out.confidence[i, j] = k + a * (c - k)
+    environment_out.clipped[i, j] = share
 
 
 def change_shape(height: int, width: int) -> tuple[int, int]:
@@ -161,21 +157,13 @@ def change_shape(height: int, width: int) -> tuple[int, int]:
 
 
 def measure_change(
-    radiance: wp.array,
-    confidence: wp.array,
-    environment: wp.array,
-    environment_confidence: wp.array,
-    change_out: wp.array,
-    *,
-    rows: Rows | None = None,
+    view: EnvironmentView, environment: EnvironmentView, change_out: wp.array, *, rows: Rows | None = None
 ) -> None:
     """Signed relative change of each sector between the accumulated light and a frame's.
 
     Args:
-        radiance: This frame's light, ``wp.vec3`` (h, w).
-        confidence: Its confidence, ``wp.float32`` (h, w).
-        environment: Accumulated light, ``wp.vec3`` (h, w).
-        environment_confidence: Its confidence, ``wp.float32`` (h, w).
+        view: (h, w) this frame's light.
+        environment: (h, w) accumulated light.
         change_out: ``wp.vec2`` of ``change_shape(h, w)``: the change in -1..1, and what stood there before.
         rows: Band of sector rows, None for all.
     """
@@ -183,7 +171,7 @@ def measure_change(
     launch_rows(
         measure_change_kernel,
         (*change_out.shape, lanes),
-        [lanes, radiance, confidence, environment, environment_confidence],
+        [lanes, view, environment],
         [change_out],
         rows=rows,
         device=change_out.device,
@@ -191,35 +179,27 @@ def measure_change(
 
 
 def accumulate_environment(
-    radiance: wp.array,
-    confidence: wp.array,
-    clipped: wp.array,
+    view: EnvironmentView,
     change: wp.array,
     params: wp.array,
-    environment_out: wp.array,
-    confidence_out: wp.array,
-    clipped_out: wp.array,
+    environment_out: EnvironmentView,
     *,
     rows: Rows | None = None,
 ) -> None:
     """Draw the accumulated light toward a frame's; outputs are read and written in place and start at zero.
 
     Args:
-        radiance: This frame's light, ``wp.vec3`` (h, w).
-        confidence: Its confidence, ``wp.float32`` (h, w); 0 or NaN: not seen.
-        clipped: Share at clipping per channel, ``wp.vec3`` (h, w).
+        view: (h, w) this frame's light.
         change: From ``measure_change``.
         params: ``FrameParams`` (1): ``time_step`` and ``environment_reset``.
-        environment_out: Accumulated light, ``wp.vec3`` (h, w).
-        confidence_out: Its confidence, ``wp.float32`` (h, w).
-        clipped_out: Its share at clipping, ``wp.vec3`` (h, w).
+        environment_out: (h, w) accumulated light.
         rows: Band of rows, None for all.
     """
     launch_rows(
         accumulate_environment_kernel,
-        environment_out.shape,
-        [radiance, confidence, clipped, change, params],
-        [environment_out, confidence_out, clipped_out],
+        environment_out.radiance.shape,
+        [view, change, params],
+        [environment_out],
         rows=rows,
-        device=environment_out.device,
+        device=environment_out.radiance.device,
     )

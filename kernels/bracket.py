@@ -33,6 +33,7 @@ import warp as wp
 from warp_ar.kernels.guards import is_finite, light_confidence
 from warp_ar.kernels.latlong import PI
 from warp_ar.kernels.launch import Rows, launch_rows
+from warp_ar.kernels.structs import EnvironmentView
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,17 +54,33 @@ class BracketExposure:
     trust: wp.float32  # 1; 0 where there has been no such frame lately
 
 
+@wp.struct
+class ExposureStack:
+    """The latest unwrapped frame of every exposure, longest first, (K, h, w) each."""
+
+    radiance: wp.array3d[wp.vec3]  # in camera values of the exposure over the ball's reflectance
+    confidence: wp.array3d[wp.float32]  # 0 or NaN: not seen
+    clipped: wp.array3d[wp.vec3]  # share at clipping, per channel
+    spread: wp.array3d[wp.vec3]  # of ``spread_clipping``
+
+
+def make_exposure_stack(radiance: wp.array, confidence: wp.array, clipped: wp.array, spread: wp.array) -> ExposureStack:
+    """The arrays of the exposures together."""
+    stack = ExposureStack()
+    stack.radiance, stack.confidence, stack.clipped, stack.spread = radiance, confidence, clipped, spread
+    return stack
+
+
 @wp.kernel(enable_backward=False)
 def spread_clipping_kernel(
     # In:
     row_start: wp.int32,
-    confidence: wp.array3d[wp.float32],
-    clipped: wp.array3d[wp.vec3],
     reach: wp.float32,
-    # Out:
-    spread_out: wp.array3d[wp.vec3],
+    # In and out:
+    stack_out: ExposureStack,
 ):
     """Largest share at clipping along the row, one texel a thread."""
+    clipped = stack_out.clipped
     band_row, j, k = wp.tid()
     i = row_start + band_row
     height = clipped.shape[1]
@@ -73,34 +90,30 @@ def spread_clipping_kernel(
     largest = wp.vec3(0.0, 0.0, 0.0)
     for offset in range(-columns, columns + 1):
         at = (j + offset + width) % width
-        if confidence[k, i, at] > 0.0:
+        if stack_out.confidence[k, i, at] > 0.0:
             share = clipped[k, i, at]
             if not is_finite(share):
                 share = wp.vec3(1.0, 1.0, 1.0)
             largest = wp.max(largest, share)
-    spread_out[k, i, j] = largest
+    stack_out.spread[k, i, j] = largest
 
 
-def spread_clipping(
-    confidence: wp.array, clipped: wp.array, spread_out: wp.array, *, reach: float = REACH, rows: Rows | None = None
-) -> None:
+def spread_clipping(stack_out: ExposureStack, *, reach: float = REACH, rows: Rows | None = None) -> None:
     """Find what clips near every texel: first half, along the rows; ``merge_exposures`` does the columns.
 
     Args:
-        confidence: ``wp.float32`` (K, h, w) of every exposure.
-        clipped: Share at clipping per channel, ``wp.vec3`` (K, h, w).
-        spread_out: ``wp.vec3`` (K, h, w).
+        stack_out: (K, h, w); its ``spread`` is written.
         reach: Radians.
         rows: Band of rows, None for all.
     """
-    count, height, width = clipped.shape
+    count, height, width = stack_out.clipped.shape
     launch_rows(
         spread_clipping_kernel,
         (height, width, count),
-        [confidence, clipped, reach],
-        [spread_out],
+        [reach],
+        [stack_out],
         rows=rows,
-        device=clipped.device,
+        device=stack_out.clipped.device,
     )
 
 
@@ -109,17 +122,14 @@ def merge_exposures_kernel(
     # In:
     row_start: wp.int32,
     exposures: wp.array[BracketExposure],
-    radiance: wp.array3d[wp.vec3],
-    confidence: wp.array3d[wp.float32],
-    clipped: wp.array3d[wp.vec3],
-    spread: wp.array3d[wp.vec3],
+    stack: ExposureStack,
     reach: wp.float32,
     # Out:
-    radiance_out: wp.array2d[wp.vec3],
-    confidence_out: wp.array2d[wp.float32],
-    clipped_out: wp.array2d[wp.vec3],
+    view_out: EnvironmentView,
 ):
     """One texel a thread."""
+    radiance = stack.radiance
+    clipped = stack.clipped
     band_row, j = wp.tid()
     i = row_start + band_row
     height = radiance.shape[1]
@@ -136,14 +146,14 @@ def merge_exposures_kernel(
     for k in range(exposures.shape[0]):
         c = wp.float32(0.0)
         if exposures[k].trust > 0.0 and exposures[k].ratio > 0.0:
-            c = light_confidence(radiance[k, i, j], confidence[k, i, j])
+            c = light_confidence(radiance[k, i, j], stack.confidence[k, i, j])
         if c > 0.0 and is_finite(clipped[k, i, j]):
             certainty = wp.max(certainty, c)
             ratio = exposures[k].ratio
             value = radiance[k, i, j]
             brightest = wp.vec3(0.0, 0.0, 0.0)
             for row in range(first, last + 1):
-                brightest = wp.max(brightest, spread[k, row, j])
+                brightest = wp.max(brightest, stack.spread[k, row, j])
             for channel in range(3):
                 light = value[channel] / ratio
                 if brightest[channel] == 0.0:
@@ -159,20 +169,15 @@ def merge_exposures_kernel(
             shortest[channel] = mean[channel]
             share[channel] = 0.0
         shortest[channel] = wp.max(shortest[channel], least[channel])
-    radiance_out[i, j] = shortest
-    confidence_out[i, j] = certainty
-    clipped_out[i, j] = share
+    view_out.radiance[i, j] = shortest
+    view_out.confidence[i, j] = certainty
+    view_out.clipped[i, j] = share
 
 
 def merge_exposures(
     exposures: wp.array,
-    radiance: wp.array,
-    confidence: wp.array,
-    clipped: wp.array,
-    spread: wp.array,
-    radiance_out: wp.array,
-    confidence_out: wp.array,
-    clipped_out: wp.array,
+    stack: ExposureStack,
+    view_out: EnvironmentView,
     *,
     reach: float = REACH,
     rows: Rows | None = None,
@@ -181,21 +186,17 @@ def merge_exposures(
 
     Args:
         exposures: ``BracketExposure`` (K), longest first; the reference, whose ratio is 1, is one of them.
-        radiance: ``wp.vec3`` (K, h, w), in camera values of the exposure over the ball's reflectance.
-        confidence: ``wp.float32`` (K, h, w); 0 or NaN: not seen.
-        clipped: Share at clipping per channel, ``wp.vec3`` (K, h, w).
-        spread: From ``spread_clipping``, with the same ``reach``.
-        radiance_out: ``wp.vec3`` (h, w), in camera values of the reference; 0 where confidence is 0.
-        confidence_out: ``wp.float32`` (h, w): of the view that saw the texel best.
-        clipped_out: ``wp.vec3`` (h, w): share that clips in all exposures.
+        stack: (K, h, w); its ``spread`` from ``spread_clipping``, with the same ``reach``.
+        view_out: (h, w): radiance in camera values of the reference, confidence of the view that saw the texel best,
+            the share that clips in all exposures.
         reach: Radians.
         rows: Band of rows, None for all.
     """
     launch_rows(
         merge_exposures_kernel,
-        radiance_out.shape,
-        [exposures, radiance, confidence, clipped, spread, reach],
-        [radiance_out, confidence_out, clipped_out],
+        view_out.radiance.shape,
+        [exposures, stack, reach],
+        [view_out],
         rows=rows,
-        device=radiance_out.device,
+        device=view_out.radiance.device,
     )

@@ -222,6 +222,22 @@ def make_picture(
 
 
 @wp.struct
+class EnvironmentView:
+    """What is seen of the environment, (h, w) each: in one frame, in merged exposures, or over frames."""
+
+    radiance: wp.array2d[wp.vec3]  # linear; 0 where confidence is 0
+    confidence: wp.array2d[wp.float32]  # 0..1; 0 or NaN: not seen
+    clipped: wp.array2d[wp.vec3]  # share at clipping, per channel
+
+
+def make_environment_view(radiance: wp.array, confidence: wp.array, clipped: wp.array) -> EnvironmentView:
+    """The arrays of a view together."""
+    view = EnvironmentView()
+    view.radiance, view.confidence, view.clipped = radiance, confidence, clipped
+    return view
+
+
+@wp.struct
 class KeyLight:
     """A dominant direction of the environment."""
 

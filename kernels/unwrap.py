@@ -35,7 +35,7 @@ from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angl
 from warp_ar.kernels.launch import QUICK_TO_COMPILE, Rows, launch_rows
 from warp_ar.kernels.pixels import clip_levels, is_at_clipping, keep_linear
 from warp_ar.kernels.shapes import FAR, intersect_box, intersect_plane, meets_mesh, to_rigid_point, to_rigid_vector
-from warp_ar.kernels.structs import BOX, MESH, PLANE, FrameParams, Probe, RayScene
+from warp_ar.kernels.structs import BOX, MESH, PLANE, EnvironmentView, FrameParams, Probe, RayScene
 
 wp.set_module_options({"enable_backward": False})
 
@@ -307,14 +307,12 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
         rim_start: wp.float32,
         rim_width: wp.float32,
         # Out:
-        radiance_out: wp.array2d[wp.vec3],
-        confidence_out: wp.array2d[wp.float32],
-        clipped_out: wp.array2d[wp.vec3],
+        view_out: EnvironmentView,
     ):
         band_row, column, lane = wp.tid()
         row = row_start + band_row
-        height = radiance_out.shape[0]
-        width = radiance_out.shape[1]
+        height = view_out.radiance.shape[0]
+        width = view_out.radiance.shape[1]
         last_row = wp.float32(frame.shape[0] - 1)
         last_column = wp.float32(frame.shape[1] - 1)
         saturation = find_levels(table)
@@ -411,9 +409,9 @@ def make_gather_probe_kernel(method: str, linear: bool = False) -> wp.Kernel:
                         clipped = mix(clipped, mean_clipped, vote / votes)
                         confidence = wp.max(confidence, certainty)
         if lane == 0:
-            radiance_out[row, column] = radiance
-            confidence_out[row, column] = confidence
-            clipped_out[row, column] = clipped
+            view_out.radiance[row, column] = radiance
+            view_out.confidence[row, column] = confidence
+            view_out.clipped[row, column] = clipped
 
     return gather_probe_kernel
 
@@ -432,9 +430,7 @@ def gather_probe(
     decode_table: wp.array,
     probes: wp.array,
     corners: wp.array,
-    radiance_out: wp.array,
-    confidence_out: wp.array,
-    clipped_out: wp.array,
+    view_out: EnvironmentView,
     *,
     method: str = "area",
     rim_start: float = RIM_START,
@@ -449,9 +445,7 @@ def gather_probe(
             another channel that does, (2,).
         probes: ``Probe`` (P); reflectances must be positive.
         corners: From ``project_corners``, (h + 1, w + 1, P).
-        radiance_out: ``wp.vec3`` (h, w), linear; 0 where confidence is 0.
-        confidence_out: ``wp.float32`` (h, w) in 0..1.
-        clipped_out: ``wp.vec3`` (h, w): share of the footprint that is at clipping, per channel.
+        view_out: (h, w); of every texel its footprint's mean, and the share of it that is at clipping.
         method: ``bilinear``: one sample at the texel's centre; ``area``: one per pixel of the footprint,
             up to 8 x 8.
         rim_start: Pixels from the silhouette that are not used.
@@ -462,14 +456,14 @@ def gather_probe(
         ValueError: There is no such method.
     """
     # A texel has one sample but at the method that averages. Many texels keep a device busy by themselves.
-    lanes = 1
-    if method == "area" and radiance_out.device.is_cuda:
-        lanes = GATHER_LANES if radiance_out.size <= FEW_TEXELS else 2
+    lanes, shape, device = 1, view_out.radiance.shape, view_out.radiance.device
+    if method == "area" and device.is_cuda:
+        lanes = GATHER_LANES if shape[0] * shape[1] <= FEW_TEXELS else 2
     launch_rows(
         make_gather_probe_kernel(method, frame.dtype is wp.vec3),
-        (*radiance_out.shape, lanes),
+        (*shape, lanes),
         [lanes, frame, decode_table, probes, corners, rim_start, rim_width],
-        [radiance_out, confidence_out, clipped_out],
+        [view_out],
         rows=rows,
-        device=radiance_out.device,
+        device=device,
     )

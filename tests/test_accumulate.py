@@ -5,7 +5,7 @@ import warp as wp
 from tests.error_model import check_error
 from tests.reference import accumulate as reference
 from warp_ar.kernels import accumulate
-from warp_ar.kernels.structs import FrameParams
+from warp_ar.kernels.structs import FrameParams, make_environment_view
 
 # Float32 sums and exponentials, a few roundings each.
 ROUNDING = 2e-6
@@ -29,10 +29,10 @@ class Light:
         x = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(radiance), (h, w, 3))), dtype=wp.vec3)
         c = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(confidence), (h, w))), dtype=wp.float32)
         s = wp.array(np.ascontiguousarray(np.broadcast_to(np.float32(clipped), (h, w, 3))), dtype=wp.vec3)
-        accumulate.measure_change(x, c, self.radiance, self.confidence, self.change)
-        accumulate.accumulate_environment(
-            x, c, s, self.change, wp.array(params, dtype=FrameParams), self.radiance, self.confidence, self.clipped
-        )
+        view = make_environment_view(x, c, s)
+        environment = make_environment_view(self.radiance, self.confidence, self.clipped)
+        accumulate.measure_change(view, environment, self.change)
+        accumulate.accumulate_environment(view, self.change, wp.array(params, dtype=FrameParams), environment)
         return self.radiance.numpy()
 
 

@@ -21,6 +21,7 @@ from warp_ar.input.exposures import MOST_EXPOSURES, brightened, find_exposure, p
 from warp_ar.input.sources import Synthetic
 from warp_ar.kernels import bracket
 from warp_ar.kernels.color import decode_table
+from warp_ar.kernels.structs import make_environment_view
 from warp_ar.scene import (
     Camera,
     Marker,
@@ -60,15 +61,14 @@ def merge(ratios, radiance, confidence, clipped, *, trust=None, rows=None, reach
     radiance, clipped = (wp.array(np.float32(x), dtype=wp.vec3) for x in (radiance, clipped))
     confidence = wp.array(np.float32(confidence), dtype=wp.float32)
     spread = wp.zeros(clipped.shape, dtype=wp.vec3)
-    out = [wp.full((height, width), -1.0, dtype=kind) for kind in (wp.float32,)]
+    stack = bracket.make_exposure_stack(radiance, confidence, clipped, spread)
     light, share = (wp.full((height, width), wp.vec3(-1.0), dtype=wp.vec3) for _ in range(2))
+    out = make_environment_view(light, wp.full((height, width), -1.0, dtype=wp.float32), share)
     for band in rows or [None]:
-        bracket.spread_clipping(confidence, clipped, spread, reach=reach, rows=band)
+        bracket.spread_clipping(stack, reach=reach, rows=band)
     for band in rows or [None]:
-        bracket.merge_exposures(
-            exposures, radiance, confidence, clipped, spread, light, out[0], share, reach=reach, rows=band
-        )
-    return light.numpy(), out[0].numpy(), share.numpy()
+        bracket.merge_exposures(exposures, stack, out, reach=reach, rows=band)
+    return out.radiance.numpy(), out.confidence.numpy(), out.clipped.numpy()
 
 
 def expose(light, ratios=RATIOS):

@@ -21,6 +21,7 @@ from warp_ar.kernels.structs import (
     RayScene,
     Shape,
     Texture,
+    make_environment_view,
 )
 
 # Float32 directions and unit vectors: a few roundings of 6e-8 each.
@@ -90,9 +91,8 @@ def unwrapped(
     table = wp.array(decode_table(transfer), dtype=wp.vec3)
     frame = wp.array(np.ascontiguousarray(frame), dtype=wp.vec3ub)
     for band in rows or [None]:
-        unwrap.gather_probe(
-            frame, table, make_probes(balls), corners, radiance, confidence, clipped, method=method, rows=band
-        )
+        view = make_environment_view(radiance, confidence, clipped)
+        unwrap.gather_probe(frame, table, make_probes(balls), corners, view, method=method, rows=band)
     return radiance.numpy(), confidence.numpy(), clipped.numpy()
 
 

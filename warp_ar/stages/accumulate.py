@@ -10,7 +10,7 @@ import warp as wp
 from warp_ar.kernels import accumulate
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.probe_maps import UNWRAPPED
+from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
 
 
 class Accumulate(Stage):
@@ -55,30 +55,14 @@ class Accumulate(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """Change first, then the mean; neither of a frame in which something covers a ball."""
         height = self.request.quality.environment_height
-        radiance, confidence, clipped = (arrays[name] for name in self.wiring.reads[:3])
+        view = find_view(arrays, self.wiring.reads[0].removesuffix("_radiance"))
+        environment, change, params = find_view(arrays, "environment"), arrays["accumulate_change"], arrays["params"]
 
         def measure(rows: Rows | None) -> None:
-            accumulate.measure_change(
-                radiance,
-                confidence,
-                arrays["environment_radiance"],
-                arrays["environment_confidence"],
-                arrays["accumulate_change"],
-                rows=rows,
-            )
+            accumulate.measure_change(view, environment, change, rows=rows)
 
         def follow(rows: Rows | None) -> None:
-            accumulate.accumulate_environment(
-                radiance,
-                confidence,
-                clipped,
-                arrays["accumulate_change"],
-                arrays["params"],
-                arrays["environment_radiance"],
-                arrays["environment_confidence"],
-                arrays["environment_clipped"],
-                rows=rows,
-            )
+            accumulate.accumulate_environment(view, change, params, environment, rows=rows)
 
         def tells() -> bool:
             return not arrays["ball_covered"]()

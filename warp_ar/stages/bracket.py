@@ -11,7 +11,7 @@ from warp_ar.kernels import bracket as kernels
 from warp_ar.kernels.launch import copy
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.probe_maps import UNWRAPPED
+from warp_ar.stages.shared.probe_maps import UNWRAPPED, find_view
 
 
 class Bracket(Stage):
@@ -59,6 +59,8 @@ class Bracket(Stage):
         """The reference joins the others; what clips nearby; their mean."""
         height = self.request.quality.environment_height
         reference = self.request.exposures.index(1.0)
+        stack = kernels.make_exposure_stack(*(arrays[f"bracket_{part}"] for part in (*UNWRAPPED, "spread")))
+        merged = find_view(arrays, "merged")
         own = [(arrays[f"bracket_{part}"][reference], arrays[f"probe_{part}"]) for part in UNWRAPPED]
 
         def store(rows: Rows | None) -> None:
@@ -66,21 +68,9 @@ class Bracket(Stage):
                 copy(target, source)
 
         def spread(rows: Rows | None) -> None:
-            kernels.spread_clipping(
-                arrays["bracket_confidence"], arrays["bracket_clipped"], arrays["bracket_spread"], rows=rows
-            )
+            kernels.spread_clipping(stack, rows=rows)
 
         def merge(rows: Rows | None) -> None:
-            kernels.merge_exposures(
-                arrays["bracket_exposures"],
-                arrays["bracket_radiance"],
-                arrays["bracket_confidence"],
-                arrays["bracket_clipped"],
-                arrays["bracket_spread"],
-                arrays["merged_radiance"],
-                arrays["merged_confidence"],
-                arrays["merged_clipped"],
-                rows=rows,
-            )
+            kernels.merge_exposures(arrays["bracket_exposures"], stack, merged, rows=rows)
 
         return [Pass(store), Pass(spread, rows=height), Pass(merge, rows=height)]

@@ -11,6 +11,7 @@ from warp_ar.kernels import sphere_map, unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.probe_maps import find_view
 from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
@@ -94,15 +95,15 @@ class Unwrap(Stage):
                 rows=rows,
             )
 
+        view = find_view(arrays, "probe")
+
         def gather(rows: Rows | None) -> None:
             unwrap.gather_probe(
                 arrays["linear_frame" if linear else "frame"],
                 arrays["linear_clip" if linear else "decode"],
                 arrays["probes"],
                 arrays["unwrap_corners"],
-                arrays["probe_radiance"],
-                arrays["probe_confidence"],
-                arrays["probe_clipped"],
+                view,
                 method=method,
                 rows=rows,
             )
