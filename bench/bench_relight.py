@@ -119,7 +119,7 @@ def _edges(world: World) -> dict[str, Callable[[], None]]:
         receiver = make_receiver(config, world.picture, **world.known)
         count = wp.zeros(1, wp.int32, device=device)
         edges = wp.zeros(H * W // 16, wp.vec2i, device=device)
-        lists = EdgeLists(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
+        lists = EdgeLists.of(count, edges, wp.zeros(len(edges) * samples, wp.vec4, device=device))
         inputs = config, world.params, world.scene, world.lights, receiver
         relight.relight(*inputs, out, visibility)
         for name, own in (("in place", None), ("listed", lists)):

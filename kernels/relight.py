@@ -26,7 +26,7 @@ import warp as wp
 
 from warp_ar.kernels.area_lights import make_area_count, make_area_sample
 from warp_ar.kernels.cells import any_cell_above_zero, look_up_cells
-from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, QUICK_TO_COMPILE, Rows, launch, launch_rows, slow_to_compile
 from warp_ar.kernels.receiver import (
     DEFAULT_REFLECTANCE,
@@ -300,15 +300,14 @@ def make_smooth_edges_kernel(config: RelightConfig, *, left: bool = False) -> wp
         lights: wp.array[Light],
         receiver: Receiver,
         visibility: wp.array2d[wp.int32],
-        edge_count: wp.array[wp.int32],
-        edges: wp.array[wp.vec2i],
+        listed: EdgeList,
         # Out:
         added_out: wp.array2d[wp.vec3],
     ):
         i, j = wp.tid()
         i += row_start
         if wp.static(left):
-            if edge_count[0] <= edges.shape[0]:
+            if holds_all(listed):
                 return
         rect = params[0].light_rect
         if not inside_rect(i, j, rect):
@@ -331,15 +330,14 @@ def list_edges_kernel(
     params: wp.array[FrameParams],
     visibility: wp.array2d[wp.int32],
     # Out:
-    edge_count_out: wp.array[wp.int32],
-    edges_out: wp.array[wp.vec2i],
+    list_out: EdgeList,
 ):
     """List the pixels that ``is_edge`` finds."""
     i, j = wp.tid()
     rect = params[0].light_rect
     if inside_rect(i, j, rect):
         if is_edge(visibility, rect, i, j):
-            list_edge(i, j, edge_count_out, edges_out)
+            list_edge(i, j, list_out)
 
 
 @functools.cache
@@ -355,15 +353,14 @@ def make_sample_edges_kernel(config: RelightConfig) -> wp.Kernel:
         scene: RayScene,
         lights: wp.array[Light],
         receiver: Receiver,
-        edge_count: wp.array[wp.int32],
-        edges: wp.array[wp.vec2i],
+        listed: EdgeList,
         # Out:
         samples_out: wp.array[wp.vec4],
     ):
         item = wp.tid()
-        stop = listed_edges(edge_count, edges) * wp.static(config.edge_samples)
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
         while item < stop:
-            edge = edges[item / wp.static(config.edge_samples)]
+            edge = listed.edges[item / wp.static(config.edge_samples)]
             sample = item % wp.static(config.edge_samples)
             samples_out[item] = sample_lighting(params, scene, lights, receiver, edge[0], edge[1], sample)
             item += threads
@@ -437,13 +434,12 @@ def smooth_edges(
     inputs = [params, scene, lights, receiver]
     if edge_lists is None:
         kernel = make_smooth_edges_kernel(config)
-        launch_rows(kernel, shape, [*inputs, visibility, None, None], [added_out], rows=rows, device=device)
+        launch_rows(kernel, shape, [*inputs, visibility, EdgeList()], [added_out], rows=rows, device=device)
         return
-    listed = [edge_lists.count, edge_lists.edges]
-    edge_lists.count.zero_()
-    launch(list_edges_kernel, shape, [params, visibility], listed, device=device)
+    edge_lists.listed.count.zero_()
+    launch(list_edges_kernel, shape, [params, visibility], [edge_lists.listed], device=device)
     kernel = make_smooth_edges_kernel(config, left=True)
-    launch_rows(kernel, shape, [*inputs, visibility, *listed], [added_out], rows=None, device=device)
+    launch_rows(kernel, shape, [*inputs, visibility, edge_lists.listed], [added_out], rows=None, device=device)
     sample_listed_edges(
         make_sample_edges_kernel(config), inputs, edge_lists, config.edge_samples, added_out, weighted=True
     )

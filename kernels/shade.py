@@ -30,7 +30,7 @@ from warp_ar.kernels.area_lights import (
     make_area_sample,
     without_lobe,
 )
-from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
+from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
 from warp_ar.kernels.materials import Surface, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
@@ -68,6 +68,8 @@ EDGE_COSINE = wp.constant(wp.float32(math.cos(math.radians(30.0))))
 # Smallest cosine between shading normal and viewer.
 MIN_FACING = wp.constant(wp.float32(1.0e-3))
 
+ALONE = wp.constant(-1)
+"""Number of the one sample of a pixel without an edge."""
 SAMPLED, LISTED, LEFT = "sampled", "listed", "left"
 """What becomes of edges in a kernel of ``make_shade_kernel``."""
 
@@ -288,7 +290,7 @@ def most_alike(visible: VisibleObjects, i: wp.int32, j: wp.int32, hit: Hit) -> w
 
 @functools.cache
 def make_shade_sample(config: ShadeConfig) -> wp.Function:
-    """``shade_sample``: radiance and coverage of one sample of a pixel; where alone, of its centre's hit."""
+    """``shade_sample``: radiance and coverage of one sample of a pixel; of ``ALONE``, its centre's hit."""
     shade_hit = make_shade_hit(config)
     closest_visible = make_primary(config.distant.trace)
     centre_direction, sample_direction = make_sample_direction(1), make_sample_direction(config.edge_samples)
@@ -302,12 +304,13 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
         distant: DistantLight,
         visible: VisibleObjects,
         near: NearLight,
-        i: wp.int32,
-        j: wp.int32,
+        pixel: wp.vec2i,
         sample: wp.int32,
-        alone: wp.bool,
         centre: Hit,
     ) -> wp.vec4:
+        i = pixel[0]
+        j = pixel[1]
+        alone = sample == ALONE
         direction = centre_direction(params, rays[i, j], 0)
         hit = centre
         if wp.static(config.edge_samples > 1):
@@ -318,17 +321,17 @@ def make_shade_sample(config: ShadeConfig) -> wp.Function:
             return wp.vec4(0.0)
         point = NearPoint()
         if wp.static(config.near_field):
-            pixel = wp.vec2i(i, j)
+            alike = pixel
             if not alone:
-                pixel = most_alike(visible, i, j, hit)
-            point.known = pixel[0] >= 0
+                alike = most_alike(visible, i, j, hit)
+            point.known = alike[0] >= 0
             if point.known:
                 if wp.static(config.distant.diffuse != "none"):
                     if near.irradiance.shape[0] > 0:
-                        point.irradiance = near.irradiance[pixel[0], pixel[1]]
+                        point.irradiance = near.irradiance[alike[0], alike[1]]
                 if wp.static(config.distant.specular):
                     if near.reflected.shape[0] > 0:
-                        point.reflected = near.reflected[pixel[0], pixel[1]]
+                        point.reflected = near.reflected[alike[0], alike[1]]
         spread = scene.pixel_spread
         radiance = shade_hit(scene, lights, distant, hit, direction, point, tile_turn(i, j), spread)
         return wp.vec4(radiance[0], radiance[1], radiance[2], 1.0)
@@ -362,13 +365,12 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
         near: NearLight,
         # Out:
         virtual_out: wp.array2d[wp.vec4],
-        edge_count_out: wp.array[wp.int32],
-        edges_out: wp.array[wp.vec2i],
+        list_out: EdgeList,
     ):
         i, j = wp.tid()
         i += row_start
         if wp.static(edges == LEFT):
-            if edge_count_out[0] <= edges_out.shape[0]:
+            if holds_all(list_out):
                 return
         result = wp.vec4(0.0)
         samples = wp.int32(0)
@@ -388,23 +390,12 @@ def make_shade_kernel(config: ShadeConfig, edges: str = SAMPLED) -> wp.Kernel:
                         samples = wp.static(config.edge_samples)
             if wp.static(edges == LISTED):
                 if samples > 1:
-                    list_edge(i, j, edge_count_out, edges_out)
+                    list_edge(i, j, list_out)
                     return
-            for sample in range(samples):
-                result += shade_sample(
-                    params,
-                    rays,
-                    scene,
-                    lights,
-                    distant,
-                    visible,
-                    near,
-                    i,
-                    j,
-                    sample,
-                    wp.static(edges == LISTED) or samples == 1,
-                    hit,
-                )
+            pixel = wp.vec2i(i, j)
+            for number in range(samples):
+                sample = wp.where(wp.static(edges == LISTED) or samples == 1, ALONE, number)
+                result += shade_sample(params, rays, scene, lights, distant, visible, near, pixel, sample, hit)
             if samples > 1:
                 result = result / wp.float32(samples)
         if wp.static(edges == LEFT):
@@ -431,29 +422,16 @@ def make_sample_edges_kernel(config: ShadeConfig) -> wp.Kernel:
         distant: DistantLight,
         visible: VisibleObjects,
         near: NearLight,
-        edge_count: wp.array[wp.int32],
-        edges: wp.array[wp.vec2i],
+        listed: EdgeList,
         # Out:
         samples_out: wp.array[wp.vec4],
     ):
         item = wp.tid()
-        stop = listed_edges(edge_count, edges) * wp.static(config.edge_samples)
+        stop = listed_edges(listed) * wp.static(config.edge_samples)
         while item < stop:
-            edge = edges[item / wp.static(config.edge_samples)]
-            samples_out[item] = shade_sample(
-                params,
-                rays,
-                scene,
-                lights,
-                distant,
-                visible,
-                near,
-                edge[0],
-                edge[1],
-                item % wp.static(config.edge_samples),
-                False,
-                Hit(),
-            )
+            pixel = listed.edges[item / wp.static(config.edge_samples)]
+            sample = item % wp.static(config.edge_samples)
+            samples_out[item] = shade_sample(params, rays, scene, lights, distant, visible, near, pixel, sample, Hit())
             item += threads
 
     return sample_edges_kernel
@@ -494,10 +472,10 @@ def shade(
     inputs = [params, rays, scene, lights, distant, visible, NearLight() if near is None else near]
     device = rays.device
     if edge_lists is None or config.edge_samples == 1:
-        launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, None, None], rows=rows, device=device)
+        launch_rows(make_shade_kernel(config), rays.shape, inputs, [virtual_out, EdgeList()], rows=rows, device=device)
         return
-    edge_lists.count.zero_()
-    outputs = [virtual_out, edge_lists.count, edge_lists.edges]
+    edge_lists.listed.count.zero_()
+    outputs = [virtual_out, edge_lists.listed]
     for kernel in (make_shade_kernel(config, LISTED), make_shade_kernel(config, LEFT)):
         launch_rows(kernel, rays.shape, inputs, outputs, rows=rows, device=device)
     sample_listed_edges(

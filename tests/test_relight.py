@@ -181,7 +181,7 @@ def run_edges(
         lists = None
         if listed:
             sizes = ((1, wp.int32), (listed, wp.vec2i), (listed * samples, wp.vec4))
-            lists = EdgeLists(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
+            lists = EdgeLists.of(*(wp.zeros(size, dtype=kind) for size, kind in sizes))
         for band in rows or (None,):
             relight.smooth_edges(*inputs, visibility, out, edge_lists=lists, rows=band)
     return out.numpy()

@@ -123,7 +123,7 @@ def render(
     if listed:
         samples = wp.zeros(listed * config.edge_samples, dtype=wp.vec4, device=device)
         count, edges = (wp.zeros(n, dtype=t, device=device) for n, t in ((1, wp.int32), (listed, wp.vec2i)))
-        lists = EdgeLists(count, edges, samples)
+        lists = EdgeLists.of(count, edges, samples)
     for rows in bands:
         inputs = (params, rays, scene, light_array, surroundings, visible)
         shade(config, *inputs, virtual, edge_lists=lists, rows=rows)

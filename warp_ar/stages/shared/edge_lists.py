@@ -35,4 +35,4 @@ def make_edge_lists(arrays: Arrays, device: Any, stage: str) -> EdgeLists | None
     """The lists of a stage on CUDA; on CPU, and where a pixel has one sample, None."""
     if device.is_cpu or f"{stage}_edges" not in arrays:
         return None
-    return EdgeLists(*(arrays[f"{stage}_{name}"] for name in ("edge_count", "edges", "edge_samples")))
+    return EdgeLists.of(*(arrays[f"{stage}_{name}"] for name in ("edge_count", "edges", "edge_samples")))
