@@ -21,7 +21,7 @@ import numpy as np
 from bench.common import paired_ratio
 from bench.farm_bounds import measure_worker
 from bench.farm_recordings import RATE, write_recording, write_scene
-from bench.farm_runs import Done, jobs_done, prepare, rates, work
+from bench.farm_runs import Done, jobs_done, prepare, rates, work, write_jobs
 from warp_ar.device import usable_cores
 from warp_ar.farm.draws import draw_variation
 from warp_ar.farm.jobs import Job, parse_jobs, read_jobs
@@ -36,16 +36,6 @@ if TYPE_CHECKING:
 SEGMENTS = 8
 EDGE = 24
 """Frames from a segment's begin on that are taken for its beginning."""
-RECORDING = """schema = 1
-[run]
-quality = "{quality}"
-decode = "{decode}"
-segment_frames = {segment}
-[[clip]]
-scene = "desk.toml"
-path = "long.mp4"
-name = "long"
-"""
 
 
 # ------------------------------------------------------------------------------------------------------ long recordings
@@ -62,10 +52,7 @@ def run_long(bench: Bench) -> None:
     bench.say(
         f"a recording of {frames} frames in {time.monotonic() - start:.0f} s, {video.stat().st_size / 1e6:.0f} MB"
     )
-    jobs = bench.folder / "long.toml"
-    options = bench.options
-    text = RECORDING.format(quality=options.quality, decode=options.decode, segment=-(-frames // SEGMENTS))
-    jobs.write_text(text)
+    jobs = write_jobs(bench, "long", -(-frames // SEGMENTS))
     prepare(folder, jobs, None)
     seen = work(folder, SEGMENTS, bench.device, bench.say, limit=max(bench.left, 120.0))
     survey, segments = jobs_done(folder, "survey"), jobs_done(folder, "segment")

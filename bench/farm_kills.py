@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.farm_recordings import write_recording
-from bench.farm_runs import Watched, prepare, work, workers_of
+from bench.farm_runs import Watched, prepare, work, workers_of, write_jobs
 from warp_ar.device import usable_cores
 
 if TYPE_CHECKING:
@@ -28,16 +28,6 @@ JOBS_A_DEATH = 4
 """Segments of the recording for each death: between two of them some jobs are done."""
 MOST_RUNS = 8
 """Times that a driver is begun beyond the deaths that are asked for, before the benchmark gives up."""
-JOBS = """schema = 1
-[run]
-quality = "{quality}"
-decode = "{decode}"
-segment_frames = {segment}
-[[clip]]
-scene = "desk.toml"
-path = "kills.mp4"
-name = "kills"
-"""
 
 
 def run_kills(bench: Bench) -> None:
@@ -48,8 +38,7 @@ def run_kills(bench: Bench) -> None:
     deaths = options.kills + options.driver_kills
     segment = max(2, options.kill_frames // (JOBS_A_DEATH * max(deaths, 1)))
     write_recording(bench.folder / "kills.mp4", bench.size, options.kill_frames)
-    jobs = bench.folder / "kills.toml"
-    jobs.write_text(JOBS.format(quality=options.quality, decode=options.decode, segment=segment))
+    jobs = write_jobs(bench, "kills", segment)
     alone, killed = bench.folder / "alone", bench.folder / "killed"
     prepare(alone, jobs, None)
     left = work(alone, workers, bench.device, bench.say, limit=max(0.4 * bench.left, 120.0))

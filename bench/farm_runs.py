@@ -17,13 +17,26 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from warp_ar.farm.jobs import read_jobs
 from warp_ar.farm.manifest import begin_run
 from warp_ar.farm.version import program_version
 
+if TYPE_CHECKING:
+    from bench.bench_farm import Bench
+
 ROOT = Path(__file__).resolve().parents[1]
+JOBS = """schema = 1
+[run]
+quality = "{quality}"
+decode = "{decode}"
+segment_frames = {segment}
+[[clip]]
+scene = "desk.toml"
+path = "{name}.mp4"
+name = "{name}"
+"""
 TELL_SECONDS = 10.0
 """Between two lines of progress."""
 
@@ -71,6 +84,13 @@ class Watched:
             "driver_peak_mb": round(max(self.driver_mb, default=0.0)),
             "samples": len(self.driver_mb),
         }
+
+
+def write_jobs(bench: Bench, name: str, segment: int) -> Path:
+    """The job file of one recording, ``NAME.mp4``, lit by the scene ``desk.toml`` in segments of so many frames."""
+    path, options = bench.folder / f"{name}.toml", bench.options
+    path.write_text(JOBS.format(quality=options.quality, decode=options.decode, segment=segment, name=name))
+    return path
 
 
 def prepare(folder: Path, jobs: Path, survey: Path | None) -> None:

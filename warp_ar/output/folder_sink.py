@@ -82,11 +82,7 @@ class FolderSink(ThreadedSink):
         super().write(image)
 
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
-        path = self._path / f"{index:04d}.png"
-        ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
-        if not ok:
-            raise SinkError(f"{path} cannot be encoded as PNG")
-        _write(path, sign_png(data.tobytes()))
+        _write_png(self._path / f"{index:04d}.png", image)
 
 
 class DeepPngSink(FolderSink):
@@ -112,12 +108,8 @@ class DeepPngSink(FolderSink):
     def _store(self, index: int, image: npt.NDArray[Any]) -> None:
         from warp_ar.kernels.color import encode_codes  # here, for it loads Warp: the page is to be there before
 
-        path = self._path / f"{index:04d}.png"
         codes = np.rint(65535.0 * encode_codes(self._transfer, image)).astype(np.uint16)
-        ok, data = cv2.imencode(".png", cv2.cvtColor(codes, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
-        if not ok:
-            raise SinkError(f"{path} cannot be encoded as PNG")
-        _write(path, sign_png(data.tobytes()))
+        _write_png(self._path / f"{index:04d}.png", codes)
 
 
 class RadianceSink(FolderSink):
@@ -151,6 +143,14 @@ class RadianceSink(FolderSink):
         channels = {name: np.ascontiguousarray(half[..., k]) for k, name in enumerate("RGB")}
         path = self._path / f"{index:04d}.exr"
         _write(path, functools.partial(write_exr, image=OpenEXR.File(header, channels)))
+
+
+def _write_png(path: pathlib.Path, image: npt.NDArray[Any]) -> None:
+    """Write RGB codes of 8 or 16 bits, signed."""
+    ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), PNG_OPTIONS)
+    if not ok:
+        raise SinkError(f"{path} cannot be encoded as PNG")
+    _write(path, sign_png(data.tobytes()))
 
 
 def _write(path: pathlib.Path, data: Any) -> None:

@@ -16,34 +16,22 @@ from typing import Any
 import numpy as np
 
 from warp_ar.cache_folder import cache_folder
-from warp_ar.scene import (
-    geometry,
-    gltf,
-    gltf_animation,
-    gltf_arrays,
-    gltf_materials,
-    mesh_assets,
-    mesh_files,
-    mesh_materials,
-    mesh_parts,
-    mtl,
-    node_animation,
-)
+from warp_ar.scene import geometry, mesh_files, mesh_materials
 
 _CODE = (
-    geometry,
-    gltf,
-    gltf_animation,
-    gltf_arrays,
-    gltf_materials,
-    mesh_assets,
-    mesh_files,
-    mesh_materials,
-    mesh_parts,
-    mtl,
-    node_animation,
+    "geometry",
+    "gltf",
+    "gltf_animation",
+    "gltf_arrays",
+    "gltf_materials",
+    "mesh_assets",
+    "mesh_files",
+    "mesh_materials",
+    "mesh_parts",
+    "mtl",
+    "node_animation",
 )
-"""What decides how a file is read."""
+"""Modules of this package that decide how a file is read."""
 WHOLE = (".ply", ".stl", ".off", ".glb")
 """Formats without files beside them."""
 MOST_BYTES = 256 << 20
@@ -59,7 +47,7 @@ def load_kept_mesh(path: Path) -> geometry.Mesh:
     try:
         if path.suffix.lower() not in WHOLE or path.stat().st_size > MOST_BYTES:
             return mesh_files.load_mesh(path)
-        code = b"".join(Path(str(module.__file__)).read_bytes() for module in _CODE)
+        code = b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in _CODE)
         key = hashlib.sha256(code + path.read_bytes()).hexdigest()[:32]
     except OSError:
         return mesh_files.load_mesh(path)  # which says what is wrong
