@@ -30,6 +30,15 @@ import warp as wp
 from warp_ar.kernels.color import luminance
 from warp_ar.kernels.cooperative import block_max, from_first, lane_count, team_max, team_sum, warp_sum
 from warp_ar.kernels.guards import smooth_ramp
+from warp_ar.kernels.key_light_sectors import (
+    KEY_SECTORS,
+    SECTOR_COLUMNS,
+    SECTOR_ROWS,
+    excess_around,
+    received_from,
+    shift_on_sectors,
+    stage_sectors,
+)
 from warp_ar.kernels.latlong import PI, direction_from_latlong, texel_solid_angle
 from warp_ar.kernels.launch import launch, launch_tiles, wait_for_block
 from warp_ar.kernels.structs import KeyLight
@@ -37,9 +46,6 @@ from warp_ar.kernels.structs import KeyLight
 wp.set_module_options({"enable_backward": False})
 
 KEY_LIGHT_COUNT = 4
-SECTOR_ROWS = wp.constant(8)
-SECTOR_COLUMNS = wp.constant(16)
-KEY_SECTORS = wp.constant(SECTOR_ROWS * SECTOR_COLUMNS)
 SECTOR_SUMS = 2 * SECTOR_ROWS * SECTOR_COLUMNS + 16
 """Length of the scratch array of sectors: their excess, what of it is left over, and sums around lights and pairs."""
 LOBE_INNER = wp.constant(wp.float32(math.cos(math.radians(20.0))))
@@ -187,60 +193,6 @@ def columns_of_lobe(
     return wp.vec2i(first, wp.min(wp.int32(wp.ceil(centre + reach)) - first + 1, width))
 
 
-# What concerns sectors is written so that few instructions do it: a warp that has a processor to itself waits for each.
-
-
-_LANES = f"""
-#if defined(__CUDA_ARCH__)
-    constexpr int LANES = 32;
-    const int lane = threadIdx.x & 31;
-#else
-    constexpr int LANES = 1;
-    const int lane = 0;
-#endif
-    constexpr int SECTORS = {SECTOR_ROWS * SECTOR_COLUMNS}, OWN = SECTORS / LANES;
-"""
-
-
-@wp.func_native(
-    _LANES
-    + """
-    const wp::vec_t<4, float>* left_over = sectors.data + SECTORS;
-#if defined(__CUDA_ARCH__)
-    __shared__ float4 staged[SECTORS];
-    for (int sector = threadIdx.x; sector < SECTORS; sector += blockDim.x)
-        staged[sector] = make_float4(left_over[sector][0], left_over[sector][1], left_over[sector][2], 0.0f);
-    __syncthreads();
-    return reinterpret_cast<wp::uint64>(staged);
-#else
-    return reinterpret_cast<wp::uint64>(left_over);
-#endif
-"""
-)
-def stage_sectors(sectors: wp.array[wp.vec4]) -> wp.uint64:
-    """Where what is left over can be read fast; for a whole block."""
-
-
-@wp.func_native(
-    _LANES
-    + """
-    const float* moments = reinterpret_cast<const float*>(staged);
-    float sum = 0.0f;
-#if defined(__CUDA_ARCH__)
-#pragma unroll 8
-#endif
-    for (int sector = 0; sector < SECTORS; ++sector) {
-        const float* at = moments + 4 * sector;
-        const float facing = at[0] * toward[0] + at[1] * toward[1] + at[2] * toward[2];
-        sum += facing > 0.0f ? facing : 0.0f;
-    }
-    return sum;
-"""
-)
-def received_from(staged: wp.uint64, toward: wp.vec3) -> wp.float32:
-    """What a surface that faces ``toward`` receives of the excess left over; ``staged`` is of ``stage_sectors``."""
-
-
 @wp.func_native("""
     const wp::vec3& texel = wp::index(environment, row, column);
 #if defined(__CUDA_ARCH__)
@@ -253,61 +205,220 @@ def load_constant(environment: wp.array2d[wp.vec3], row: wp.int32, column: wp.in
     """A texel of what does not change while a team works: it stays in the cache while blocks wait for each other."""
 
 
-@wp.func_native(
-    _LANES
-    + """
-    wp::vec_t<4, float> own[OWN];
-    float inverse[OWN];
-    for (int n = 0; n < OWN; ++n) {
-        own[n] = sectors.data[SECTORS + lane + LANES * n];
-        inverse[n] = own[n][3] > 0.0f ? 1.0f / own[n][3] : 0.0f;
-    }
-#if defined(__CUDA_ARCH__)
-#pragma unroll 1
-#endif
-    for (int shift = 0; shift < 10; ++shift) {
-        float centre[3] = {0.0f, 0.0f, 0.0f};
-        for (int n = 0; n < OWN; ++n) {
-            const float facing = own[n][0] * direction[0] + own[n][1] * direction[1] + own[n][2] * direction[2];
-            const float cosine = facing * inverse[n], square = cosine * cosine, fourth = square * square;
-            const float weight = facing > 0.0f ? (shift < 2 ? 1.0f : shift < 4 ? square : fourth * fourth) : 0.0f;
-            for (int k = 0; k < 3; ++k) centre[k] += weight * own[n][k];
-        }
-#if defined(__CUDA_ARCH__)
-        for (int reach = 16; reach > 0; reach /= 2)
-            for (int k = 0; k < 3; ++k) centre[k] += __shfl_xor_sync(0xffffffffu, centre[k], reach);
-#endif
-        const float length = sqrtf(centre[0] * centre[0] + centre[1] * centre[1] + centre[2] * centre[2]);
-        if (length > 0.0f)
-            for (int k = 0; k < 3; ++k) direction[k] = centre[k] / length;
-    }
-    return direction;
-"""
-)
-def shift_on_sectors(sectors: wp.array[wp.vec4], direction: wp.vec3) -> wp.vec3:
-    """Ten mean shifts: two with all that faces the direction, two with cos^2, six with cos^8; for a whole warp."""
+@wp.struct
+class Team:
+    """Where a thread stands among those that find lights together."""
+
+    thread: wp.int32  # in its block
+    threads: wp.int32
+    worker: wp.int32  # in all blocks
+    workers: wp.int32
+    lane: wp.int32  # in its warp
+    lanes: wp.int32
 
 
-@wp.func_native(
-    _LANES
-    + """
-    float sum = 0.0f;
-    for (int n = 0; n < OWN; ++n) {
-        const wp::vec_t<4, float> moment = sectors.data[lane + LANES * n];
-        const float facing = moment[0] * direction[0] + moment[1] * direction[1] + moment[2] * direction[2];
-        if (facing > 0.0f) {
-            const float cosine = facing / moment[3], square = cosine * cosine, fourth = square * square;
-            sum += moment[3] * fourth * fourth * fourth * fourth;
-        }
-    }
-#if defined(__CUDA_ARCH__)
-    for (int reach = 16; reach > 0; reach /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, reach);
-#endif
-    return sum;
-"""
-)
-def excess_around(sectors: wp.array[wp.vec4], direction: wp.vec3) -> wp.float32:
-    """Excess within some 17 degrees of a direction, weighted by cos^16; for a whole warp."""
+@wp.struct
+class Sky:
+    """What holds for all texels of the map, and all lights."""
+
+    mean: wp.float32  # luminance
+    column_angle: wp.float32  # radians
+    cos_step: wp.float32  # of the angle from a lane's texel to its next one
+    sin_step: wp.float32
+    area_of_sine: wp.float32  # a texel's solid angle / sin theta
+
+
+@wp.struct
+class LobeSums:
+    """Of a thread's texels of a lobe."""
+
+    sum: wp.vec4
+    highest: wp.float32  # excess that is left over
+
+
+@wp.struct
+class Found:
+    """The lights found so far; a light's place is picked by comparing."""
+
+    directions: mat43
+    strengths: wp.vec4  # luminance of irradiance
+    reds: wp.vec4  # irradiance
+    greens: wp.vec4
+    blues: wp.vec4
+
+
+@wp.func
+def sector_direction(sector: wp.int32) -> wp.vec3:
+    """Direction of a sector's middle."""
+    return direction_from_latlong(
+        wp.float32(sector // SECTOR_COLUMNS) + 0.5,
+        wp.float32(sector % SECTOR_COLUMNS) + 0.5,
+        SECTOR_ROWS,
+        SECTOR_COLUMNS,
+    )
+
+
+@wp.func
+def best_direction(sectors: wp.array[wp.vec4], team: Team) -> wp.vec4:
+    """The sector's direction in which a surface receives most, moved by mean shifts, and what it receives.
+
+    The first of equals, whatever the number of threads. Where nothing is left over, +z and 0. For a whole block.
+    """
+    best = wp.float32(0.0)
+    best_sector = wp.float32(KEY_SECTORS)
+    staged = stage_sectors(sectors)
+    candidate = team.thread
+    while candidate < KEY_SECTORS:
+        received = received_from(staged, sector_direction(candidate))
+        if received > best:
+            best = received
+            best_sector = wp.float32(candidate)
+        candidate += team.threads
+    most = block_max(best)
+    if best < most:
+        best_sector = wp.float32(KEY_SECTORS)
+    chosen = -wp.int32(block_max(-best_sector))
+    direction = wp.vec3(0.0, 0.0, 1.0)
+    if most > 0.0:
+        direction = sector_direction(chosen)
+        if team.thread < team.lanes:
+            direction = shift_on_sectors(sectors, direction)
+        direction = from_first(direction)
+    return wp.vec4(direction[0], direction[1], direction[2], most)
+
+
+# What a texel adds to a lobe's sums, pass by pass; share: of it, by the lobe's window and the lights found before.
+#     0, 1  share excess at                      centroid of the excess; its largest share excess is the peak
+#     2     share max(excess - CORE peak, 0) at  centroid of the core
+#     3     share excess / luminance cos value   irradiance: light above the map's mean, in the texel's own colour
+@wp.func
+def sum_lobe(
+    environment: wp.array2d[wp.vec3],
+    team: Team,
+    sky: Sky,
+    direction: wp.vec3,
+    found: mat43,
+    k: wp.int32,
+    step: wp.int32,
+    peak: wp.float32,
+) -> LobeSums:
+    """A thread's part of a pass over the texels of light ``k``: a row to a warp, shared by its lanes."""
+    height = environment.shape[0]
+    width = environment.shape[1]
+    sums = LobeSums()
+    theta = wp.atan2(wp.length(wp.vec2(direction[0], direction[1])), direction[2])
+    first_row = wp.max(wp.int32((theta - LOBE_ANGLE) / PI * wp.float32(height)), 0)
+    last_row = wp.min(wp.int32((theta + LOBE_ANGLE) / PI * wp.float32(height)), height - 1)
+    middle = (wp.atan2(direction[1], direction[0]) / PI + 1.0) * 0.5 * wp.float32(width) - 0.5
+    i = first_row + team.worker // team.lanes
+    while i <= last_row:
+        row_theta = (wp.float32(i) + 0.5) * PI / wp.float32(height)
+        sin_theta = wp.sin(row_theta)
+        cos_theta = wp.cos(row_theta)
+        span = columns_of_lobe(direction, sin_theta, cos_theta, middle, width)
+        area = sky.area_of_sine * sin_theta
+        phi = (wp.float32(span[0] + team.lane) + 0.5) * sky.column_angle - PI
+        at = wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), cos_theta)
+        column = team.lane
+        while column < span[1]:
+            j = span[0] + column
+            if j < 0:
+                j += width
+            if j >= width:
+                j -= width
+            value = load_constant(environment, i, j)
+            cosine = wp.dot(at, direction)
+            excess = wp.max(luminance(value) - sky.mean, 0.0)
+            if cosine > LOBE_OUTER and excess > 0.0:
+                share = lobe_window(cosine) * left_over(at, found, k)
+                weight = area * share * excess
+                if step == 2:
+                    weight = area * share * wp.max(excess - CORE * peak, 0.0)
+                if step < 3:
+                    sums.highest = wp.max(sums.highest, share * excess)
+                    sums.sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
+                else:
+                    given = (weight / luminance(value) * cosine) * value
+                    sums.sum += wp.vec4(given[0], given[1], given[2], 0.0)
+            at = rotated(at, sky.cos_step, sky.sin_step)
+            column += team.lanes
+        i += team.workers // team.lanes
+    return sums
+
+
+@wp.func
+def take_from_sectors(direction: wp.vec3, team: Team, sectors_out: wp.array[wp.vec4]):
+    """Take a light from what sectors have left over, each worker from its own; seen by others after the next sum."""
+    sector = team.worker
+    while sector < KEY_SECTORS:
+        moment = sectors_out[KEY_SECTORS + sector]
+        if moment[3] > 0.0:
+            facing = wp.dot(wp.vec3(moment[0], moment[1], moment[2]), direction)
+            sectors_out[KEY_SECTORS + sector] = (1.0 - lobe_window(facing / moment[3])) * moment
+        sector += team.workers
+
+
+@wp.func
+def compare_lights(lights: mat43, count: wp.int32, team: Team, sectors_out: wp.array[wp.vec4]):
+    """Note of each pair of lights the excess halfway between them, and how far they are rivals; a pair to a warp.
+
+    Rivals by their angle alone: min(1, 2 (1 - s_j . s_k)), 1 from 60 degrees on. Of a light with itself, the excess
+    around it.
+    """
+    item = team.thread // team.lanes
+    while item < MAX_KEY_LIGHTS * MAX_KEY_LIGHTS:
+        first = item // MAX_KEY_LIGHTS
+        second = item % MAX_KEY_LIGHTS
+        if first <= second and second < count:
+            a = wp.vec3(lights[first, 0], lights[first, 1], lights[first, 2])
+            b = wp.vec3(lights[second, 0], lights[second, 1], lights[second, 2])
+            halfway = wp.normalize(a + b)
+            if first == second:
+                halfway = a
+            excess = excess_around(sectors_out, halfway)
+            rivalry = wp.clamp(2.0 * (1.0 - wp.dot(a, b)), 0.0, 1.0)
+            if team.lane == 0:
+                sectors_out[2 * KEY_SECTORS + item] = wp.vec4(excess, rivalry, 0.0, 0.0)
+        item += team.threads // team.lanes
+    wait_for_block()
+
+
+@wp.func
+def write_lights(
+    found: Found, all: wp.vec4, team: Team, sectors: wp.array[wp.vec4], key_lights_out: wp.array[KeyLight]
+):
+    """Write all lights with their directionality, the module's D_k, brightest first.
+
+    ``sectors`` holds what ``compare_lights`` noted, ``all`` is of ``sum_all``.
+    """
+    count = key_lights_out.shape[0]
+    lights = found.directions
+    strength = found.strengths
+    flow = wp.vec3(all[0], all[1], all[2])
+    k = team.thread
+    while k < count:
+        around = sectors[2 * KEY_SECTORS + (MAX_KEY_LIGHTS + 1) * k][0]
+        # Of equals the one that was found first.
+        place = int(0)
+        alone = wp.float32(1.0)
+        for j in range(count):
+            if strength[j] > strength[k] or (strength[j] == strength[k] and j < k):
+                place += 1
+            between = sectors[2 * KEY_SECTORS + MAX_KEY_LIGHTS * wp.min(j, k) + wp.max(j, k)]
+            least = wp.min(around, sectors[2 * KEY_SECTORS + (MAX_KEY_LIGHTS + 1) * j][0])
+            rivalry = between[1]
+            if least > 0.0:
+                rivalry *= 1.0 - smooth_ramp(0.3, 0.6, between[0] / least)
+            if j != k and strength[k] > 0.0:
+                alone = wp.min(alone, 1.0 - wp.min(1.0, strength[j] / strength[k]) * rivalry)
+        light = KeyLight()
+        light.direction = wp.vec3(lights[k, 0], lights[k, 1], lights[k, 2])
+        light.irradiance = wp.vec3(found.reds[k], found.greens[k], found.blues[k])
+        light.directionality = 0.0
+        if strength[k] > 0.0:
+            light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
+        key_lights_out[place] = light
+        k += team.threads
 
 
 # A module of its own: its block is not that of other launches, and a module is compiled once per size of block.
@@ -323,129 +434,44 @@ def find_key_lights_kernel(
 ):
     """A team of blocks finds all lights, one after another.
 
-    Every block does for itself what concerns sectors: to wait for each other would take longer. Texels are shared out:
-    a row to a warp, of which its lanes take every so manyth, and only as far as the lobe reaches. Loops that are not
-    to be unrolled are written as ``while``: a kernel that is run through once takes as long as its instructions take
-    to arrive.
+    Every block does for itself what concerns sectors: to wait for each other would take longer. Texels are shared out,
+    and only as far as the lobe reaches. Loops that are not to be unrolled are written as ``while``: a kernel that is
+    run through once takes as long as its instructions take to arrive.
     """
     block, thread = wp.tid()
-    threads = wp.block_dim()
-    worker = block * threads + thread
-    workers = blocks * threads
-    lanes = lane_count()
-    lane = thread % lanes
-    height = environment.shape[0]
-    width = environment.shape[1]
-    all = sum_all(sums, lane, lanes)
-    flow = wp.vec3(all[0], all[1], all[2])
-    mean = all[3] / (4.0 * PI)
-    column_angle = 2.0 * PI / wp.float32(width)
-    cos_step = wp.cos(column_angle * wp.float32(lanes))
-    sin_step = wp.sin(column_angle * wp.float32(lanes))
-    area_of_sine = 2.0 * wp.sin(0.5 * PI / wp.float32(height)) * column_angle  # a texel's solid angle / sin theta
-    found = mat43()
-    strengths = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    reds = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    greens = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    blues = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    team = Team()
+    team.thread = thread
+    team.threads = wp.block_dim()
+    team.worker = block * team.threads + thread
+    team.workers = blocks * team.threads
+    team.lanes = lane_count()
+    team.lane = thread % team.lanes
+    all = sum_all(sums, team.lane, team.lanes)
+    sky = Sky()
+    sky.mean = all[3] / (4.0 * PI)
+    sky.column_angle = 2.0 * PI / wp.float32(environment.shape[1])
+    sky.cos_step = wp.cos(sky.column_angle * wp.float32(team.lanes))
+    sky.sin_step = wp.sin(sky.column_angle * wp.float32(team.lanes))
+    sky.area_of_sine = 2.0 * wp.sin(0.5 * PI / wp.float32(environment.shape[0])) * sky.column_angle
+    found = Found()
     count = key_lights_out.shape[0]
     turn = int(0)
 
     for k in range(count):
-        # The sector's direction in which a surface receives most; the first of equals, whatever the number of threads.
-        best = wp.float32(0.0)
-        best_sector = wp.float32(KEY_SECTORS)
-        staged = stage_sectors(sectors_out)
-        candidate = thread
-        while candidate < KEY_SECTORS:
-            toward = direction_from_latlong(
-                wp.float32(candidate // SECTOR_COLUMNS) + 0.5,
-                wp.float32(candidate % SECTOR_COLUMNS) + 0.5,
-                SECTOR_ROWS,
-                SECTOR_COLUMNS,
-            )
-            received = received_from(staged, toward)
-            if received > best:
-                best = received
-                best_sector = wp.float32(candidate)
-            candidate += threads
-        most = block_max(best)
-        if best < most:
-            best_sector = wp.float32(KEY_SECTORS)
-        chosen = -wp.int32(block_max(-best_sector))
-        direction = wp.vec3(0.0, 0.0, 1.0)
-        lit = most > 0.0
-        if lit:
-            direction = direction_from_latlong(
-                wp.float32(chosen // SECTOR_COLUMNS) + 0.5,
-                wp.float32(chosen % SECTOR_COLUMNS) + 0.5,
-                SECTOR_ROWS,
-                SECTOR_COLUMNS,
-            )
-            if thread < lanes:
-                direction = shift_on_sectors(sectors_out, direction)
-            direction = from_first(direction)
-
-        # Texels now. Passes 0 and 1: centroid of the lobe's excess and its peak; 2: centroid of the core;
-        # 3: what the lobe gives.
+        best = best_direction(sectors_out, team)
+        direction = wp.vec3(best[0], best[1], best[2])
         peak = wp.float32(0.0)
         step = int(0)
         while step < 4:
-            sum = wp.vec4(0.0, 0.0, 0.0, 0.0)
-            highest = wp.float32(0.0)
-            theta = wp.atan2(wp.length(wp.vec2(direction[0], direction[1])), direction[2])
-            first_row = wp.max(wp.int32((theta - LOBE_ANGLE) / PI * wp.float32(height)), 0)
-            last_row = wp.min(wp.int32((theta + LOBE_ANGLE) / PI * wp.float32(height)), height - 1)
-            if not lit:
-                last_row = first_row - 1
-            middle = (wp.atan2(direction[1], direction[0]) / PI + 1.0) * 0.5 * wp.float32(width) - 0.5
-            i = first_row + worker // lanes
-            while i <= last_row:
-                row_theta = (wp.float32(i) + 0.5) * PI / wp.float32(height)
-                sin_theta = wp.sin(row_theta)
-                cos_theta = wp.cos(row_theta)
-                span = columns_of_lobe(direction, sin_theta, cos_theta, middle, width)
-                area = area_of_sine * sin_theta
-                phi = (wp.float32(span[0] + lane) + 0.5) * column_angle - PI
-                at = wp.vec3(sin_theta * wp.cos(phi), sin_theta * wp.sin(phi), cos_theta)
-                column = lane
-                while column < span[1]:
-                    j = span[0] + column
-                    if j < 0:
-                        j += width
-                    if j >= width:
-                        j -= width
-                    value = load_constant(environment, i, j)
-                    cosine = wp.dot(at, direction)
-                    excess = wp.max(luminance(value) - mean, 0.0)
-                    if cosine > LOBE_OUTER and excess > 0.0:
-                        share = lobe_window(cosine) * left_over(at, found, k)
-                        weight = area * share * excess
-                        if step == 2:
-                            weight = area * share * wp.max(excess - CORE * peak, 0.0)
-                        if step < 3:
-                            highest = wp.max(highest, share * excess)
-                            sum += weight * wp.vec4(at[0], at[1], at[2], 0.0)
-                        else:
-                            # Light above the environment's mean, in the texel's own colour.
-                            given = (weight / luminance(value) * cosine) * value
-                            sum += wp.vec4(given[0], given[1], given[2], 0.0)
-                    at = rotated(at, cos_step, sin_step)
-                    column += lanes
-                i += workers // lanes
+            mine = LobeSums()
+            if best[3] > 0.0:
+                mine = sum_lobe(environment, team, sky, direction, found.directions, k, step, peak)
             if step == 3:
-                # Each worker its own sectors; the sums below make all of them wait for that.
-                sector = worker
-                while sector < KEY_SECTORS:
-                    moment = sectors_out[KEY_SECTORS + sector]
-                    if moment[3] > 0.0:
-                        facing = wp.dot(wp.vec3(moment[0], moment[1], moment[2]), direction)
-                        sectors_out[KEY_SECTORS + sector] = (1.0 - lobe_window(facing / moment[3])) * moment
-                    sector += workers
-            total = team_sum(sum, blocks, turn)
+                take_from_sectors(direction, team, sectors_out)
+            total = team_sum(mine.sum, blocks, turn)
             turn += 1
             if step == 1:
-                peak = team_max(block_max(highest), blocks, turn)
+                peak = team_max(block_max(mine.highest), blocks, turn)
                 turn += 1
             if step < 3:
                 centre = wp.vec3(total[0], total[1], total[2])
@@ -455,62 +481,20 @@ def find_key_lights_kernel(
                 given = wp.vec3(total[0], total[1], total[2])
                 for place in range(MAX_KEY_LIGHTS):
                     if place == k:
-                        reds[place] = given[0]
-                        greens[place] = given[1]
-                        blues[place] = given[2]
-                        strengths[place] = luminance(given)
+                        found.reds[place] = given[0]
+                        found.greens[place] = given[1]
+                        found.blues[place] = given[2]
+                        found.strengths[place] = luminance(given)
             step += 1
         for place in range(MAX_KEY_LIGHTS):
             if place == k:
                 for axis in range(3):
-                    found[place, axis] = direction[axis]
+                    found.directions[place, axis] = direction[axis]
 
-    # How far each pair of lights are rivals: 60 degrees apart, with a valley between them. A sum to a warp.
     if block > 0:
         return
-    lights = found
-    strength = strengths
-    item = thread // lanes
-    while item < MAX_KEY_LIGHTS * MAX_KEY_LIGHTS:
-        first = item // MAX_KEY_LIGHTS
-        second = item % MAX_KEY_LIGHTS
-        if first <= second and second < count:
-            a = wp.vec3(lights[first, 0], lights[first, 1], lights[first, 2])
-            b = wp.vec3(lights[second, 0], lights[second, 1], lights[second, 2])
-            halfway = wp.normalize(a + b)
-            if first == second:
-                halfway = a
-            excess = excess_around(sectors_out, halfway)
-            rivalry = wp.clamp(2.0 * (1.0 - wp.dot(a, b)), 0.0, 1.0)
-            if lane == 0:
-                sectors_out[2 * KEY_SECTORS + item] = wp.vec4(excess, rivalry, 0.0, 0.0)
-        item += threads // lanes
-    wait_for_block()
-
-    k = thread
-    while k < count:
-        around = sectors_out[2 * KEY_SECTORS + (MAX_KEY_LIGHTS + 1) * k][0]
-        # Brightest first; of equals the one that was found first.
-        place = int(0)
-        alone = wp.float32(1.0)
-        for j in range(count):
-            if strength[j] > strength[k] or (strength[j] == strength[k] and j < k):
-                place += 1
-            between = sectors_out[2 * KEY_SECTORS + MAX_KEY_LIGHTS * wp.min(j, k) + wp.max(j, k)]
-            least = wp.min(around, sectors_out[2 * KEY_SECTORS + (MAX_KEY_LIGHTS + 1) * j][0])
-            rivalry = between[1]
-            if least > 0.0:
-                rivalry *= 1.0 - smooth_ramp(0.3, 0.6, between[0] / least)
-            if j != k and strength[k] > 0.0:
-                alone = wp.min(alone, 1.0 - wp.min(1.0, strength[j] / strength[k]) * rivalry)
-        light = KeyLight()
-        light.direction = wp.vec3(lights[k, 0], lights[k, 1], lights[k, 2])
-        light.irradiance = wp.vec3(reds[k], greens[k], blues[k])
-        light.directionality = 0.0
-        if strength[k] > 0.0:
-            light.directionality = alone * wp.clamp(2.0 * wp.dot(flow, light.direction) / all[3], 0.0, 1.0)
-        key_lights_out[place] = light
-        k += threads
+    compare_lights(found.directions, count, team, sectors_out)
+    write_lights(found, all, team, sectors_out, key_lights_out)
 
 
 def find_key_lights(environment: wp.array, sums_out: wp.array, sectors_out: wp.array, key_lights_out: wp.array) -> None:
