@@ -88,7 +88,8 @@ class FrameInputs:
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
-        if device.is_cpu and MESH in map(shape_kind, [*scene.objects, *scene.proxies]):
+        shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
+        if device.is_cpu and MESH in shapes:
             load_at_once(build_wide_bvh_kernel, device)
         self.host_scene = HostScene(scene, device)
         self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
