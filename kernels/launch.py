@@ -43,7 +43,8 @@ _SLOW: weakref.WeakSet[wp.Kernel] = weakref.WeakSet()
 def slow_to_compile(kernel: wp.Kernel) -> wp.Kernel:
     """Mark a kernel, the one of its module, that Clang takes seconds for and that pays for inlining in each frame.
 
-    Commands begin with a version of it into which less is inlined (``warp_ar.engine.tiers``).
+    Commands begin with versions of all kernels into which less is inlined; of this one the better version is compiled
+    first (``warp_ar.engine.tiers``).
     """
     _SLOW.add(kernel)
     return kernel

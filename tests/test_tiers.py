@@ -15,7 +15,7 @@ import warp as wp
 from warp_ar.device import resolve_device
 from warp_ar.engine import better_kernels, modules, tiers
 from warp_ar.errors import UsageError
-from warp_ar.kernels.launch import is_slow_to_compile, slow_to_compile
+from warp_ar.kernels.launch import QUICK_TO_COMPILE, is_slow_to_compile, slow_to_compile
 
 PATIENCE = 120.0
 """Seconds in which a process that works only while a core is free gets to its end, on a machine with other work."""
@@ -167,21 +167,76 @@ def usual_kernel(values_out: wp.array[wp.int32]):
     values_out[wp.tid()] = 4
 
 
-def test_only_marked_kernels_are_compiled_quickly_and_none_twice(monkeypatch, tmp_path) -> None:
+@wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+def chosen_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 5
+
+
+def test_all_kernels_are_compiled_quickly_and_none_twice(monkeypatch, tmp_path) -> None:
+    """All by the same flags: Clang's belong to the process, and compilers with others would wait."""
     device = resolve_device("cpu")
     monkeypatch.setattr(tiers, "_BESIDE", tiers._Beside())
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setenv(tiers.VARIABLE, "quick")
-    assert is_slow_to_compile(marked_kernel)
-    assert not is_slow_to_compile(usual_kernel)
-    modules.load_modules([marked_kernel, usual_kernel], device)
-    assert marked_kernel.module.options["cpu_compiler_flags"] == tiers.QUICK_FLAGS
-    assert usual_kernel.module.options["cpu_compiler_flags"] is None
+    modules.load_modules([marked_kernel, usual_kernel, chosen_kernel], device)
+    for kernel in (marked_kernel, usual_kernel, chosen_kernel):
+        assert kernel.module.options["cpu_compiler_flags"] == tiers.QUICK_FLAGS
     names = {path.name for path in tmp_path.glob("wp_*")}
+    assert len(names) == 3
     monkeypatch.setenv(tiers.VARIABLE, "two")  # what has begun stays as it is
-    modules.load_modules([marked_kernel, usual_kernel], device)
+    modules.load_modules([marked_kernel, usual_kernel, chosen_kernel], device)
     assert {path.name for path in tmp_path.glob("wp_*")} == names
     assert tiers._BESIDE.process is None
+
+
+@slow_to_compile
+@wp.kernel(module="unique", enable_backward=False)
+def last_marked_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 6
+
+
+@wp.kernel(module="unique", enable_backward=False, module_options=QUICK_TO_COMPILE)
+def last_chosen_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 7
+
+
+def test_kernels_that_gain_most_are_compiled_better_first_and_each_by_its_own_flags(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(tiers, "_BESIDE", tiers._Beside())
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setenv(tiers.VARIABLE, "two")
+    assert is_slow_to_compile(last_marked_kernel)
+    assert not is_slow_to_compile(last_chosen_kernel)
+    tiers.choose([last_chosen_kernel, last_marked_kernel], resolve_device("cpu"))
+    wanted = [(module, arguments["extra_flags"]) for module, _, _, arguments in tiers._BESIDE.wanted]
+    assert wanted == [
+        (last_marked_kernel.module, wp.config.cpu_compiler_flags),
+        (last_chosen_kernel.module, QUICK_TO_COMPILE["cpu_compiler_flags"]),
+    ]
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def early_kernel(values_out: wp.array[wp.int32]):
+    values_out[wp.tid()] = 8
+
+
+def test_a_kernel_that_runs_while_a_pipeline_is_built_parses_no_headers(monkeypatch, tmp_path) -> None:
+    """They were parsed ahead, by another thread; the kernel keeps its own flags."""
+    build, found = wp._src.build.build_cpu, {}
+
+    def note(target: str, source: str, *, pch_dir: str, **given: object) -> None:
+        found[Path(source).name.partition("_kernel")[0]] = list(Path(pch_dir).glob("*.pch")) != []
+        build(target, source, pch_dir=pch_dir, **given)
+
+    monkeypatch.setattr(wp._src.build, "build_cpu", note)
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    modules.parse_headers_ahead()
+    modules.load_at_once(early_kernel, resolve_device("cpu"))
+    assert found == {"headers.cpp": False, "wp_early": True}
+    assert early_kernel.module.options["cpu_compiler_flags"] is None
+    values = wp.zeros(1, dtype=wp.int32, device="cpu")
+    wp.launch(early_kernel, 1, [], [values], device="cpu")
+    assert values.numpy()[0] == 8
+    assert len(list(tmp_path.glob("wp_early_kernel*"))) == 1
 
 
 FRAMES = """
@@ -214,7 +269,7 @@ print(json.dumps({"frames": seen.hexdigest(), "quick": quick}))
     [
         ("desk", "medium"),
         ("desk", "high"),
-        # All other bundled scenes but ``darken``, which runs no kernel of two ways.
+        # All other bundled scenes but ``darken``, which runs no kernel that is marked.
         *((name, "medium") for name in ("mirror", "screen", "torus", "wire_coincident", "wire_opposing")),
     ],
 )

@@ -15,6 +15,7 @@ from warp_ar import scene as scenes
 from warp_ar.device import exclusive
 from warp_ar.engine.frame_block import FrameBlock
 from warp_ar.engine.graph import INPUTS
+from warp_ar.engine.modules import load_at_once
 from warp_ar.engine.scheduler import StageTiming
 from warp_ar.engine.transfer import Slot, Transfers
 from warp_ar.input.cover import BallCover
@@ -23,8 +24,10 @@ from warp_ar.input.own_markers import Places
 from warp_ar.input.plate import Plate, decode_deep
 from warp_ar.input.saturation import PERIOD, WATCHED, SaturationLevels, ball_discs
 from warp_ar.kernels.color import camera_table, decode_table, encode_table
-from warp_ar.kernels.structs import Probe
+from warp_ar.kernels.structs import MESH, Probe
+from warp_ar.kernels.wide_bvh import build_wide_bvh_kernel
 from warp_ar.scene import Camera, Pose, Scene
+from warp_ar.scene.kinds import shape_kind
 from warp_ar.scene.pixel_rays import pixel_rays
 from warp_ar.scene.ray_scene import HostScene
 from warp_ar.scene.screen_extents import Outline, Rect, screen_rects
@@ -85,6 +88,9 @@ class FrameInputs:
         """
         shape = (camera.height, camera.width)
         self._camera, self._arrays = camera, arrays
+        shapes = {shape_kind(item) for item in scene.objects} | {shape_kind(item) for item in scene.proxies}
+        if device.is_cpu and MESH in shapes:
+            load_at_once(build_wide_bvh_kernel, device)
         self.host_scene = HostScene(scene, device)
         self.host_scene.ray_scene.pixel_spread = 1.0 / max(camera.fx, camera.fy)
         self.block = FrameBlock(device, len(scene.lights), self.host_scene.shape_count, len(scene.proxies))

@@ -68,6 +68,22 @@ def load_modules(
             compile_better(_Headers([]).store)
 
 
+def load_at_once(kernel: wp.Kernel, device: Any) -> None:
+    """Compile a kernel that runs while a pipeline is built, unless it is in the cache, and load it.
+
+    Its first launch would compile it too, but would parse Warp's headers for that, though they are there.
+
+    Args:
+        kernel: The one of its module, or one of several.
+        device: Warp device.
+    """
+    with compiling():
+        if not any(kernel.module.execs.values()) and not _is_cached(kernel.module, None, device):
+            _compile([(kernel.module, None)], device, None)
+        with exclusive(device):
+            _load(kernel.module, device)
+
+
 def parse_headers_ahead() -> None:
     """Have Warp's headers parsed beside what this thread imports and builds, where no earlier run has left them.
 
@@ -151,7 +167,7 @@ def _flags(module: Any) -> str:
 
 
 def _by_flags(variants: list[tuple[Any, int | None]]) -> list[tuple[Any, int | None]]:
-    """Modules of the same flags after each other: first what is marked as slow, which else has Warp's flags."""
+    """Modules of the same flags after each other: first the quick ones, then those that have flags of their own."""
     quick = any(module.options.get("cpu_compiler_flags") == QUICK_FLAGS for module, _ in variants)
     order = {QUICK_FLAGS: 0, None: 2 if quick else 0}
     return sorted(variants, key=lambda variant: order.get(variant[0].options.get("cpu_compiler_flags"), 1))

@@ -74,8 +74,12 @@ class BallCover:
         self._camera = camera
         self._table = decode_table(camera.transfer).astype(np.float64)
         self._points = np.concatenate([still_points(scene)[0][::EVERY], _points_around(scene)])
-        middle = 2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0
-        self._in_disc = np.hypot(middle, middle[:, None]).ravel() < 0.9
+        # A cell is the mean of four codes, of which there are so few that all are looked up.
+        means: Array = 0.25 * np.arange(4 * 255 + 1, dtype=np.float64)
+        self._of_sums = np.stack([self._radiance(means, c) for c in range(3)]).ravel()
+        self._logarithms: Array = np.zeros(0)
+        self._gain: Array | None = None
+        self._cell_row, self._cell_column = _cells_in_disc()
         self.forget()
 
     def forget(self) -> None:
@@ -105,7 +109,7 @@ class BallCover:
         Returns:
             Whether a ball is covered.
         """
-        own = [self._logarithm(self._cells(image, disc), gain) for disc in discs]
+        own = [self._cells(image, disc, gain) for disc in discs]
         known = self._shown is not None and len(own) == len(self._discs)
         rests = known and not self._covered and not any(map(self._has_changed, self._discs, own))
         if rests and abs(seconds - self._looked) < LOOK_SECONDS:
@@ -116,7 +120,8 @@ class BallCover:
             self._shown, self._discs, self._covered = shown, own, False
             self._last = self._looked = seconds
             return False
-        was, self._covered = self._covered, self._is_covered(shown, own, discs, pose)
+        was = self._covered
+        self._covered = not rests and self._is_covered(shown, own, discs, pose)
         if self._covered and not was:
             self._since = seconds
         if self._covered and abs(seconds - self._since) > PATIENCE:
@@ -134,9 +139,10 @@ class BallCover:
         self._last = seconds
 
     def _has_changed(self, before: Array, now: Array) -> bool:
-        """Whether a ball's disc shows something else."""
-        cells = np.abs(now - before).max(axis=1)[self._in_disc]
-        return bool((np.nan_to_num(cells) > CHANGED).mean() >= DISC_SHARE)
+        """Whether a ball's disc shows something else; a cell that is not seen in both is as it was."""
+        change = np.abs(now - before)
+        most = np.maximum(np.maximum(change[0], change[1]), change[2])
+        return bool(np.count_nonzero(most > CHANGED) / len(most) >= DISC_SHARE)
 
     def _is_covered(
         self, shown: Array, own: list[Array], discs: Sequence[tuple[float, float, float]], pose: Pose
@@ -165,26 +171,66 @@ class BallCover:
                 return True
         return False
 
-    def _cells(self, image: NDArray[np.uint8], disc: tuple[float, float, float]) -> Array:
-        """Mean codes of a disc's cells, NaN beyond the picture, (cells, 3)."""
+    def _cells(self, image: NDArray[np.uint8], disc: tuple[float, float, float], gain: Array) -> Array:
+        """Logarithm of what a disc's cells show, four samples of each, NaN beyond the picture, (3, cells)."""
         x, y, radius = disc
         radius = max(radius, 1.0)
         if not (abs(x) < 1e5 and abs(y) < 1e5 and radius < 1e4):
-            return np.full((CELLS * CELLS, 3), np.nan)
-        scale = 2.0 * radius / CELLS
+            return np.full((3, len(self._cell_row)), np.nan)
         # Half a cell of blur by sampling four places in each.
-        steps = np.arange(2 * CELLS) * 0.5 + 0.25
-        u, v = np.meshgrid(x - radius + scale * steps, y - radius + scale * steps)
-        column, row = np.asarray(np.round(u), np.int64), np.asarray(np.round(v), np.int64)
-        inside = (row >= 0) & (column >= 0) & (row < image.shape[0]) & (column < image.shape[1])
-        codes = np.full((*inside.shape, 3), np.nan)
-        codes[inside] = image[row[inside], column[inside]]
-        return np.asarray(codes.reshape(CELLS, 2, CELLS, 2, 3).mean(axis=(1, 3)).reshape(-1, 3))
+        steps = 2.0 * radius / CELLS * _STEPS
+        columns = np.round(x - radius + steps).astype(np.int64)
+        rows = np.round(y - radius + steps).astype(np.int64)
+        height, width = image.shape[:2]
+        whole = rows[0] >= 0 and columns[0] >= 0 and rows[-1] < height and columns[-1] < width
+        if whole:
+            codes = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            rows, columns = rows - rows[0], columns - columns[0]
+            seen = None
+        else:
+            seen = _pairs((rows >= 0) & (rows < height))[self._cell_row]
+            seen &= _pairs((columns >= 0) & (columns < width))[self._cell_column]
+            codes, rows, columns = image, rows.clip(0, height - 1), columns.clip(0, width - 1)
+        grid = codes.take(rows, axis=0).take(columns, axis=1).astype(np.int64)
+        halves = grid[::2] + grid[1::2]
+        sums = (halves[:, ::2] + halves[:, 1::2])[self._cell_row, self._cell_column]
+        found = self._table_of_sums(gain)[sums.T + _CHANNELS]
+        if seen is not None:
+            found[:, ~seen] = np.nan
+        return found
+
+    def _table_of_sums(self, gain: Array) -> Array:
+        """Logarithm of the radiance of all sums of four codes at a gain, channel after channel."""
+        if self._gain is None or (self._gain != gain).any():
+            self._gain = np.array(gain)
+            self._logarithms = np.log(self._of_sums.reshape(3, -1) / self._gain[:, None] + DARK).ravel()
+        return self._logarithms
+
+    def _radiance(self, codes: Array, channel: int) -> Array:
+        return np.asarray(np.interp(codes, np.arange(256), self._table[:, channel]))
 
     def _logarithm(self, codes: Array, gain: Array) -> Array:
         """Of the radiance that codes stand for at gain 1, (n, 3)."""
-        values = np.stack([np.interp(codes[:, c], np.arange(256), self._table[:, c]) for c in range(3)], -1)
+        values = np.stack([self._radiance(codes[:, c], c) for c in range(3)], -1)
         return np.asarray(np.log(values / gain + DARK))
+
+
+_STEPS = np.arange(2 * CELLS) * 0.5 + 0.25
+"""Where samples lie along a disc, in cells."""
+_CHANNELS = np.arange(3)[:, None] * (4 * 255 + 1)
+"""Where a channel's sums begin in a table of all."""
+
+
+def _cells_in_disc() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of those cells of a square that lie in the disc."""
+    middle = 2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0
+    row, column = np.nonzero(np.hypot(middle, middle[:, None]) < 0.9)
+    return row, column
+
+
+def _pairs(inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether both samples of a cell are inside, along one side."""
+    return np.asarray(inside[::2] & inside[1::2])
 
 
 def _rate(seconds: float) -> float:
@@ -194,8 +240,11 @@ def _rate(seconds: float) -> float:
 
 def _follow(before: Array, now: Array, rate: float) -> Array:
     """What is remembered, drawn toward what is seen now, where that is seen."""
-    followed = np.where(np.isnan(before), now, before + rate * (now - before))
-    return np.asarray(np.where(np.isnan(followed), before, followed))
+    followed = before + rate * (now - before)
+    if np.isnan(followed).any():
+        followed = np.where(np.isnan(before), now, followed)
+        followed = np.where(np.isnan(followed), before, followed)
+    return np.asarray(followed)
 
 
 def _points_around(scene: Scene) -> Array:

@@ -230,10 +230,10 @@ def codes_around(image: NDArray[np.uint8], camera: Camera, pose: Pose, points: A
     at = np.round(np.clip(pixels, -1e6, 1e6)).astype(np.int64)
     inside = ((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1)
     ahead, at = ahead[inside], at[inside]
-    around = at[:, None] + _OFFSETS
-    codes = image[around[..., 1], around[..., 0]]
-    tells = ((codes > DARK) & (codes < BRIGHT)).all(axis=(1, 2))
-    result[ahead[tells]] = codes[tells].mean(axis=1)
+    around = at + _OFFSETS[:, None]
+    codes = image.reshape(-1, 3).take(around[..., 1] * image.shape[1] + around[..., 0], axis=0)
+    tells = np.flatnonzero(((codes.min(axis=0) > DARK) & (codes.max(axis=0) < BRIGHT)).all(axis=1))
+    result[ahead[tells]] = codes.sum(axis=0, dtype=np.int64)[tells] / len(_OFFSETS)
     return result
 
 
