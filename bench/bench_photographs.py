@@ -1,6 +1,6 @@
 """One photograph of a mirror ball against the merged bracket that it is from, over a folder of one's own brackets.
 
-    python -m bench photographs FOLDER    # FOLDER/NAME/*.jpg: a bracket each, the ball in every picture
+    python -m bench photographs --folder=FOLDER    # FOLDER/NAME/*.jpg: a bracket each, the ball in every picture
 
 Each photograph is captured alone and compared with all of its folder, in its own camera values: relative error of
 irradiance over all directions, as it is and after one scale. The bracket clipped at the photograph's white level tells
@@ -117,7 +117,7 @@ def measure_set(folder: Path, device: str) -> list[Row]:
 def main(device: str, arguments: Sequence[str] = ()) -> None:
     """Measure all sets of a folder and print figures of each and of all."""
     parser = argparse.ArgumentParser(prog="python -m bench photographs", description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", help="a folder of brackets, a folder each")
+    parser.add_argument("--folder", type=Path, help="a folder of brackets, a folder each")
     options = parser.parse_args(list(arguments))
     if options.folder is None or not options.folder.is_dir():
         print("bench photographs: expected a folder that holds a folder of photographs for each bracket")
