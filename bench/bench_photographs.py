@@ -1,0 +1,132 @@
+"""One photograph of a mirror ball against the merged bracket that it is from, over a folder of one's own brackets.
+
+    python -m bench photographs --folder=FOLDER    # FOLDER/NAME/*.jpg: a bracket each, the ball in every picture
+
+Each photograph is captured alone and compared with all of its folder, in its own camera values: relative error of
+irradiance over all directions, as it is and after one scale. The bracket clipped at the photograph's white level tells
+what clipping alone takes; what is left is the response, noise and the ball's outline. Where names or EXIF contradict
+each other, ``exposures.txt`` beside the pictures holds their seconds, in order of their names; the word ``pixels`` in
+it leaves them to the pixels. One JSON line in all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.bench_never_worse import irradiance
+from bench.table_world import latlong_directions
+from warp_ar.errors import WarpArError
+from warp_ar.photo_capture import capture_light
+
+Array = NDArray[np.float64]
+REFLECTANCE = 0.85
+"""Of the ball, as ``capture`` takes it: radiance of 1 / REFLECTANCE clips."""
+SUFFIXES = (".jpg", ".jpeg", ".png")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One photograph."""
+
+    name: str
+    error: float
+    """Relative error of irradiance of the light that it alone gives."""
+    scaled: float
+    """The same after one scale."""
+    clipping: float
+    """The same of the bracket's light, clipped where this photograph clips."""
+    rest: float
+    """Of the photograph's light against that."""
+    lower_bound: float
+    """Share of the bracket's light that is a lower bound."""
+
+
+def relative_error(found: Array, truth: Array) -> float:
+    """Of irradiance, over directions and channels."""
+    return float(np.linalg.norm(found - truth) / max(float(np.linalg.norm(truth)), 1e-12))
+
+
+def compare(name: str, single: NDArray[Any], merged: NDArray[Any], lower_bound: float) -> Row:
+    """Figures of one photograph, from two maps (h, 2 h, 3) in its camera values."""
+    normals = latlong_directions(24, 48)[0].reshape(-1, 3)
+    clipped = np.minimum(merged, 1.0 / REFLECTANCE)
+    found, truth, limit = (irradiance(one, normals) for one in (single, merged, clipped))
+    scale = float((found * truth).sum() / max(float((found * found).sum()), 1e-12))
+    return Row(
+        name,
+        relative_error(found, truth),
+        relative_error(scale * found, truth),
+        relative_error(limit, truth),
+        relative_error(found, limit),
+        lower_bound,
+    )
+
+
+def read_set(folder: Path, neutral: Path) -> tuple[list[Path], list[float] | None]:
+    """Photographs of a set, and their exposures where a file tells them.
+
+    Args:
+        folder: Of the set.
+        neutral: Where copies without names and EXIF may lie.
+    """
+    photos = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    told = folder / "exposures.txt"
+    words = told.read_text().split() if told.is_file() else []
+    if words != ["pixels"]:
+        return photos, [float(word) for word in words] or None
+    copies = []
+    for index, path in enumerate(photos):
+        copies.append(neutral / f"{folder.name}_{'abcdefghijklmnop'[index]}.png")
+        cv2.imwrite(str(copies[-1]), np.asarray(cv2.imread(str(path))))
+    return copies, None
+
+
+def measure_set(folder: Path, device: str) -> list[Row]:
+    """All photographs of a set, each against the bracket."""
+    rows = []
+    with tempfile.TemporaryDirectory() as neutral:
+        photos, exposures = read_set(folder, Path(neutral))
+        for index, photo in enumerate(photos):
+            name = f"{folder.name}/{photo.name}"
+            try:
+                merged = capture_light(photos, shown=index, exposures=exposures, device=device, height=64).light
+                single = capture_light([photo], device=device, height=64).light
+            except WarpArError as error:
+                print(f"{name}: {error}", flush=True)
+                continue
+            rows.append(compare(name, single.radiance, merged.radiance, merged.lower_bound))
+            row = rows[-1]
+            print(
+                f"{name}: {row.error:.1%}, after one scale {row.scaled:.1%}; by clipping {row.clipping:.1%}, "
+                f"the rest {row.rest:.1%}; the bracket's lower bound {row.lower_bound:.1%}",
+                flush=True,
+            )
+    return rows
+
+
+def main(device: str, arguments: Sequence[str] = ()) -> None:
+    """Measure all sets of a folder and print figures of each and of all."""
+    parser = argparse.ArgumentParser(prog="python -m bench photographs", description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, help="a folder of brackets, a folder each")
+    options = parser.parse_args(list(arguments))
+    if options.folder is None or not options.folder.is_dir():
+        print("bench photographs: expected a folder that holds a folder of photographs for each bracket")
+        return
+    sets = {path.name: measure_set(path, device) for path in sorted(options.folder.iterdir()) if path.is_dir()}
+    means = {
+        name: {key: float(np.mean([getattr(row, key) for row in rows])) for key in ("error", "scaled", "clipping")}
+        for name, rows in sets.items()
+        if rows
+    }
+    every = {key: float(np.mean([own[key] for own in means.values()])) for key in ("error", "scaled", "clipping")}
+    print(json.dumps({"bench": "photographs", "sets": means, **every}))
