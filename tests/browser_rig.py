@@ -64,8 +64,11 @@ def write_camera_file(path: Path, images: Iterable[np.ndarray]) -> None:
 
 
 @contextlib.contextmanager
-def served(options: Sequence[str], cache: Path) -> Iterator[str]:
-    """The page of a server of its own; it says nothing on its standard error, and ends as Ctrl-C ends it."""
+def served(options: Sequence[str], cache: Path, *, says: Sequence[str] | None = None) -> Iterator[str]:
+    """The page of a server of its own, which ends as Ctrl-C ends it.
+
+    On its standard error it says ``says``, among others; where that is not given, nothing.
+    """
     command = [sys.executable, "-c", LIVE, *options, "--device", "cpu", "--quality", "low"]
     command += ["--port", "0", "--no-browser"]
     # Costs of its own, but the kernels that are compiled already.
@@ -93,7 +96,9 @@ def served(options: Sequence[str], cache: Path) -> Iterator[str]:
             process.kill()
             raise
     assert process.returncode == 130, errors
-    assert errors == "", errors
+    if says is None:
+        assert errors == "", errors
+    assert [words for words in says or () if words not in errors] == [], errors
 
 
 @contextlib.contextmanager

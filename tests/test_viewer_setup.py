@@ -16,6 +16,7 @@ import pytest
 
 from tests.browser_rig import CHROMIUM, SMALL, CanvasCamera, Tab, axe_core, chromium, serious_findings, served
 from tests.random_desk import RandomDesk
+from warp_ar.init import make_desk
 from warp_ar.input.card import write_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.kernels.color import decode_table
@@ -157,6 +158,7 @@ def use_the_card(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
     assert card.value.suggested_filename == "card-a4.pdf"
     tab.until("!document.getElementById('guide').hidden", "the guide")
     assert "Use the card with these sizes" in hands.words("#guide")
+    assert hands.page.locator("#guide").bounding_box()["y"] < 100, "the guide is out of sight"
     # Typed as a ruler has it: to the millimetre.
     hands.type("#ball-radius", f"{1e3 * desk.radius:.0f}")
     hands.press("#use-card")
@@ -250,3 +252,30 @@ def the_object_is_lit(tab: Tab, hands: Hands) -> None:
     hands.page.evaluate("document.getElementById('split').value = 500")
     hands.page.locator("#split").dispatch_event("input")
     hands.look("lit")
+
+
+def test_without_a_camera_the_page_waits_for_a_browsers(
+    desk: RandomDesk, views: list[np.ndarray], browser: Any, tmp_path: Path
+) -> None:
+    """A desk of one's own names this machine's camera; where there is none, a phone's lights it."""
+    folder = tmp_path / "my_desk"
+    make_desk(folder, 1023, 0.03)
+    said = "capture device 1023 cannot be opened; the page goes on without"
+    with served(
+        [str(folder)], tmp_path, says=(said, f"for a phone's camera: python -m warp_ar.live {folder} --host")
+    ) as url:
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
+        camera = CanvasCamera(context, views[:1])
+        tab = Tab(context.new_page())
+        tab.page.goto(url)
+        tab.until("!!window.warpAr && warpAr.state.missing && !document.getElementById('guide').hidden", "the guide")
+        assert "Press “My camera”" in tab.page.inner_text("#guide")
+        camera.begin(tab)
+        tab.page.click("#use-camera")
+        tab.until("warpAr.state.camera === true && warpAr.view.stats.stamped", "the camera's frames")
+        tab.until("document.getElementById('track-state').classList.contains('tracked')", "the card in the picture")
+        tab.until("document.getElementById('guide').hidden")
+        tab.page.click("#use-clip")
+        tab.until("warpAr.state.camera === false && !document.getElementById('guide').hidden", "no camera again")
+        context.close()
+    assert tab.errors == []

@@ -251,11 +251,6 @@ class SetupChecks:
             "failed": dict(self._failed),
         }
 
-    def missing_record(self) -> dict[str, str] | None:
-        """Why the marker is not seen, as plain data."""
-        missing = self.missing
-        return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
-
 
 def _with_ball(scene: Scene, ball: Probe) -> Scene:
     return dataclasses.replace(scene, probes=(ball, *scene.probes[1:]))
