@@ -1479,6 +1479,22 @@ def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixtu
     assert "http://127.0.0.1:" in capsys.readouterr().out
 
 
+def test_without_a_camera_frames_that_are_counted_never_come(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["desk", "--source", "1023", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser"]
+    assert live.main([*arguments, "--frames", "1"]) == 2
+    assert "capture device 1023 cannot be opened" in capsys.readouterr().err
+
+
+def test_without_a_camera_a_picture_says_so() -> None:
+    with Running(page_scene(), source=1023) as running:
+        missing = running.host.state_message()["missing"]
+        assert missing["name"] == "source.absent"
+        assert "capture device 1023 cannot be opened" in missing["text"]
+        assert "My camera" in missing["remedy"]
+        words = running.next().frame
+        assert np.ptp(words) > 100, "nothing is written there"
+
+
 def test_names_do_not_reach_the_terminal_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = dataclasses.replace(load_scene("desk"), name="d\x1b]0;owned\x07esk")
     (tmp_path / "scene.toml").write_text(dumps_scene(scene))
