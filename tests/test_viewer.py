@@ -39,7 +39,7 @@ from warp_ar.accuracy.budget import AIM
 from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError, UsageError, WarpArError
+from warp_ar.errors import SceneError, SourceError, UsageError, WarpArError
 from warp_ar.input.card import card_size, draw_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import Synthetic, open_source
@@ -1483,6 +1483,8 @@ def test_without_a_camera_frames_that_are_counted_never_come(capsys: pytest.Capt
     arguments = ["desk", "--source", "1023", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser"]
     assert live.main([*arguments, "--frames", "1"]) == 2
     assert "capture device 1023 cannot be opened" in capsys.readouterr().err
+    with pytest.raises(SourceError, match="numbered from 0 to 1023"):
+        Host(page_scene(), source=1024, device="cpu", quality="low")
 
 
 def test_without_a_camera_a_picture_says_so() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from warp_ar.errors import SourceError, UsageError
-from warp_ar.input.sources import QueueSource, Source, open_source
+from warp_ar.input.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
@@ -74,7 +74,10 @@ def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | Non
 
 
 def _is_device(source: str | int | Path | None) -> bool:
-    return isinstance(source, int) or (isinstance(source, str) and source.isdecimal() and not Path(source).exists())
+    """Whether a source is a capture device that there may be."""
+    if isinstance(source, str) and source.isdecimal() and len(source) <= 4 and not Path(source).exists():
+        source = int(source)
+    return isinstance(source, int) and 0 <= source <= MOST_INDEX
 
 
 class Controls:
