@@ -158,7 +158,9 @@ def use_the_card(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
     assert card.value.suggested_filename == "card-a4.pdf"
     tab.until("!document.getElementById('guide').hidden", "the guide")
     assert "Use the card with these sizes" in hands.words("#guide")
-    assert hands.page.locator("#guide").bounding_box()["y"] < 100, "the guide is out of sight"
+    guide = hands.page.locator("#guide").bounding_box()
+    assert guide["y"] >= 0, "the guide is out of sight"
+    assert guide["y"] + guide["height"] <= hands.page.viewport_size["height"], "the guide is out of sight"
     # Typed as a ruler has it: to the millimetre.
     hands.type("#ball-radius", f"{1e3 * desk.radius:.0f}")
     hands.press("#use-card")
