@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import os
 import re
@@ -63,8 +64,11 @@ def write_camera_file(path: Path, images: Iterable[np.ndarray]) -> None:
 
 
 @contextlib.contextmanager
-def served(options: Sequence[str], cache: Path) -> Iterator[str]:
-    """The page of a server of its own; it says nothing on its standard error, and ends as Ctrl-C ends it."""
+def served(options: Sequence[str], cache: Path, *, says: Sequence[str] | None = None) -> Iterator[str]:
+    """The page of a server of its own, which ends as Ctrl-C ends it.
+
+    On its standard error it says ``says``, among others; where that is not given, nothing.
+    """
     command = [sys.executable, "-c", LIVE, *options, "--device", "cpu", "--quality", "low"]
     command += ["--port", "0", "--no-browser"]
     # Costs of its own, but the kernels that are compiled already.
@@ -92,19 +96,75 @@ def served(options: Sequence[str], cache: Path) -> Iterator[str]:
             process.kill()
             raise
     assert process.returncode == 130, errors
-    assert errors == "", errors
+    if says is None:
+        assert errors == "", errors
+    assert [words for words in says or () if words not in errors] == [], errors
 
 
 @contextlib.contextmanager
-def chromium(camera_file: Path) -> Iterator[Any]:
-    """The browser, whose camera plays a file."""
+def chromium(camera_file: Path | None = None) -> Iterator[Any]:
+    """The browser; its camera plays a file, if one is given."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
-    fake = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
-    arguments = ["--no-sandbox", *fake, f"--use-file-for-fake-video-capture={camera_file}"]
+    arguments = ["--no-sandbox"]
+    if camera_file is not None:
+        arguments += ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+        arguments.append(f"--use-file-for-fake-video-capture={camera_file}")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
         yield browser
         browser.close()
+
+
+# A camera that is a canvas: thirty frames a second of one picture, until another is shown.
+CANVAS_CAMERA = """
+const canvas = Object.assign(document.createElement("canvas"), { width: 640, height: 480 });
+const context = canvas.getContext("2d", { alpha: false });
+const pictures = [];
+let shown = null, since = 0, first = null, seen = 0;
+const draw = () => shown && context.drawImage(shown, 0, 0);
+setInterval(draw, 33);
+navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
+window.canvasCamera = {
+  async add(coded) {
+    const bytes = Uint8Array.from(atob(coded), (letter) => letter.charCodeAt(0));
+    pictures.push(await createImageBitmap(new Blob([bytes], { type: "image/png" })));
+  },
+  show(k) {
+    [shown, since, first, seen] = [pictures[k], performance.now(), null, 0];
+    draw();
+  },
+  // Milliseconds, on the server's clock, from the first to the last frame since then that came back lit.
+  note(frame) {
+    if (frame.stamp === null || frame.stamp < since) return;
+    first ??= frame.taken;
+    seen = frame.taken - first;
+  },
+  get seen() { return seen; },
+};
+"""
+
+
+class CanvasCamera:
+    """A camera whose picture changes when the page has had it long enough, however slow the machine is."""
+
+    def __init__(self, context: Any, images: Sequence[np.ndarray]) -> None:
+        """Take the place of a browser context's camera; its pages are opened afterwards."""
+        self._images = images
+        context.add_init_script(f"(() => {{{CANVAS_CAMERA}}})()")
+
+    def begin(self, tab: Tab) -> None:
+        """Show the first picture; the page has been loaded."""
+        self._tab = tab
+        for image in self._images:
+            png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+            tab.page.evaluate("(coded) => canvasCamera.add(coded)", base64.b64encode(png).decode())
+        tab.page.evaluate("warpAr.view.addEventListener('shown', ({ detail }) => canvasCamera.note(detail))")
+        tab.page.evaluate("canvasCamera.show(0)")
+
+    def show(self, number: int, seconds: float) -> None:
+        """Show a picture until its lit frames on the page were taken over so long a time."""
+        self._tab.page.evaluate(f"canvasCamera.show({number})")
+        self._tab.until(f"canvasCamera.seen >= {1e3 * seconds}", f"picture {number}, lit")
 
 
 def axe_core() -> str:

@@ -258,6 +258,8 @@ def test_command_says_it_and_ends_with_1(capsys, tmp_path):
     path.write_text(text)
     assert doctor.main([str(tmp_path), "--frames", "4"]) == 1
     said = capsys.readouterr().out
+    for line in ("device: ", "driver: ", "kernels: ", "codecs: "):
+        assert line in said
     assert "35 millimetres are 0.035 m" in said
     assert "do: write the radius in metres" in said
     assert doctor.main(["nowhere"]) == 2

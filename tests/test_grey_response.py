@@ -22,6 +22,10 @@ CLOSE = 0.35
 """Logarithm of a value, from code 40 on: the ink's spread alone, of which the test's printers have 1.5 %, does 0.1."""
 
 
+SAME = 0.005
+"""Share: each picture's own exposure has a weak prior, and it counts once for each."""
+
+
 def pictures(seed, count=5, low=0.25, **options):
     rng = np.random.default_rng(seed)
     card, encode = PrintedCard(rng, **options), smooth_curve(rng)
@@ -50,6 +54,14 @@ def test_more_exposures_tell_more():
     alike, _ = pictures(3, count=3, low=0.94)
     apart, _ = pictures(3, count=6, low=0.15)
     assert measure_grey_response(apart).deviation[64, 1] < measure_grey_response(alike).deviation[64, 1]
+
+
+def test_many_alike_pictures_tell_what_a_few_do():
+    """What is wrong with pictures of one desk is alike in all: it must not outvote what is expected of the ink."""
+    images, _ = pictures(2)
+    few, many = measure_grey_response(images), measure_grey_response(images * 4)
+    assert np.allclose(many.curve, few.curve, rtol=SAME)
+    assert np.allclose(many.deviation, few.deviation, rtol=SAME)
 
 
 def test_what_does_not_tell_is_refused():

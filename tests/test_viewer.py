@@ -39,7 +39,7 @@ from warp_ar.accuracy.budget import AIM
 from warp_ar.accuracy.cost_table import SETTINGS
 from warp_ar.accuracy.costs import Costs
 from warp_ar.engine.pipeline import Pipeline
-from warp_ar.errors import SceneError, UsageError, WarpArError
+from warp_ar.errors import SceneError, SourceError, UsageError, WarpArError
 from warp_ar.input.card import card_size, draw_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.input.sources import Synthetic, open_source
@@ -1477,6 +1477,24 @@ def test_the_command_serves_until_its_frames_are_lit(capsys: pytest.CaptureFixtu
     arguments = ["desk", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser", "--frames", "3"]
     assert live.main(arguments) == 0
     assert "http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_without_a_camera_frames_that_are_counted_never_come(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["desk", "--source", "1023", "--device", "cpu", "--quality", "low", "--port", "0", "--no-browser"]
+    assert live.main([*arguments, "--frames", "1"]) == 2
+    assert "capture device 1023 cannot be opened" in capsys.readouterr().err
+    with pytest.raises(SourceError, match="numbered from 0 to 1023"):
+        Host(page_scene(), source=1024, device="cpu", quality="low")
+
+
+def test_without_a_camera_a_picture_says_so() -> None:
+    with Running(page_scene(), source=1023) as running:
+        missing = running.host.state_message()["missing"]
+        assert missing["name"] == "source.absent"
+        assert "capture device 1023 cannot be opened" in missing["text"]
+        assert "My camera" in missing["remedy"]
+        words = running.next().frame
+        assert np.ptp(words) > 100, "nothing is written there"
 
 
 def test_names_do_not_reach_the_terminal_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

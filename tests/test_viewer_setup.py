@@ -6,6 +6,7 @@ Screenshots are kept in the folder that WARP_AR_ARTEFACTS names, else in pytest'
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,63 +14,69 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.browser_rig import CHROMIUM, SMALL, Tab, axe_core, chromium, serious_findings, served, write_camera_file
+from tests.browser_rig import CHROMIUM, SMALL, CanvasCamera, Tab, axe_core, chromium, serious_findings, served
 from tests.random_desk import RandomDesk
+from warp_ar.init import make_desk
 from warp_ar.input.card import write_card
 from warp_ar.input.sheet import SHEET
 from warp_ar.kernels.color import decode_table
+from warp_ar.srgb import decode_srgb
 
 pytest.importorskip("playwright.sync_api", reason="needs playwright: pip install '.[test]'")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium")
 
 SEED = 31
 VIEWS = 14
-HELD = 15
-"""Frames of the film in which each view stands still: half a second."""
-LIGHTS = (1.0, 0.6, 0.3)
-"""What the lamps give, two views at a time."""
+SHOWN = 0.5
+"""Seconds of frames of each view that the page has lit: it keeps one in 0.4 s."""
+LIGHTS = (1.4, 0.7, 0.35)
+"""What the lamps give, view by view in another order than the tilts."""
 FOCAL = 0.015
-"""Share of the focal length: twelve views of 640x480, packed twice as JPEG, their board in half of the picture."""
+"""Share of the focal length: twelve views of 640x480, packed as JPEG, their board in half of the picture."""
 RADIUS = 0.7e-3
 """Metres: the interval that the page states for this desk."""
 CHANGED = 12.0
 """Levels by which the picture changes where the teapot is: JPEG changes it by two."""
 
 
-def walk(desk: RandomDesk) -> Iterator[np.ndarray]:
-    """Frames of a hand that carries a camera around the desk, while lamps go on and off."""
+def dimmed(image: np.ndarray, light: float) -> np.ndarray:
+    """A frame under lamps that give so many times what they gave."""
     decode = decode_table("srgb")[:, 0]
-    for k in range(VIEWS):
-        turn, tilt, far = 2.4 * k, np.radians((14, 32, 46)[k % 3]), 0.36 + 0.03 * (k % 4)
-        at = np.array([0.05 * np.cos(1.3 * k), 0.045 + 0.035 * np.sin(1.3 * k), 0.0])
-        eye = at + far * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
-        image = desk.photograph(eye, at, (0.0, 25.0, -30.0)[k % 3])
-        dimmed = np.searchsorted(decode, decode * LIGHTS[k // 2 % len(LIGHTS)]).astype(np.uint8)
-        yield from [dimmed[image]] * HELD
+    return np.searchsorted(decode, np.minimum(decode * light, 1.0)).astype(np.uint8)[image]
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> RandomDesk:
-    if not pytestconfig.getoption("--long"):
-        pytest.skip("one to four minutes for each size, and a busy machine's fake camera loses views; run with --long")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> RandomDesk:
     card = tmp_path_factory.mktemp("card") / "card.pdf"
     write_card(SHEET, card, "a4", 600)
     return RandomDesk(card, SEED)
 
 
 @pytest.fixture(scope="module")
-def browser(desk: RandomDesk, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
-    write_camera_file(path, walk(desk))
-    with chromium(path) as browser:
+def views(desk: RandomDesk) -> list[np.ndarray]:
+    """What a hand sees that carries a camera around the desk, while lamps go on and off."""
+    found = []
+    for k in range(VIEWS):
+        turn, tilt, far = 2.4 * k, np.radians((14, 32, 46)[k % 3]), 0.36 + 0.03 * (k % 4)
+        at = np.array([0.05 * np.cos(1.3 * k), 0.045 + 0.035 * np.sin(1.3 * k), 0.0])
+        eye = at + far * np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+        image = desk.photograph(eye, at, (0.0, 25.0, -30.0)[k % 3])
+        found.append(dimmed(image, LIGHTS[k // 2 % len(LIGHTS)]))
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as browser:
         yield browser
 
 
 class Hands:
     """A page that is used by the keyboard, looked at by axe-core, and photographed."""
 
-    def __init__(self, tab: Tab, phone: bool, folder: Path, name: str) -> None:
-        self.tab, self.page, self._phone, self._folder, self._name = tab, tab.page, phone, folder, name
+    def __init__(self, tab: Tab, camera: CanvasCamera, phone: bool, folder: Path, name: str) -> None:
+        self.tab, self.page, self._camera = tab, tab.page, camera
+        self._phone, self._folder, self._name = phone, folder, name
         self._count = 0
         self.page.evaluate(axe_core())
 
@@ -90,6 +97,11 @@ class Hands:
         self.page.keyboard.press("Control+a")
         self.page.keyboard.type(text)
 
+    def walk(self, *views: int) -> None:
+        """Carry the camera around the desk."""
+        for view in views:
+            self._camera.show(view, SHOWN)
+
     def look(self, step: str) -> None:
         """Nothing serious hinders anybody in this step, and a finger hits what it wants."""
         self.page.screenshot(path=self._folder / f"{self._name}_{self._count}_{step}.png")
@@ -109,18 +121,20 @@ class Hands:
 
 
 @pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
-def test_from_the_card_to_a_lit_object(size: tuple[int, int], desk: RandomDesk, browser: Any, tmp_path: Path) -> None:
+def test_from_the_card_to_a_lit_object(
+    size: tuple[int, int], desk: RandomDesk, views: list[np.ndarray], browser: Any, tmp_path: Path
+) -> None:
     folder = Path(os.environ.get("WARP_AR_ARTEFACTS") or tmp_path)
     folder.mkdir(parents=True, exist_ok=True)
     phone = size[0] < 800
     with served(["desk"], tmp_path) as url:
-        context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]}, has_touch=phone, is_mobile=phone, permissions=["camera"]
-        )
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]}, has_touch=phone, is_mobile=phone)
+        camera = CanvasCamera(context, views)
         tab = Tab(context.new_page())
         tab.page.goto(url)
         tab.until("!!window.warpAr && warpAr.view.stats.plan > 0 && !!warpAr.scene", "the first lit frame")
-        hands = Hands(tab, phone, folder, f"setup_{size[0]}")
+        camera.begin(tab)
+        hands = Hands(tab, camera, phone, folder, f"setup_{size[0]}")
         use_the_card(tab, hands, desk)
         measure_the_camera(tab, hands, desk)
         measure_the_ball(tab, hands, desk)
@@ -144,6 +158,9 @@ def use_the_card(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
     assert card.value.suggested_filename == "card-a4.pdf"
     tab.until("!document.getElementById('guide').hidden", "the guide")
     assert "Use the card with these sizes" in hands.words("#guide")
+    guide = hands.page.locator("#guide").bounding_box()
+    assert guide["y"] >= 0, "the guide is out of sight"
+    assert guide["y"] + guide["height"] <= hands.page.viewport_size["height"], "the guide is out of sight"
     # Typed as a ruler has it: to the millimetre.
     hands.type("#ball-radius", f"{1e3 * desk.radius:.0f}")
     hands.press("#use-card")
@@ -161,6 +178,7 @@ def use_the_card(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
 
 def measure_the_camera(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
     hands.press("#calibrate")
+    hands.walk(*range(VIEWS))
     tab.until("document.getElementById('calibration-note').textContent.includes('enough')", "a dozen views")
     hands.look("camera")
     hands.press("#calibrate-finish")
@@ -174,6 +192,7 @@ def measure_the_camera(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
 
 
 def measure_the_ball(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
+    hands.walk(*range(0, VIEWS, 2))
     hands.press("#measure-ball")
     tab.until("document.getElementById('ball-note').textContent.startsWith('Looking at the frames')")
     tab.until("!document.getElementById('measure-ball').disabled", "the ball")
@@ -189,14 +208,21 @@ def measure_the_ball(tab: Tab, hands: Hands, desk: RandomDesk) -> None:
 
 
 def measure_the_response(tab: Tab, hands: Hands) -> None:
-    """By chance of the moment the film tells the curve well enough or not; either is said beside the button."""
+    hands.walk(*range(1, VIEWS, 2))
     hands.press("#measure-response")
     tab.until("document.getElementById('response-note').textContent.startsWith('Looking at the frames')")
     tab.until("!document.getElementById('measure-response').disabled", "the response")
     said = hands.words("#response-note")
-    assert said.startswith("Code 128 is") or "nothing is changed" in said, said
-    assert hands.page.locator("#response-file").is_visible() == said.startswith("Code 128 is")
+    found = re.match(r"Code 128 is (0\.\d+) of clipping ± (\d+)%", said)
+    assert found, said
+    # The desk is seen as sRGB has it.
+    assert abs(float(found[1]) / decode_srgb(128 / 255) - 1) < float(found[2]) / 100
+    assert hands.page.locator("#response-file").is_visible()
     hands.look("response")
+    hands.page.keyboard.press("Control+z")
+    tab.until("document.getElementById('response-file').hidden", "undone")
+    hands.page.keyboard.press("Control+Shift+z")
+    tab.until("!document.getElementById('response-file').hidden", "done again")
 
 
 def check(tab: Tab, hands: Hands) -> None:
@@ -228,3 +254,30 @@ def the_object_is_lit(tab: Tab, hands: Hands) -> None:
     hands.page.evaluate("document.getElementById('split').value = 500")
     hands.page.locator("#split").dispatch_event("input")
     hands.look("lit")
+
+
+def test_without_a_camera_the_page_waits_for_a_browsers(
+    desk: RandomDesk, views: list[np.ndarray], browser: Any, tmp_path: Path
+) -> None:
+    """A desk of one's own names this machine's camera; where there is none, a phone's lights it."""
+    folder = tmp_path / "my_desk"
+    make_desk(folder, 1023, 0.03)
+    said = "capture device 1023 cannot be opened; the page goes on without"
+    with served(
+        [str(folder)], tmp_path, says=(said, f"for a phone's camera: python -m warp_ar.live {folder} --host")
+    ) as url:
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
+        camera = CanvasCamera(context, views[:1])
+        tab = Tab(context.new_page())
+        tab.page.goto(url)
+        tab.until("!!window.warpAr && warpAr.state.missing && !document.getElementById('guide').hidden", "the guide")
+        assert "Press “My camera”" in tab.page.inner_text("#guide")
+        camera.begin(tab)
+        tab.page.click("#use-camera")
+        tab.until("warpAr.state.camera === true && warpAr.view.stats.stamped", "the camera's frames")
+        tab.until("document.getElementById('track-state').classList.contains('tracked')", "the card in the picture")
+        tab.until("document.getElementById('guide').hidden")
+        tab.page.click("#use-clip")
+        tab.until("warpAr.state.camera === false && !document.getElementById('guide').hidden", "no camera again")
+        context.close()
+    assert tab.errors == []

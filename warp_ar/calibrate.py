@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from warp_ar.command_line import EXIT_DONE, EXIT_FAILED, Parser, leave, run_command, say
 from warp_ar.errors import UsageError
@@ -175,10 +176,13 @@ def _run_ball(options: argparse.Namespace) -> int:
     for guess in guesses(scene):
         say(f"{guess}; until then what follows is no better than that")
     views, code = views[:: -(-len(views) // 12)], EXIT_DONE
-    say(f"looking at the ball in {len(views)} frames, which takes 5 to 30 seconds")
+    say(f"looking at the ball in {len(views)} frames, which takes some seconds")
     for index, probe in enumerate(scene.probes):
         others = [other for other in scene.probes if other is not probe]
-        report = measure_ball(views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius)
+        with Console(stderr=True).status("looking at the frames") as status:
+            report = measure_ball(
+                views, camera, probe, scene.proxies, others, keep_radius=options.keep_radius, tell=status.update
+            )
         moved = 1e3 * math.dist(report.center, probe.center)
         x, y, z = report.center
         print(

@@ -44,6 +44,10 @@ def check_machine() -> tuple[list[str], list[Finding]]:
 
     device = resolve_device("auto")
     told = [f"device: {device.name} ({usable_cores()} cores)" if device.is_cpu else f"device: {device.name}"]
+    driver = wp.get_cuda_driver_version()
+    told.append(
+        "driver: " + ("none for CUDA, so kernels run on the CPU" if driver is None else f"CUDA {driver[0]}.{driver[1]}")
+    )
     cache = str(wp.config.kernel_cache_dir)
     found: list[Finding] = []
     told.append(f"kernels: kept in {printable(cache)}; the first run of a kind of scene compiles them")

@@ -79,7 +79,7 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
     # What is imported stays: looking through it for garbage would hold up a frame for a tenth of a second.
     gc.collect()
     gc.freeze()
-    return Host(
+    host = Host(
         scene,
         source=options.source,
         device=options.device,
@@ -88,6 +88,20 @@ def _make_page_host(options: argparse.Namespace, scene: Scene, **callbacks: Any)
         frames=options.frames,
         **callbacks,
     )
+    if host.no_camera is not None:
+        _say_no_camera(options, host.no_camera.finding.text)
+    return host
+
+
+def _say_no_camera(options: argparse.Namespace, text: str) -> None:
+    """Say how another camera than that of this machine comes to the page, which goes on."""
+    from warp_ar.viewer.address import LOOPBACK
+
+    say(f'{text}; the page goes on without: press "My camera" there for the camera of the browser\'s machine')
+    if options.host in LOOPBACK:
+        say(f"for a phone's camera: python -m warp_ar.live {printable(options.scene)} --host 0.0.0.0 --tls")
+    elif not options.tls:
+        say("browsers keep their camera from other machines without TLS: start with --tls as well")
 
 
 def serve_page(options: argparse.Namespace) -> int:

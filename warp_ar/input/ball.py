@@ -23,6 +23,7 @@ neighbouring samples share pixels and errors of the model.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -114,8 +115,8 @@ class BallFit:
         return self.deviation < MOST_DEVIATION and self.error < MOST_ERROR and distinct
 
 
-class _View:
-    """One frame, prepared for looking objects up."""
+class BallView:
+    """One frame, prepared for comparing what balls in it mirror with what it shows."""
 
     def __init__(self, image: Image, pose: Pose, camera: Camera, table: NDArray[np.float32]) -> None:
         self.pose, self.camera = pose, camera
@@ -123,11 +124,21 @@ class _View:
         self.eye, self._world_from_camera = inverse.translation, inverse.rotation
         linear = np.stack([table[image[..., channel], channel] for channel in range(3)], -1)
         clipped = (image >= 254).any(-1).astype(np.float32)
-        linear = np.dstack([linear, clipped**2])
-        self.coarse, self.fine = (
-            tuple(np.sqrt(cv2.GaussianBlur(linear, (0, 0), blur) if blur else linear) for blur in blurs)
-            for blurs in BLURS
-        )
+        self._linear = np.dstack([linear, clipped**2])
+
+    @functools.cached_property
+    def coarse(self) -> tuple[Any, Any]:
+        """Pictures of ball and receiver for the search: square roots of radiance and of the share at clipping."""
+        return self._blurred(*BLURS[0])
+
+    @functools.cached_property
+    def fine(self) -> tuple[Any, Any]:
+        """The same for the fit."""
+        return self._blurred(*BLURS[1])
+
+    def _blurred(self, *blurs: float) -> tuple[Any, Any]:
+        ball, receiver = (cv2.GaussianBlur(self._linear, (0, 0), blur) if blur else self._linear for blur in blurs)
+        return np.sqrt(ball), np.sqrt(receiver)
 
     def sample(self, picture: Any, pixels: Array) -> Array:
         """Square roots of radiance and of the share at clipping, (n, 4)."""
@@ -232,50 +243,66 @@ def _meet_ball(center: Array, radius: float, origin: Array, direction: Array) ->
 
 
 @dataclasses.dataclass(frozen=True)
+class _Samples:
+    """What a view shows of a ball at n samples."""
+
+    directions: Array
+    """Unit directions in the world, (n, 3)."""
+    values: Array
+    """Square roots of radiance and of the share at clipping, (n, 4)."""
+
+
+@dataclasses.dataclass(frozen=True)
 class _Task:
     """What is compared."""
 
-    views: Sequence[_View]
+    views: Sequence[BallView]
     probe: Probe
     receiver: _Receiver
     is_coarse: bool = False
 
-    def pixels(self, view: _View, center: Array) -> Array:
-        """Samples on the ball in one view."""
-        return view.disc(center, self.probe.radius, SEARCH_ACROSS if self.is_coarse else ACROSS)
+    def samples(self, view: BallView, center: Array) -> _Samples:
+        """What one view shows of a ball."""
+        pixels = view.disc(center, self.probe.radius, SEARCH_ACROSS if self.is_coarse else ACROSS)
+        picture, _ = view.coarse if self.is_coarse else view.fine
+        return _Samples(view.rays(pixels), view.sample(picture, pixels))
 
-    def residuals(self, view: _View, center: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Seen less predicted, (n, 3), and which pixels have a prediction."""
-        radius = self.probe.radius
-        direction = view.rays(pixels)
-        eye = np.broadcast_to(view.eye, direction.shape)
-        t = _meet_ball(center, radius, eye, direction)
-        told = np.isfinite(t)
-        point = eye + np.where(told, t, 1.0)[:, None] * direction
+    def residuals(self, view: BallView, center: Array, seen: _Samples) -> tuple[Array, NDArray[np.bool_]]:
+        """Seen less predicted, (n, 3), and which samples have a prediction; the others' residuals are 0."""
+        radius, eye = self.probe.radius, view.eye
+        t = _meet_ball(center, radius, np.broadcast_to(eye, seen.directions.shape), seen.directions)
+        # What is known to have no prediction is not looked at further: about half of the samples.
+        index = np.flatnonzero(np.isfinite(t) & (seen.values[:, 3] < 0.1))
+        direction = seen.directions[index]
+        point = eye + t[index, None] * direction
         normal = (point - center) / radius
         mirrored = direction - 2.0 * _dot(direction, normal)[:, None] * normal
         s = self.receiver.trace(point, mirrored)
-        told &= np.isfinite(s)
-        hit = point + np.where(told, s, 1.0)[:, None] * mirrored
-        seen, inside = view.project(hit)
-        told &= inside
+        met = np.isfinite(s)
+        index, hit = index[met], point[met] + s[met, None] * mirrored[met]
+        places, inside = view.project(hit)
+        index, hit, places = index[inside], hit[inside], places[inside]
         away = hit - eye
         distance = np.sqrt(_dot(away, away))
         away /= np.maximum(distance, 1e-9)[:, None]
+        origin = np.broadcast_to(eye, away.shape)
         # The ball with a margin: it bleeds into what is blurred.
-        told &= _meet_ball(center, 1.1 * radius, eye, away) > distance
-        told &= self.receiver.trace(eye, away) > distance * (1.0 - _BOUND) - _BOUND
-        of_ball, of_receiver = view.coarse if self.is_coarse else view.fine
-        ball = view.sample(of_ball, pixels)
-        wanted = view.sample(of_receiver, np.where(told[:, None], seen, 0.0))
-        told &= (ball[:, 3] < 0.1) & (wanted[:, 3] < 0.1)
-        return ball[:, :3] - wanted[:, :3] * np.sqrt(self.probe.reflectance), told
+        shown = _meet_ball(center, 1.1 * radius, origin, away) > distance
+        shown &= self.receiver.trace(origin, away) > distance * (1.0 - _BOUND) - _BOUND
+        _, picture = view.coarse if self.is_coarse else view.fine
+        wanted = view.sample(picture, places)
+        shown &= wanted[:, 3] < 0.1
+        index, wanted = index[shown], wanted[shown]
+        residuals, told = np.zeros((len(t), 3)), np.zeros(len(t), bool)
+        residuals[index] = seen.values[index, :3] - wanted[:, :3] * np.sqrt(self.probe.reflectance)
+        told[index] = True
+        return residuals, told
 
     def cost(self, center: Array, scale: float) -> tuple[float, int]:
         """Mean of rho over all samples, and how many there are."""
         total, count = 0.0, 0
         for view in self.views:
-            e, told = self.residuals(view, center, self.pixels(view, center))
+            e, told = self.residuals(view, center, self.samples(view, center))
             squared = _dot(e, e)[told] / 3.0
             total += float((squared / (squared + scale**2)).sum())
             count += len(squared)
@@ -287,12 +314,12 @@ class _Task:
         matrix, vector = np.zeros((3, 3)), np.zeros(3)
         squares, weights, count = 0.0, 0.0, 0
         for view in self.views:
-            pixels = self.pixels(view, center)
-            e, told = self.residuals(view, center, pixels)
+            seen = self.samples(view, center)
+            e, told = self.residuals(view, center, seen)
             columns = []
             for axis in np.eye(3):
-                ahead, told_ahead = self.residuals(view, center + DIFFERENCE * axis, pixels)
-                behind, told_behind = self.residuals(view, center - DIFFERENCE * axis, pixels)
+                ahead, told_ahead = self.residuals(view, center + DIFFERENCE * axis, seen)
+                behind, told_behind = self.residuals(view, center - DIFFERENCE * axis, seen)
                 columns.append((ahead - behind) / (2.0 * DIFFERENCE))
                 told = told & told_ahead & told_behind
             jacobian, e = np.stack(columns, -1)[told], e[told]
@@ -349,9 +376,7 @@ def fit_ball(
     Returns:
         The fit, or None where too little of the receiver is mirrored; look at ``is_good`` before believing it.
     """
-    table = decode_table(camera.transfer)
-    views = [_View(image, pose, camera, table) for image, pose in frames]
-    coarse = _Task(views, probe, _Receiver(proxies, others), is_coarse=True)
+    coarse = _Task(prepare_views(frames, camera), probe, _Receiver(proxies, others), is_coarse=True)
     fine = dataclasses.replace(coarse, is_coarse=False)
     start: Array = np.array(probe.center, np.float64)
     before, count = fine.cost(start, SCALES[-1])
@@ -376,18 +401,19 @@ def fit_ball(
     return BallFit(center, deviation, error, before, samples, rival)
 
 
+def prepare_views(frames: Sequence[tuple[Image, Pose]], camera: Camera) -> tuple[BallView, ...]:
+    """Frames, RGB uint8 with ``camera_from_world``, prepared once for all balls that are tried."""
+    table = decode_table(camera.transfer)
+    return tuple(BallView(image, pose, camera, table) for image, pose in frames)
+
+
 def mirrored_error(
-    frames: Sequence[tuple[Image, Pose]],
-    camera: Camera,
-    probe: Probe,
-    proxies: Sequence[Proxy] = (),
-    others: Sequence[Probe] = (),
+    views: Sequence[BallView], probe: Probe, proxies: Sequence[Proxy] = (), others: Sequence[Probe] = ()
 ) -> tuple[float, Array] | None:
-    """How badly a ball of a radius explains what the frames show it to mirror, at the best place beside its own.
+    """How badly a ball of a radius explains what frames show it to mirror, at the best place beside its own.
 
     Args:
-        frames: uint8 RGB pictures with ``camera_from_world``.
-        camera: The camera of all of them.
+        views: The frames.
         probe: The ball, its centre within some millimetres.
         proxies: What stands on the receiver; without planes or boxes a desk at the marker's height is assumed.
         others: Other balls.
@@ -395,8 +421,7 @@ def mirrored_error(
     Returns:
         Mean cost, 0 (all samples agree) to 1, and the centre (3,); None where too little of the receiver is mirrored.
     """
-    table = decode_table(camera.transfer)
-    task = _Task([_View(image, pose, camera, table) for image, pose in frames], probe, _Receiver(proxies, others))
+    task = _Task(views, probe, _Receiver(proxies, others))
     center: Array = np.array(probe.center, np.float64)
     if task.cost(center, SCALES[-1])[1] < FEWEST:
         return None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,7 @@ def measure_ball(
     others: Sequence[Probe] = (),
     *,
     keep_radius: bool = False,
+    tell: Callable[[str], None] = lambda words: None,
 ) -> BallMeasurement:
     """Centre and radius of a mirror ball.
 
@@ -81,6 +82,7 @@ def measure_ball(
         proxies: What stands on the receiver.
         others: Other balls.
         keep_radius: Believe the probe's radius.
+        tell: Takes what is being looked at, in words, whenever that changes: all of it takes some seconds.
 
     Raises:
         UsageError: The ball is in too few frames.
@@ -90,6 +92,7 @@ def measure_ball(
     standing = ground is not None and probe.center[2] - probe.radius - ground < 0.3 * probe.radius
     ground = ground if standing else None
     how = "by {} outlines"
+    tell("the ball's outlines")
     outlines = agreeing_outlines(few, camera, probe, ground)
     if not outlines:
         report = outline_search(views, camera, probe.center, probe.radius)
@@ -107,6 +110,7 @@ def measure_ball(
     deviation = ASSUMED * radius if assumed else solution.radius_deviation
     own = max(solution.center_deviation)
     if not assumed and ground is not None and _is_doubtful(solution, probe, len(few)):
+        tell("its radius, by what it mirrors")
         mirrored = mirrored_radius(few, camera, probe, proxies, others)
         if mirrored is not None and _contradicts(solution, mirrored):
             radius, deviation = mirrored.radius, DEVIATION * mirrored.radius
@@ -114,6 +118,7 @@ def measure_ball(
             solution = dataclasses.replace(solution, center=mirrored.center)
             how = "by the desk in it"
     better = None
+    tell("its place, by what it mirrors")
     try:
         found = dataclasses.replace(probe, center=solution.center, radius=radius)
         better = fit_ball(few, camera, found, proxies, others, search=SEARCH)

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from warp_ar.input.ball import mirrored_error
+from warp_ar.input.ball import mirrored_error, prepare_views
 from warp_ar.scene import Camera, Pose, Probe, Proxy
 
 Image = NDArray[np.uint8]
@@ -52,7 +52,7 @@ def mirrored_radius(
         proxies: What stands on the receiver.
         others: Other balls.
     """
-    few = views[:: -(-len(views) // VIEWS)]
+    few = prepare_views(views[:: -(-len(views) // VIEWS)], camera)
     steps = round(SPAN / STEP)
     costs: dict[int, float] = {}
     balls: dict[int, Probe] = {}
@@ -62,7 +62,7 @@ def mirrored_radius(
         radius = probe.radius * (1.0 + STEP * k)
         start = (place[0], place[1], probe.center[2] + radius - probe.radius)
         ball = dataclasses.replace(probe, center=start, radius=radius)
-        found = mirrored_error(few, camera, ball, proxies, others)
+        found = mirrored_error(few, ball, proxies, others)
         if found is not None and found[0] < costs.get(k, math.inf):
             x, y, z = (float(value) for value in found[1])
             costs[k], balls[k] = found[0], dataclasses.replace(ball, center=(x, y, z))
@@ -98,8 +98,8 @@ def explains_better(
     others: Sequence[Probe] = (),
 ) -> bool:
     """Whether a ball explains what is mirrored, and much better than another one does."""
-    few = views[:: -(-len(views) // VIEWS)]
-    found = [mirrored_error(few, camera, ball, proxies, others) for ball in (probe, other)]
+    few = prepare_views(views[:: -(-len(views) // VIEWS)], camera)
+    found = [mirrored_error(few, ball, proxies, others) for ball in (probe, other)]
     if found[0] is None or found[0][0] > EXPLAINED:
         return False
     return found[1] is None or found[0][0] < BETTER * found[1][0]

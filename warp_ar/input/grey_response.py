@@ -67,7 +67,8 @@ where all curves meet, it falls as the square root of what is left."""
 MOST_DEVIATION: Final = 0.25
 """Share of a middle code's value that its interval may have: usual cameras differ from sRGB by as much."""
 COUNTED: Final = 5
-"""Pictures beyond which more tell nothing new: what compression and the curve's form miss is alike in all of them."""
+"""Pictures beyond which more tell nothing new: what compression and the curve's form miss is alike in all of them, and
+must not outvote what is expected of the curve and the ink."""
 ZONES: Final = 3
 """The board's cells are averaged over so many zones along x and y: neighbours share what is wrong with them."""
 _LIMITS: Final = ((0.015, 0.25), (-0.1, 0.1))
@@ -239,11 +240,12 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
     solved = np.zeros(_TERMS + 2 + 3 * count)
     means = np.array([mean for mean, _ in BENDS])
     solved[:_TERMS] = means
+    say = math.sqrt(min(1.0, COUNTED / float(count)))
     for _ in range(_STEPS):
         # Errors of a code are those of its logarithm times the curve's slope there. The slope must be the curve's own:
         # with another's, the flatter a curve is the better it fits.
         ahead, behind = (_log_curve(codes + step, solved[:_TERMS]) for step in (0.003, -0.003))
-        weight = 1.0 / np.hypot(CODE_ERROR / 255.0 * np.maximum((ahead - behind) / 0.006, 0.3), even)
+        weight = say / np.hypot(CODE_ERROR / 255.0 * np.maximum((ahead - behind) / 0.006, 0.3), even)
         now = _reflected(shares, math.exp(black), spread)
         by_black = (_reflected(shares, math.exp(black + 1e-4), spread) - now) / 1e-4
         by_spread = (_reflected(shares, math.exp(black), spread + 1e-4) - now) / 1e-4
@@ -257,7 +259,7 @@ def _solve(found: list[_Samples], channel: int) -> tuple[Array, Array]:
         spread = float(np.clip(spread + solved[_TERMS + 1], *_LIMITS[1]))
     rest = design @ solved - target
     # Samples of one picture share what is wrong with them: the pictures and patches count, not the cells.
-    excess = max(float((rest**2).mean()), 1.0) * max(float(count) / COUNTED, 1.0)
+    excess = max(float((rest**2).mean()) / say**2, 1.0)
     covariance = np.asarray(np.linalg.inv(normal) * excess, float)
     return _curve(np.asarray(solved[:_TERMS], float), covariance[:_TERMS, :_TERMS])
 

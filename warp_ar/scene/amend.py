@@ -12,6 +12,7 @@ from tomlkit.exceptions import TOMLKitError
 from warp_ar.errors import SceneError, SinkError, reason
 from warp_ar.files import read_text, write_whole
 from warp_ar.scene.reader import loads_scene
+from warp_ar.scene.starter import key_comment
 
 
 def amend_scene(
@@ -24,7 +25,7 @@ def amend_scene(
         section: Such as ``probe``; of several of its kind, the one at ``index``.
         values: Keys with numbers, texts, or lists of numbers.
         index: Which of several.
-        remove: Keys that the new ones stand for.
+        remove: Keys that the new ones stand for; what a new desk's file says of them goes with them.
 
     Raises:
         SceneError: The file cannot be read, has no such section, or would no longer be a scene; it is left as it was.
@@ -40,12 +41,14 @@ def amend_scene(
         table = table[index] if index < len(table) else None
     if table is None:
         raise SceneError(f"{path}: [{section}] is missing: there is nothing to write {', '.join(values)} into")
-    for key in remove:
-        if key in table:
-            del table[key]
+    gone = [key for key in remove if key in table]
+    for key in gone:
+        del table[key]
     for key, value in values.items():
         table[key] = value
     made = tomlkit.dumps(document)
+    for key in gone:
+        made = made.replace("\n".join(["", *key_comment(section, key), ""]), "\n")
     loads_scene(made, path)
     try:
         write_whole(path, made.encode())

@@ -86,7 +86,6 @@ def starter_scene(
         mesh: Path of the object's mesh, relative to the file.
     """
     parts = _sections(source, marker, center, radius, mesh)
-    known = {(key.section, key.name): key for key in keys()}
     lines = [
         "# Metres, degrees, linear RGB. The origin is the middle of the card's board: x right, y up the page, z up."
     ]
@@ -94,12 +93,15 @@ def starter_scene(
     for head, comment, entries in parts:
         lines += ["", *(f"# {line}" for line in textwrap.wrap(comment, _WIDTH)), head]
         for section, key, value in entries:
-            explained = known[section, key]
-            said = explained.unit == "-" or explained.unit.split()[0] in explained.meaning.lower()
-            meaning = explained.meaning if said else f"{explained.meaning} ({explained.unit})"
-            lines += [f"# {line}" for line in textwrap.wrap(meaning, _WIDTH)]
-            lines.append(f"{key} = {value}")
+            lines += [*key_comment(section, key), f"{key} = {value}"]
     return "\n".join(lines) + "\n"
+
+
+def key_comment(section: str, name: str) -> list[str]:
+    """Lines of a comment that says what a key is."""
+    (key,) = (one for one in keys() if (one.section, one.name) == (section, name))
+    said = key.unit == "-" or key.unit.split()[0] in key.meaning.lower()
+    return [f"# {line}" for line in textwrap.wrap(key.meaning if said else f"{key.meaning} ({key.unit})", _WIDTH)]
 
 
 def guesses(scene: Scene) -> list[str]:

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from warp_ar.errors import UsageError
-from warp_ar.input.sources import QueueSource, Source, open_source
+from warp_ar.errors import SourceError, UsageError
+from warp_ar.input.sources import MOST_INDEX, QueueSource, Source, open_source
 from warp_ar.scene import Camera, Scene, SourceSpec
 from warp_ar.stages.quality import PRESETS
 from warp_ar.viewer import messages
 from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.history import History
+from warp_ar.viewer.no_camera import NoCamera
 
 CAMERA: Final = "camera"
 """What a picture is compared with when it is not another preset."""
@@ -53,17 +54,30 @@ def _where(spec: SourceSpec) -> str | int | Path:
 
 
 def open_feed(scene: Scene, given: str | int | Path | None, wanted: Wanted | None = None) -> Feed:
-    """A scene's own source, or the one that was given instead.
+    """A scene's own source, or the one that was given instead; of a capture device that is not there a ``NoCamera``.
 
     Raises:
         WarpArError: It cannot be opened, or the scene names none.
     """
-    if given is not None:
-        return Feed(open_source(given, loop=True), wanted=wanted)
     spec = scene.source
-    if spec is None:
+    if given is None and spec is None:
         raise UsageError(f"scene {scene.name!r} names no source; give one with --source")
-    return Feed(open_source(_where(spec), fps=spec.fps, loop=True, exposures=spec.exposures or ()), wanted=wanted)
+    try:
+        if given is not None:
+            return Feed(open_source(given, loop=True), wanted=wanted)
+        assert spec is not None
+        return Feed(open_source(_where(spec), fps=spec.fps, loop=True, exposures=spec.exposures or ()), wanted=wanted)
+    except SourceError as error:
+        if not _is_device(given if given is not None or spec is None else spec.camera):
+            raise
+        return Feed(NoCamera((scene.camera.width, scene.camera.height), error), wanted=wanted)
+
+
+def _is_device(source: str | int | Path | None) -> bool:
+    """Whether a source is a capture device that there may be."""
+    if isinstance(source, str) and source.isdecimal() and len(source) <= 4 and not Path(source).exists():
+        source = int(source)
+    return isinstance(source, int) and 0 <= source <= MOST_INDEX
 
 
 class Controls:

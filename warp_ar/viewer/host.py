@@ -31,6 +31,7 @@ from warp_ar.viewer.edits import Wanted
 from warp_ar.viewer.frames import FrameLoop, Helpers, Lit
 from warp_ar.viewer.light_record import LightState
 from warp_ar.viewer.lighting import Lighting, make_target
+from warp_ar.viewer.no_camera import NoCamera
 from warp_ar.viewer.recorder import Recorder
 from warp_ar.viewer.setup import SetupChecks
 
@@ -63,7 +64,8 @@ class Host:
             notify: Takes what else viewers should know, on any thread.
 
         Raises:
-            WarpArError: The source cannot be opened, or no plan be made for it.
+            WarpArError: The source cannot be opened, or no plan be made for it. A capture device that is not there is
+                waited for, unless ``frames`` are counted: a viewer may bring a camera.
         """
         self._notify = notify
         self._given_source = source
@@ -73,7 +75,10 @@ class Host:
         self._preset = PRESETS[DEFAULT_PRESET] if quality == AUTO else resolve_quality(quality)
         wanted = Wanted(scene, self._budget.start_quality() if quality == AUTO else self._preset)
         self._original = wanted
-        self._controls = Controls(open_feed(scene, source), wanted, notify)
+        feed = open_feed(scene, source)
+        if isinstance(feed.source, NoCamera) and frames is not None:
+            raise feed.source.error
+        self._controls = Controls(feed, wanted, notify)
         self._folder = tempfile.TemporaryDirectory(prefix="warp_ar_live_")
         self._recorder = Recorder(Path(self._folder.name))
         self._dropped, self._dropping = DroppedFiles(Path(self._folder.name)), threading.Lock()
@@ -98,6 +103,12 @@ class Host:
     def latest(self) -> Lit | None:
         """The newest frame."""
         return self._loop.latest
+
+    @property
+    def no_camera(self) -> NoCamera | None:
+        """What is said while there is no camera; None while there are frames."""
+        source = self._controls.feed.source
+        return source if isinstance(source, NoCamera) else None
 
     @property
     def description(self) -> str:
@@ -359,7 +370,7 @@ class Host:
             "camera": controls.feed.is_browser,
             "estimating": self._camera.estimating,
             "lens": self._lens(),
-            "missing": self._setup.missing_record(),
+            "missing": self._missing(),
             "playing": controls.playing,
             "recording": self._recorder.count,
             "building": lighting.doing(),
@@ -372,6 +383,11 @@ class Host:
             "watchers": controls.watchers,
             "difference": self._loop.difference,
         }
+
+    def _missing(self) -> dict[str, str] | None:
+        """Why there are no frames, or why the marker is not seen in them."""
+        missing = self._setup.missing if self.no_camera is None else self.no_camera.finding
+        return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
 
     def _lens(self) -> str:
         """Where the camera's numbers come from: calibrated, given by the scene, estimated, or guessed."""

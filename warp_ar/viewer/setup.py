@@ -63,6 +63,7 @@ class SetupChecks:
         self._of: object = None
         self._busy: Future[None] | None = None
         self._step: str | None = None
+        self._doing = ""
         self._waits = False
         self._work: dict[str, Callable[[Scene, Look], None]] = {
             "check": self._check,
@@ -159,8 +160,13 @@ class SetupChecks:
         except WarpArError as error:
             self._failed[step] = str(error)
         finally:
-            self._step = None
+            self._step, self._doing = None, ""
             self._notify(self.message())
+
+    def _tell(self, words: str) -> None:
+        """Say what is being looked at."""
+        self._doing = words
+        self._notify(self.message())
 
     def _check(self, scene: Scene, look: Look) -> None:
         self._findings = check_look(scene, look, views=2)
@@ -181,7 +187,7 @@ class SetupChecks:
         if len(look.views) < FEWEST:
             raise UsageError("the marker was seen in too few frames to measure the ball by")
         probe, *others = scene.probes
-        found = measure_ball(look.views, look.camera, probe, scene.proxies, others)
+        found = measure_ball(look.views, look.camera, probe, scene.proxies, others, tell=self._tell)
         if not found.is_usable:
             raise UsageError(
                 f"the ball is known to {2e3 * found.deviation:.0f} mm only: nothing is changed. Have all of it in the "
@@ -244,17 +250,13 @@ class SetupChecks:
         return {
             "type": "setup",
             "busy": self._step,
+            "doing": self._doing,
             "findings": findings,
             "outdated": self._findings is not None and findings is None,
             "frames": len(self._frames),
             "measured": {step: words for step, words in self._measured.items() if step in valid},
             "failed": dict(self._failed),
         }
-
-    def missing_record(self) -> dict[str, str] | None:
-        """Why the marker is not seen, as plain data."""
-        missing = self.missing
-        return None if missing is None else {"name": missing.name, "text": missing.text, "remedy": missing.remedy}
 
 
 def _with_ball(scene: Scene, ball: Probe) -> Scene:

@@ -12,6 +12,8 @@ export class SetupPanel {
   #state = {};
   #frame = null;
   #clock = null;
+  #busy = null;
+  #began = 0;
 
   constructor(connection) {
     this.#connection = connection;
@@ -85,28 +87,30 @@ export class SetupPanel {
     put("guess", guessed);
   }
 
-  set message({ busy, findings, outdated, measured, failed }) {
+  set message({ busy, doing, findings, outdated, measured, failed }) {
     for (const id of ["measure-ball", "measure-response", "check"]) $(id).disabled = busy !== null;
     clearInterval(this.#clock);
     // What was asked for stands beside its own button: how long it has taken, what came out, or why nothing did.
     const put_step = (step, id, idle) =>
-      put(id, busy === step ? LOOKING : failed[step] ? sentence(failed[step]) : measured[step] ?? idle);
+      put(id, busy === step ? (doing ? `Looking at the frames: ${doing} …` : LOOKING) : failed[step] ? sentence(failed[step]) : measured[step] ?? idle);
     const count = findings?.length ?? 0;
     put_step("ball", "ball-note", "Centre and radius are solved for together, from the frames of the last seconds: move the camera around the ball, then press.");
     put_step("response", "response-note", "How the camera encodes light, told by the card's grey patches under different exposures or light.");
     put_step("check", "check-note", findings ? (count ? `${count} finding${count === 1 ? "" : "s"}, the worst first:` : "Nothing wrong was found.") : outdated ? "The set-up has changed since it was looked at: check it again." : "Units, card, camera, ball and light are looked at in the frames of the last seconds.");
     $("response-file").hidden = !measured.response;
     $("findings").replaceChildren(...(findings ?? []).map((one) => el("li", {}, sentence(one.text), el("small", {}, `Spoils: ${one.cost}.`), el("small", {}, `To do: ${one.remedy}.`))));
-    if (busy === null) return;
+    if (busy === null) return void (this.#busy = null);
     // Seconds are for the eye alone: a status that is set anew is read out anew.
-    const began = performance.now();
+    if (busy !== this.#busy) this.#began = performance.now();
+    this.#busy = busy;
+    const began = this.#began;
     const seconds = el("span", { "aria-hidden": "true" });
     $({ ball: "ball-note", response: "response-note", check: "check-note" }[busy]).append(seconds);
     this.#clock = setInterval(() => (seconds.textContent = ` ${Math.round((performance.now() - began) / 1000)} s`), 1000);
   }
 }
 
-const LOOKING = "Looking at the frames, which takes 5 to 30 seconds …";
+const LOOKING = "Looking at the frames, which takes some seconds …";
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}${/[.!?]$/.test(text) ? "" : "."}`;
 
 /** Text of an element, set only where it changes: what is set anew is read out anew. */
