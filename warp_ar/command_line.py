@@ -22,6 +22,8 @@ EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
+_LARGEST = 2**31 - 1
+"""Largest whole number of an argument: they count frames, samples, pixels, ports."""
 _LONGEST = 1000
 """Characters of a message that are shown: a path may have thousands."""
 
@@ -35,6 +37,22 @@ class Parser(argparse.ArgumentParser):
         meant = difflib.get_close_matches(unknown[1], _options(self), n=1, cutoff=0.75) if unknown else []
         hint = f"; did you mean {meant[0]}?" if meant else ""
         raise UsageError(f"{message}{hint}; see {self.prog} --help")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number."""
+        given = list(sys.argv[1:] if args is None else args)
+        for place, word in enumerate(given):
+            if word == "" or re.fullmatch(r"--[a-z0-9-]+=", word):
+                before = given[place - 1] if place and given[place - 1].startswith("-") else "an argument"
+                raise UsageError(f"{word.rstrip('=') or before} is empty; give it a value, or leave it out")
+        found, rest = super().parse_known_args(given, namespace)
+        for action in self._actions:
+            value = getattr(found, action.dest, None)
+            if isinstance(value, int) and abs(value) > _LARGEST:
+                name = action.option_strings[-1] if action.option_strings else action.dest
+                digits = len(str(abs(value)))
+                raise UsageError(f"{name}: a number of {digits} digits; expected {_LARGEST:,} at most")
+        return found, rest
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
