@@ -20,7 +20,7 @@ from warp_ar.kernels.structs import Picture
 wp.set_module_options({"enable_backward": False})
 
 MOST_CUT = wp.constant(wp.float32(2.0))
-"""Codes that ``cut_luma`` gives at most: rounding of three channels and of the luma is 1; converters differ by 1 more."""
+"""Codes that ``cut_luma`` gives at most: rounding of channels and luma is 1, converters differ by 1 more."""
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 

@@ -1,4 +1,7 @@
-"""Blender as a client: what it makes of our USD and OpenEXR, and of Alembic. WARP_AR_BLENDER names Python with ``bpy``."""
+"""Blender as a client: what it makes of our USD and OpenEXR, and of Alembic.
+
+WARP_AR_BLENDER names an interpreter with ``bpy``.
+"""
 
 from __future__ import annotations
 

@@ -16,9 +16,10 @@ import aiohttp
 import pytest
 
 from tests.test_viewer import PATIENCE, Page, run, served
+from warp_ar.errors import UsageError
 from warp_ar.viewer.gate import MOST_PER_ADDRESS
 from warp_ar.viewer.server import own_headers
-from warp_ar.viewer.tls import make_context
+from warp_ar.viewer.tls import load_context, make_certificate, make_context
 
 SECRET = "5ec2e7"
 HEADER_SECONDS = 0.7
@@ -251,3 +252,28 @@ def test_the_gate_ends_without_a_trace() -> None:
             client.close()
 
     test()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as on POSIX")
+def test_a_certificate_that_is_none_is_one_line(tmp_path):
+    """Nothing waits: not for a pipe, not for a password at the terminal."""
+    serialization = pytest.importorskip("cryptography.hazmat.primitives.serialization", reason="needs the extra tls")
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    os.mkfifo(tmp_path / "pipe.pem")
+    (tmp_path / "text.pem").write_text("no certificate")
+    key = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.BestAvailableEncryption(b"secret"),
+    )
+    certificate = make_certificate("127.0.0.1").partition(b"-----BEGIN CERT")[1:]
+    (tmp_path / "locked.pem").write_bytes(key + b"".join(certificate))
+    for name, words in (
+        ("pipe.pem", "is a named pipe; a regular file is needed"),
+        ("none.pem", "is not there"),
+        ("text.pem", "expected a PEM file with a certificate and its key"),
+        ("locked.pem", "its key asks for a password; expected a PEM file"),
+    ):
+        with pytest.raises(UsageError, match=rf"--tls .*{name}:? .*{words}"):
+            load_context(tmp_path / name)

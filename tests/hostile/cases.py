@@ -305,7 +305,7 @@ MADE_TO_HURT: dict[tuple[str, str], bytes] = {
     + b"a\0"
     + struct.pack("<Q", 1 << 60),
     ("poses, OpenTrackIO", "200,000 deep"): b'{"transforms":' * 200_000,
-    ("poses, OpenTrackIO", "an angle of 5,000 digits"): b'{"transforms":[{"translation":{"x":' + b"9" * 5000 + b"}}]}\n",
+    ("poses, OpenTrackIO", "an angle of 5,000 digits"): b'{"transforms":[{"translation":{"x":' + b"9" * 5000 + b"}}]}",
     **{
         ("poses, USD", what): b"#usda 1.0\n" + text
         for what, text in {
@@ -321,7 +321,9 @@ MADE_TO_HURT: dict[tuple[str, str], bytes] = {
     ("farm's jobs, TOML", "arrays, 200,000 deep"): b"schema = " + b"[" * 200_000,
     ("farm's jobs, TOML", "a pattern of all files"): b'schema = 1\n[[clip]]\nscene = "desk"\npath = "/proc/*/fd/*"\n',
     ("farm's jobs, TOML", "clips that are no tables"): b"schema = 1\nclip = [1, 2]\n",
-    ("farm's jobs, TOML", "a frame of 5,000 digits"): b'schema = 1\n[[clip]]\nscene = "desk"\nframes = [0, ' + b"9" * 5000 + b"]",
+    ("farm's jobs, TOML", "a frame of 5,000 digits"): b'schema = 1\n[[clip]]\nscene = "desk"\nframes = [0, '
+    + b"9" * 5000
+    + b"]",
     ("farm's run, run.json", "200,000 deep"): b"[" * 200_000,
     ("farm's run, run.json", "jobs that are a list"): b'{"version": "1", "jobs": [1]}',
     ("farm's run, manifest", "200,000 deep"): b"[" * 200_000 + b"\n",

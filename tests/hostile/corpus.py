@@ -188,7 +188,8 @@ def _binary_poses(path: pathlib.Path) -> None:
 
 
 def _jobs(path: pathlib.Path) -> None:
-    path.write_text('schema = 1\n[run]\nquality = "low"\nsegment_frames = 20\n[[clip]]\nscene = "desk"\nframes = [0, 30]\n')
+    clip = '[[clip]]\nscene = "desk"\nframes = [0, 30]\n'
+    path.write_text(f'schema = 1\n[run]\nquality = "low"\nsegment_frames = 20\n{clip}')
 
 
 def _status(path: pathlib.Path) -> object:
