@@ -142,7 +142,9 @@ def parse_line(line: bytes) -> dict[str, Any]:
         raise ValueError("nested too deeply") from error
     if not isinstance(told, dict) or not isinstance(told.get("job"), str) or "/" not in told["job"]:
         raise ValueError("no line of a job")
-    if told.get("state") == "failed" and not isinstance(told.get("reason"), str):
+    if told.get("state") not in ("done", "failed", "try", "again"):
+        raise ValueError(f"state is {told.get('state')!r}")
+    if told["state"] == "failed" and not isinstance(told.get("reason"), str):
         raise ValueError("no reason")
     for name in ("frames", "bytes", "length", "seconds"):
         if not isinstance(told.get(name), int | float | None) or not math.isfinite(told.get(name) or 0):
