@@ -116,7 +116,7 @@ def test_usd_that_says_time_codes_alone(tmp_path, rate):
     pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
     samples = "".join(f"{code}: ({code}, 0, 0), " for code in range(1, 9))
     (tmp_path / "a.usda").write_text(
-        f'#usda 1.0\n(\n  startTimeCode = 1\n  endTimeCode = 8\n  timeCodesPerSecond = {rate}\n  metersPerUnit = 1\n'
+        f"#usda 1.0\n(\n  startTimeCode = 1\n  endTimeCode = 8\n  timeCodesPerSecond = {rate}\n  metersPerUnit = 1\n"
         '  upAxis = "Z"\n)\n'
         f'def Camera "c" {{\n  double3 xformOp:translate.timeSamples = {{ {samples} }}\n'
         '  uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'

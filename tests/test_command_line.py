@@ -80,7 +80,9 @@ PRINTS = "import sys; from warp_ar.live import main; sys.exit(main(['--list']))"
 @pytest.mark.skipif(sys.platform != "linux", reason="pipes and /dev/full as on Linux")
 def test_output_that_nobody_reads_or_that_does_not_fit_is_no_traceback():
     with open("/dev/full", "wb") as full:
-        done = subprocess.run([sys.executable, "-c", PRINTS], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+        done = subprocess.run(
+            [sys.executable, "-c", PRINTS], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60
+        )
     assert done.returncode == 1
     assert done.stderr == "warp_ar: what this command prints cannot be written: No space left on device\n"
     reader, writer = os.pipe()
@@ -95,10 +97,7 @@ def test_output_that_nobody_reads_or_that_does_not_fit_is_no_traceback():
 
 
 def test_letters_that_a_terminal_does_not_know_are_numbers():
-    script = (
-        "from warp_ar.command_line import run_command\n"
-        "run_command(lambda: print('\\u2026\\u4e2d') or 0)\n"
-    )
+    script = "from warp_ar.command_line import run_command\nrun_command(lambda: print('\\u2026\\u4e2d') or 0)\n"
     plain = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, "-c", script], env=plain, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "\\u2026\\u4e2d\n", "")
