@@ -85,4 +85,4 @@ def make_certificate(host: str) -> bytes:
     private = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    return private + certificate.public_bytes(serialization.Encoding.PEM)
+    return bytes(private + certificate.public_bytes(serialization.Encoding.PEM))
