@@ -48,8 +48,8 @@ class Parser(argparse.ArgumentParser):
         """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number."""
         given = list(sys.argv[1:] if args is None else args)
         for place, word in enumerate(given):
-            if word == "" or re.fullmatch(r"--[a-z0-9-]+=", word):
-                before = given[place - 1] if place and given[place - 1].startswith("-") else "an argument"
+            if word == "" or (word is not None and re.fullmatch(r"--[a-z0-9-]+=", word)):
+                before = given[place - 1] if place and str(given[place - 1]).startswith("-") else "an argument"
                 raise UsageError(f"{word.rstrip('=') or before} is empty; give it a value, or leave it out")
         found, rest = super().parse_known_args(given, namespace)
         for action in self._actions:
