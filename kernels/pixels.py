@@ -5,6 +5,9 @@ beside the codes: where there is one, it is read in their place. The array is em
 threads of a launch find alike, so that one kernel serves both.
 
 A dark desk of radiance 0.0007 has the sRGB code 2.3: read as code 2 it is 0.00061, 13 % too dark.
+
+Where codes themselves are asked for (a mean of codes is not swayed by a few highlights), ``cut_luma`` gives what the
+8-bit luma of a pixel lacks of that of its linear radiance.
 """
 
 from __future__ import annotations
@@ -15,6 +18,9 @@ from warp_ar.kernels.color import decode
 from warp_ar.kernels.structs import Picture
 
 wp.set_module_options({"enable_backward": False})
+
+MOST_CUT = wp.constant(wp.float32(2.0))
+"""Codes that ``cut_luma`` gives at most: rounding of channels and luma is 1, converters differ by 1 more."""
 
 mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 
@@ -37,6 +43,44 @@ def pixel_radiance(
 def shown_radiance(picture: Picture, row: wp.int32, column: wp.int32) -> wp.vec3:
     """Radiance of a pixel of a picture."""
     return pixel_radiance(picture.frame, picture.decode_table, picture.linear, row, column)
+
+
+@wp.func
+def between_codes(table: wp.array[wp.vec3], value: wp.float32, code: wp.uint8, channel: wp.int32) -> wp.float32:
+    """How far a linear value lies from its 8-bit code, in codes; exactly 0 where it is that code's value."""
+    here = wp.int32(code)
+    beside = wp.where(value > table[here][channel], wp.min(here + 1, 255), wp.max(here - 1, 0))
+    step = wp.abs(table[beside][channel] - table[here][channel])
+    if not step > 0.0:
+        return wp.float32(0.0)  # the end of the range, or a plateau of a measured response
+    return (value - table[here][channel]) / step
+
+
+@wp.func
+def cut_luma(
+    frame: wp.array2d[wp.vec3ub],
+    table: wp.array[wp.vec3],
+    linear: wp.array2d[wp.vec3],
+    row: wp.int32,
+    column: wp.int32,
+) -> wp.float32:
+    """What the 8-bit luma (``summed_area.intensity``) of a pixel lacks of its linear picture's, in codes.
+
+    Exactly 0 without a linear picture, and where that is what the codes say. Light above 1 counts as 1.
+    """
+    if linear.shape[0] == 0:
+        return wp.float32(0.0)
+    code = frame[row, column]
+    value = linear[row, column]
+    red = between_codes(table, value[0], code[0], 0)
+    green = between_codes(table, value[1], code[1], 1)
+    blue = between_codes(table, value[2], code[2], 2)
+    if red == 0.0 and green == 0.0 and blue == 0.0:
+        return wp.float32(0.0)
+    weighted = 54 * wp.int32(code[0]) + 183 * wp.int32(code[1]) + 19 * wp.int32(code[2])
+    rounded = (weighted + 128) >> 8
+    exact = wp.float32(weighted - 256 * rounded) + 54.0 * red + 183.0 * green + 19.0 * blue
+    return wp.clamp(exact / 256.0, -MOST_CUT, MOST_CUT)
 
 
 @wp.func

@@ -35,13 +35,14 @@ from typing import Literal
 import warp as wp
 
 from warp_ar.kernels.cells import look_up_cells
-from warp_ar.kernels.color import decode, luminance
+from warp_ar.kernels.color import luminance
 from warp_ar.kernels.emitters import add_emitters
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
+from warp_ar.kernels.pixels import cut_luma, shown_radiance
 from warp_ar.kernels.shapes import surface_key
 from warp_ar.kernels.structs import Emitter, Hit, KeyLight, Picture, Probe, RayScene
-from warp_ar.kernels.summed_area import box_mean, intensity
+from warp_ar.kernels.summed_area import fine_mean, intensity
 from warp_ar.kernels.trace import TraceConfig
 from warp_ar.kernels.visibility import check_edge_samples
 
@@ -201,10 +202,15 @@ def turned_relief(m: wp.float32, alpha: wp.float32, directionality: wp.float32) 
 
 @wp.func
 def surrounding_luminance(
-    table: wp.array2d[wp.uint32], decode_table: wp.array[wp.vec3], row: wp.int32, col: wp.int32, size: wp.int32
+    table: wp.array2d[wp.uint32],
+    cut_table: wp.array2d[wp.uint32],
+    decode_table: wp.array[wp.vec3],
+    row: wp.int32,
+    col: wp.int32,
+    size: wp.int32,
 ) -> wp.float32:
     """Linear luminance of the mean code around a pixel; never 0. A mean of codes is not swayed by a few highlights."""
-    code = box_mean(table, row, col, size)
+    code = fine_mean(table, cut_table, row, col, size)
     low = wp.min(wp.int32(code), 254)
     fraction = code - wp.float32(low)
     linear = (1.0 - fraction) * luminance(decode_table[low]) + fraction * luminance(decode_table[low + 1])
@@ -229,6 +235,7 @@ class Receiver:
 
     picture: Picture
     table: wp.array2d[wp.uint32]  # the frame's summed-area table
+    cut_table: wp.array2d[wp.uint32]  # that of what 8 bits cut off; empty for frames of 8 bits
     box: wp.int32  # side of a pixel's surroundings
     probes: wp.array[Probe]
     key_lights: wp.array[KeyLight]
@@ -260,10 +267,9 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         matter = Matter()
         matter.kd = wp.vec3(DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE, DEFAULT_REFLECTANCE)
         matter.m = 1.0
-        coded = decode(receiver.picture.decode_table, receiver.picture.frame[row, col])
-        radiance = coded
-        if receiver.picture.linear.shape[0] > 0:
-            radiance = wp.max(receiver.picture.linear[row, col], wp.vec3(0.0, 0.0, 0.0))
+        radiance = wp.max(shown_radiance(receiver.picture, row, col), wp.vec3(0.0, 0.0, 0.0))
+        # Light above white counts as white where it is compared with codes.
+        coded = wp.min(radiance, receiver.picture.decode_table[255])
         is_mirrored = mirror[0] > 0.0
         if is_mirrored:
             coded = wp.cw_div(coded, mirror)
@@ -272,14 +278,18 @@ def make_find_matter(config: RelightConfig) -> wp.Function:
         matter.directionality = receiver.key_lights[0].directionality
         if wp.static(reading is not None):
             if wp.static(reading is not None and reading.values == "video"):
-                matter.m = wp.float32(intensity(receiver.picture.frame[row, col])) / 255.0
+                seen = receiver.picture
+                lacking = cut_luma(seen.frame, seen.decode_table, seen.linear, row, col)
+                matter.m = wp.clamp((wp.float32(intensity(seen.frame[row, col])) + lacking) / 255.0, 0.0, 1.0)
             else:
                 matter.m = luminance(coded)
         else:
             around = luminance(radiance)
             if not is_mirrored:
-                around = surrounding_luminance(receiver.table, receiver.picture.decode_table, row, col, receiver.box)
-                matter.m = luminance(coded) / around  # like with like: what is around is told by codes
+                around = surrounding_luminance(
+                    receiver.table, receiver.cut_table, receiver.picture.decode_table, row, col, receiver.box
+                )
+                matter.m = luminance(coded) / around  # like with like: what is around is a mean of codes
             if wp.static(method == "relief"):
                 hue = radiance + wp.vec3(_HUE_FLOOR, _HUE_FLOOR, _HUE_FLOOR)
                 matter.kd = wp.min(around / luminance(hue) * hue, wp.vec3(1.0, 1.0, 1.0))
@@ -349,6 +359,7 @@ def make_receiver(
     picture: Picture,
     *,
     table: wp.array | None = None,
+    cut_table: wp.array | None = None,
     probes: wp.array | None = None,
     key_lights: wp.array | None = None,
     irradiance: wp.array | None = None,
@@ -361,6 +372,7 @@ def make_receiver(
         config: Method and forms of light.
         picture: (H, W) the camera's.
         table: (H, W) uint32, the frame's summed-area table; needed by ``relief`` and ``reflectance``.
+        cut_table: (H, W) uint32, that of what 8 bits cut off; None for frames of 8 bits.
         probes: (p,) Probe; needed if ``config.probes``.
         key_lights: (k,) KeyLight, brightest first; needed by all methods but ``flat``.
         irradiance: Irradiance of the environment, nine coefficients or a latlong map as ``config.irradiance`` says;
@@ -371,8 +383,8 @@ def make_receiver(
     receiver = Receiver()
     receiver.picture, receiver.box = picture, surroundings_size(picture.rays.shape[0])
     form = f"irradiance_{config.irradiance}"
-    optional = {"table": table, "probes": probes, "key_lights": key_lights, form: irradiance, "emitters": emitters}
-    for name, value in {**optional, "cells": cells}.items():
+    optional = {"table": table, "cut_table": cut_table, "probes": probes, "key_lights": key_lights, form: irradiance}
+    for name, value in {**optional, "emitters": emitters, "cells": cells}.items():
         if value is not None:
             setattr(receiver, name, value)
     return receiver

@@ -20,9 +20,10 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.camera import project
-from warp_ar.kernels.color import decode, is_clipped
+from warp_ar.kernels.color import is_clipped
 from warp_ar.kernels.latlong import direction_from_latlong
 from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.pixels import clip_levels, is_at_clipping, pixel_radiance
 from warp_ar.kernels.structs import FrameParams, Probe
 from warp_ar.kernels.unwrap import mix
 
@@ -103,6 +104,7 @@ def copy_ball_kernel(
     probes: wp.array[Probe],
     frame: wp.array2d[wp.vec3ub],
     decode_table: wp.array[wp.vec3],
+    linear: wp.array2d[wp.vec3],
     size: wp.int32,
     # Out:
     sphere_map_out: wp.array[wp.vec3],
@@ -122,8 +124,10 @@ def copy_ball_kernel(
         i1 = wp.min(i + 1, frame.shape[0] - 1)
         j1 = wp.min(j + 1, frame.shape[1] - 1)
         fx = x - wp.float32(j)
-        top = mix(decode(decode_table, frame[i, j]), decode(decode_table, frame[i, j1]), fx)
-        bottom = mix(decode(decode_table, frame[i1, j]), decode(decode_table, frame[i1, j1]), fx)
+        left = pixel_radiance(frame, decode_table, linear, i, j)
+        top = mix(left, pixel_radiance(frame, decode_table, linear, i, j1), fx)
+        left = pixel_radiance(frame, decode_table, linear, i1, j)
+        bottom = mix(left, pixel_radiance(frame, decode_table, linear, i1, j1), fx)
         value = mix(top, bottom, y - wp.float32(i))
     sphere_map_out[row * size + column] = value
 
@@ -192,6 +196,8 @@ def trust_ball_kernel(
     params: wp.array[FrameParams],
     probes: wp.array[Probe],
     frame: wp.array2d[wp.vec3ub],
+    linear: wp.array2d[wp.vec3],
+    linear_clip: wp.array[wp.vec3],
     # Out:
     confidence_out: wp.array2d[wp.float32],
     clipped_out: wp.array2d[wp.vec3],
@@ -210,7 +216,12 @@ def trust_ball_kernel(
         at = sphere_coordinates(params[0].world_from_camera, light)
         x = wp.clamp(disc.center[0] + at[0] * disc.radius[0], 0.0, wp.float32(frame.shape[1] - 1))
         y = wp.clamp(disc.center[1] + at[1] * disc.radius[1], 0.0, wp.float32(frame.shape[0] - 1))
-        clipped = is_clipped(frame[wp.int32(wp.round(y)), wp.int32(wp.round(x))])
+        i = wp.int32(wp.round(y))
+        j = wp.int32(wp.round(x))
+        if linear.shape[0] > 0:
+            clipped = is_at_clipping(linear[i, j], clip_levels(linear_clip))
+        else:
+            clipped = is_clipped(frame[i, j])
     confidence_out[row, column] = confidence
     clipped_out[row, column] = clipped
 
@@ -222,6 +233,7 @@ def copy_ball(
     decode_table: wp.array,
     sphere_map_out: wp.array,
     *,
+    linear: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Copy the first ball's square of the frame into level 0 of a sphere map.
@@ -233,9 +245,10 @@ def copy_ball(
         decode_table: (256,) vec3, linear value of each code.
         sphere_map_out: (map_texels(),) vec3; ``SIZE`` squared texels are written. Zero where the ball is not before
             the camera.
+        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
         rows: Band of texel rows; None means all.
     """
-    inputs = [params, probes, frame, decode_table, SIZE]
+    inputs = [params, probes, frame, decode_table, linear, SIZE]
     launch_rows(copy_ball_kernel, (SIZE, SIZE), inputs, [sphere_map_out], rows=rows, device=frame.device)
 
 
@@ -286,6 +299,8 @@ def trust_ball(
     confidence_out: wp.array,
     clipped_out: wp.array,
     *,
+    linear: wp.array | None = None,
+    linear_clip: wp.array | None = None,
     rows: Rows | None = None,
 ) -> None:
     """Write how far a sphere map is trusted, and where its ball clips.
@@ -296,9 +311,9 @@ def trust_ball(
         frame: (H, W) vec3ub, RGB codes.
         confidence_out: (h, 2 h) float32: 1, or 0 where the ball is not before the camera.
         clipped_out: (h, 2 h) vec3: 1 in the channels that clip in the nearest pixel.
+        linear: (H, W) vec3, radiance of a frame of more than 8 bits, read in the place of its codes.
+        linear_clip: (2,) vec3, where that clips: alone, and beside another channel that does; needed with ``linear``.
         rows: Band of rows; None means all.
     """
-    outputs = [confidence_out, clipped_out]
-    launch_rows(
-        trust_ball_kernel, confidence_out.shape, [params, probes, frame], outputs, rows=rows, device=frame.device
-    )
+    inputs, outputs = [params, probes, frame, linear, linear_clip], [confidence_out, clipped_out]
+    launch_rows(trust_ball_kernel, confidence_out.shape, inputs, outputs, rows=rows, device=frame.device)

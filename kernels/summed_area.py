@@ -11,6 +11,10 @@ row at a time in a processor's vectors, and adds the row above; the slabs then a
 There are as many slabs as threads: one thread reads the frame once and writes the table once. On CUDA that would be a
 few threads, each waiting for load after load: there it is *by strips* (``kernels/summed_area_strips.py``).
 
+A frame of more than 8 bits has a second table, in the same way, of what the 8 bits of its intensity cut off
+(``write_cut``), as bytes of 1/64 code around 128: a mean is then the sum of both tables' means, exact to 1/128 code.
+Where nothing was cut off every byte is 128, and the mean is the first table's to the bit.
+
 References:
     [Cro84] Crow, "Summed-area tables for texture mapping", SIGGRAPH 1984.
 """
@@ -20,8 +24,14 @@ from __future__ import annotations
 import warp as wp
 
 from warp_ar.kernels.launch import Rows, launch, launch_rows
+from warp_ar.kernels.pixels import cut_luma
 
 wp.set_module_options({"enable_backward": False})
+
+NOT_CUT = wp.constant(wp.float32(128.0))
+"""Byte of a pixel off which nothing was cut."""
+CUT_STEPS = wp.constant(wp.float32(64.0))
+"""Steps of such bytes in a code: two codes at most to either side."""
 
 LEAST_SLAB = 16
 """Rows of a slab: fewer take longer to be joined than to be summed."""
@@ -71,6 +81,51 @@ def box_mean(table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: w
     c1 = wp.min(col - size / 2 + size, table.shape[1])
     # A count in float32 is exact up to 2^24, which is the largest box that the table itself allows.
     return wp.float32(box_sum(table, r0, r1, c0, c1)) / wp.float32(wp.max((r1 - r0) * (c1 - c0), 1))
+
+
+@wp.func
+def fine_mean(
+    table: wp.array2d[wp.uint32], cut_table: wp.array2d[wp.uint32], row: wp.int32, col: wp.int32, size: wp.int32
+) -> wp.float32:
+    """``box_mean`` with what 8 bits cut off; ``cut_table`` is empty where nothing was."""
+    mean = box_mean(table, row, col, size)
+    if cut_table.shape[0] > 0:
+        mean += (box_mean(cut_table, row, col, size) - NOT_CUT) / CUT_STEPS
+    return wp.clamp(mean, 0.0, 255.0)
+
+
+@wp.kernel(enable_backward=False)
+def write_cut_kernel(
+    row_start: wp.int32,
+    # In:
+    frame: wp.array2d[wp.vec3ub],
+    decode_table: wp.array[wp.vec3],
+    linear: wp.array2d[wp.vec3],
+    # Out:
+    cut_out: wp.array2d[wp.vec3ub],
+):
+    """One pixel, as a grey whose ``intensity`` is its code."""
+    band_row, column = wp.tid()
+    row = row_start + band_row
+    steps = wp.round(CUT_STEPS * cut_luma(frame, decode_table, linear, row, column)) + NOT_CUT
+    code = wp.uint8(wp.clamp(steps, 0.0, 255.0))
+    cut_out[row, column] = wp.vec3ub(code, code, code)
+
+
+def write_cut(
+    frame: wp.array, decode_table: wp.array, linear: wp.array, cut_out: wp.array, *, rows: Rows | None = None
+) -> None:
+    """Write what 8 bits cut off a frame's intensity as a frame of its own, to be summed like one.
+
+    Args:
+        frame: (H, W) vec3ub, RGB codes.
+        decode_table: (256,) vec3, linear value of each code.
+        linear: (H, W) vec3, linear radiance.
+        cut_out: (H, W) vec3ub, greys: ``NOT_CUT`` and ``CUT_STEPS`` for each code that is lacking.
+        rows: Band of rows; None means all.
+    """
+    inputs = [frame, decode_table, linear]
+    launch_rows(write_cut_kernel, frame.shape, inputs, [cut_out], rows=rows, device=frame.device)
 
 
 # Luma fits 16 bits before the shift, and so do sums of sixteen; sums along a row need 32. Loads and stores of sixteen

@@ -1,27 +1,45 @@
-"""Blender as a client: what it makes of the light of a USD. WARP_AR_BLENDER names an interpreter with ``bpy``."""
+"""Blender as a client: what it makes of our USD and OpenEXR, and of Alembic.
+
+WARP_AR_BLENDER names an interpreter with ``bpy``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 import pathlib
+import re
 import subprocess
 
+import cv2
 import numpy as np
 import pytest
 
+from tests.layer_rig import make_scene
 from warp_ar.light.captured import latlong_directions, texel_solid_angles
 from warp_ar.output.environment_file import write_environment
+from warp_ar.output.layer_file import LayerFrame, LayerSink
 from warp_ar.output.shot import Shot
 from warp_ar.output.usd_file import write_usd
-from warp_ar.scene import Pose, load_scene
+from warp_ar.scene import Camera, Pose, load_scene
+from warp_ar.scene.pose_file import load_poses
 
 BLENDER = os.environ.get("WARP_AR_BLENDER", "")
 LIGHT = 0.02  # relative: noise of 512 paths a pixel is 1 % and averaged, the ball's facets are 0.1 %
 SCALE = 2.2  # of the camera: metres across
 
 
-@pytest.mark.skipif(not BLENDER, reason="needs Blender: name an interpreter with bpy in WARP_AR_BLENDER")
+PIXELS = 0.5  # of a picture that Blender renders: a sphere of three pixels, by its light's middle
+POSE = 2e-6  # Alembic and USD keep placements of Blender's float32
+FORMATS = pathlib.Path(__file__).parents[1] / "docs" / "formats.md"
+pytestmark = pytest.mark.skipif(not BLENDER, reason="needs Blender: name an interpreter with bpy in WARP_AR_BLENDER")
+
+
+def run(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_grey_ball_in_a_dome_light(tmp_path: pathlib.Path) -> None:
     directions = latlong_directions(64)
     radiance = np.full((64, 128, 3), 0.15)
@@ -34,8 +52,7 @@ def test_a_grey_ball_in_a_dome_light(tmp_path: pathlib.Path) -> None:
     write_usd(tmp_path / "shot.usda", shot)
     script = pathlib.Path(__file__).with_name("blender_ball.py")
     command = [BLENDER, str(script), str(tmp_path / "shot.usda"), str(tmp_path / "ball")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
-    assert done.returncode == 0, done.stderr
+    run(command)
     with np.load(tmp_path / "ball.npz") as said:
         seen, albedo = said["pixels"].astype(float), float(said["albedo"])
 
@@ -54,3 +71,57 @@ def test_a_grey_ball_in_a_dome_light(tmp_path: pathlib.Path) -> None:
     for above in (z[inside] > 0.0, z[inside] <= 0.0):
         for right in (y[inside] > 0.0, y[inside] <= 0.0):
             np.testing.assert_allclose(ratio[above & right].mean(0), 1.0, atol=LIGHT)
+
+
+def test_corners_of_proxies_are_rendered_where_the_plate_shows_them(tmp_path: pathlib.Path) -> None:
+    camera = Camera(320, 240, 350.0, 350.0, 146.0, 131.0)
+    scene = make_scene(camera=camera, lights=())
+    turn = cv2.Rodrigues(np.array([2.4, 0.3, 0.2]))[0]
+    pose = Pose(turn, np.array([0.02, -0.03, 0.5]))
+    write_usd(tmp_path / "shot.usda", Shot(scene, 24.0, (pose,)))
+    box = next(proxy for proxy in scene.proxies if proxy.shape == "box")
+    half = 0.5 * np.array(box.size)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + np.array(box.at)
+    angles, _ = cv2.Rodrigues(pose.rotation)
+    expected = cv2.projectPoints(corners, angles, pose.translation, camera.matrix(), None)[0][:, 0]
+    size = np.array([camera.width, camera.height])
+    assert ((expected > 5) & (expected < size - 5)).all()
+    np.savez(tmp_path / "corners.npz", points=corners, size=size, expected=expected)
+    plate = np.full((24, 32, 3), 0.25, np.float32)
+    with LayerSink(tmp_path / "layers") as sink:
+        sink.write(LayerFrame({"plate": plate}, np.zeros((24, 32, 3), np.uint8), ()))
+    next((tmp_path / "layers").iterdir()).rename(tmp_path / "frame.exr")
+    run([BLENDER, str(pathlib.Path(__file__).with_name("blender_shot.py")), str(tmp_path)])
+    with np.load(tmp_path / "seen.npz") as seen:
+        off = np.linalg.norm(seen["pixels"] - expected, axis=1)
+        print("corners off by", off.round(3), "pixels; layers are", seen["kind"], seen["size"])
+        assert off.max() < PIXELS
+        assert tuple(seen["size"]) == (32, 24) or str(seen["kind"]) == "MULTILAYER"
+
+
+def test_a_camera_in_alembic_becomes_usd_by_the_lines_of_the_docs(tmp_path: pathlib.Path) -> None:
+    rows = []
+    write = [
+        "import bpy, sys",
+        "bpy.ops.wm.read_factory_settings(use_empty=True)",
+        "camera = bpy.data.objects.new('c', bpy.data.cameras.new('c'))",
+        "bpy.context.scene.collection.objects.link(camera)",
+        "bpy.context.scene.render.fps = 25",
+    ]
+    for k in range(1, 5):
+        place, turn = (0.1 * k, 0.2, 0.5 + 0.01 * k), (0.3 + 0.02 * k, 0.1, 0.2 * k)
+        rows.append((place, turn))
+        write += [f"camera.location, camera.rotation_euler = {place}, {turn}"]
+        write += [f"camera.keyframe_insert({name!r}, frame={k})" for name in ("location", "rotation_euler")]
+    write.append("bpy.ops.wm.alembic_export(filepath=sys.argv[1], start=1, end=4)")
+    run([BLENDER, "-c", "\n".join(write), str(tmp_path / "a.abc")])
+    lines = re.search(r"```python\n(# usd_of_alembic\.py.*?)```", FORMATS.read_text(), re.DOTALL)
+    assert lines is not None
+    run([BLENDER, "-c", lines[1], str(tmp_path / "a.abc"), str(tmp_path / "a.usda"), "25"])
+    poses = load_poses(tmp_path / "a.usda")
+    assert len(poses) == len(rows)
+    for (rotation, translation), (place, (x, y, z)) in zip(poses, rows, strict=True):
+        about = [cv2.Rodrigues(np.array(axis))[0] for axis in ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z))]
+        axes = about[2] @ about[1] @ about[0] @ np.diag([1.0, -1.0, -1.0])
+        np.testing.assert_allclose(np.reshape(rotation, (3, 3)), axes.T, atol=POSE)
+        np.testing.assert_allclose(translation, -axes.T @ np.array(place), atol=POSE)

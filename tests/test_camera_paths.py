@@ -110,6 +110,20 @@ def test_usd_of_another_program(tmp_path):
     assert_poses(load_poses(tmp_path / "maya.usda"), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("rate", [24, 25, 30, 60])
+def test_usd_that_says_time_codes_alone(tmp_path, rate):
+    """As Blender writes it: a time code for each frame, and no rate of frames, which USD then takes for 24."""
+    pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
+    samples = "".join(f"{code}: ({code}, 0, 0), " for code in range(1, 9))
+    (tmp_path / "a.usda").write_text(
+        f"#usda 1.0\n(\n  startTimeCode = 1\n  endTimeCode = 8\n  timeCodesPerSecond = {rate}\n  metersPerUnit = 1\n"
+        '  upAxis = "Z"\n)\n'
+        f'def Camera "c" {{\n  double3 xformOp:translate.timeSamples = {{ {samples} }}\n'
+        '  uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+    )
+    assert [round(-translation[0], 6) for _, translation in load_poses(tmp_path / "a.usda")] == list(range(1, 9))
+
+
 def test_colmap_binary_says_what_its_text_does(tmp_path):
     text = "1 0.5 0.5 -0.5 0.5 0.1 0.2 0.3 1 b.png\n\n2 1 0 0 0 0 0 1 1 a.png\n\n"
     (tmp_path / "images.txt").write_text(text)
@@ -133,15 +147,18 @@ def test_colmap_binary_says_what_its_text_does(tmp_path):
         ("a.jsonl", '{"transforms": [{"translation": {"x": 1, "y": 2}}]}', r"expected translation with x, y, z"),
         ("a.json", '[{"transforms": [{"translation": {"x": 1, "y": 2, "z": 3}}]}]', r"expected rotation with pan"),
         ("a.jsonl", "", r"holds no pose"),
+        ("a.abc", "Ogawa", r"a\.abc: Alembic is not read; turn it into USD"),
         ("a.bin", "123", r"cut off after 3 bytes"),
         ("a.usda", "#usda 1.0\n", r"expected one camera, found 0"),
+        ("a.usda", "#usda 1.0\n( subLayers = [@/dev/zero@] )\n", r"expected one camera, found 0"),
         ("a.usda", "no USD", r"no USD file that can be read"),
         ("a.usda", '#usda 1.0\ndef Camera "a" {}\ndef Camera "b" {}\n', r"found 2 \(/a, /b\)"),
     ],
 )
-def test_files_that_are_none_are_named(tmp_path, name, text, words):
+def test_files_that_are_none_are_named(tmp_path, capfd, name, text, words):
     if name.endswith(".usda"):
         pytest.importorskip("pxr.Usd", reason="needs usd-core, of the extra exchange")
     (tmp_path / name).write_text(text)
     with pytest.raises(SceneError, match=words):
         load_poses(tmp_path / name)
+    assert capfd.readouterr().err == "", "what USD would print is no message of ours"

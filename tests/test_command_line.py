@@ -1,13 +1,16 @@
 """What commands share: the collector of garbage while things are loaded, and at the end."""
 
 import gc
+import os
+import pathlib
 import subprocess
 import sys
 import weakref
 
 import pytest
 
-from warp_ar.command_line import loading
+from warp_ar.command_line import Parser, loading
+from warp_ar.errors import UsageError
 
 
 class Node:
@@ -47,3 +50,54 @@ def test_leaving_gives_the_code_and_runs_what_was_registered():
     script = "import atexit; from warp_ar.command_line import leave; atexit.register(print, 'end'); leave(3)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (3, "end\n", "")
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["scene", "--output", ""], "--output is empty; give it a value, or leave it out"),
+        (["scene", "--output="], "--output is empty; give it a value, or leave it out"),
+        ([""], "an argument is empty; give it a value, or leave it out"),
+        (["scene", "--frames", "9" * 400], "--frames: a number of 400 digits; expected 2,147,483,647 at most"),
+        (["scene", "--frames=-3000000000"], "--frames: a number of 10 digits; expected 2,147,483,647 at most"),
+    ],
+)
+def test_arguments_that_would_mean_something_else_are_refused(words, line):
+    """A path without a name would be the folder that one stands in: the frames of a shell's unset variable."""
+    parser = Parser()
+    parser.add_argument("scene")
+    parser.add_argument("--output", type=pathlib.Path)
+    parser.add_argument("--frames", type=int)
+    with pytest.raises(UsageError) as told:
+        parser.parse_args(words)
+    assert str(told.value) == line
+    assert parser.parse_args(["scene", "--frames", "2147483647", "--output=a"]).frames == 2**31 - 1
+
+
+PRINTS = "import sys; from warp_ar.live import main; sys.exit(main(['--list']))"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="pipes and /dev/full as on Linux")
+def test_output_that_nobody_reads_or_that_does_not_fit_is_no_traceback():
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", PRINTS], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+    assert done.returncode == 1
+    assert done.stderr == "warp_ar: what this command prints cannot be written: No space left on device\n"
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", PRINTS], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60
+        )
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_letters_that_a_terminal_does_not_know_are_numbers():
+    script = "from warp_ar.command_line import run_command\nrun_command(lambda: print('\\u2026\\u4e2d') or 0)\n"
+    plain = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0", "LC_ALL": "C"}
+    done = subprocess.run([sys.executable, "-c", script], env=plain, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "\\u2026\\u4e2d\n", "")

@@ -224,16 +224,18 @@ def first() -> Any:
 OUTPUTS = ("image", "radiance", "environment")
 
 
-def lit(frame: Any, pose: Any = None, **more: Any) -> Any:
+def lit(frame: Any, pose: Any = None, quality: str = "medium", **more: Any) -> Any:
     with warp_ar.Pipeline(
-        "desk", device="cpu", quality="medium", size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
+        "desk", device="cpu", quality=quality, size=(160, 120), outputs=OUTPUTS, estimates="synchronous", **more
     ) as pipeline:
         result = pipeline(frame, pose=pose)
         return result.image, result.radiance, result.environment, result.layers
 
 
-def test_8_bits_through_a_deep_pipeline_are_the_same_to_the_bit(first: np.ndarray) -> None:
-    plain, deep, wide = lit(first), lit(first, linear=True), lit(first.astype(np.uint16) * 257, linear=True)
+@pytest.mark.parametrize("quality", ["paper", "medium"])
+def test_8_bits_through_a_deep_pipeline_are_the_same_to_the_bit(first: np.ndarray, quality: str) -> None:
+    plain, deep = lit(first, quality=quality), lit(first, quality=quality, linear=True)
+    wide = lit(first.astype(np.uint16) * 257, quality=quality, linear=True)
     for a, b, c in zip(plain[:3], deep[:3], wide[:3], strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
@@ -256,6 +258,18 @@ def test_light_above_white_lights_as_it_is(first: np.ndarray) -> None:
     untouched = (layers["objects"] == 0.0).all(-1) & ~laid.any(-1)
     assert untouched.sum() > 1000
     np.testing.assert_array_equal(picture[untouched], (5.0 * radiance)[untouched])
+
+
+@pytest.mark.parametrize("factor", [5.0, 1.0 / 128.0])
+def test_the_paper_s_sphere_map_holds_light_above_white_and_in_the_dark(first: np.ndarray, factor: float) -> None:
+    radiance = decode_codes("srgb", first.reshape(-1) / 255.0)[:, 0].reshape(first.shape).astype(np.float32)
+    with warp_ar.Pipeline("desk", device="cpu", size=(160, 120), outputs=("pose",)) as pipeline:
+        pose = pipeline(first).pose
+    light = np.float32(factor) * radiance
+    once, times = (lit(frame, pose, "paper", linear=True)[2] for frame in (radiance, light))
+    np.testing.assert_allclose(times, factor * once, rtol=1e-5, atol=1e-7)
+    codes = lit(srgb8(light), pose, "paper")[2]
+    assert np.abs(codes - factor * once).mean() > 0.02 * factor * once.mean(), "8 bits do not hold it"
 
 
 def test_a_desk_in_the_dark_is_lit_as_a_bright_one(first: np.ndarray) -> None:

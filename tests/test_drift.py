@@ -9,8 +9,9 @@ import warp as wp
 
 from tests.simulated_camera import decode_srgb
 from warp_ar import Pipeline
-from warp_ar.input.drift import CONTRASTS, ExposureDrift
+from warp_ar.input.drift import CONTRASTS, ExposureDrift, codes_around, still_points
 from warp_ar.input.marker_pattern import printed_cells
+from warp_ar.input.plate import Plate
 from warp_ar.kernels.change import scale_radiance
 from warp_ar.kernels.color import ENCODE_KEYS, camera_table, decode_table, encode_table
 from warp_ar.scene import Pose, Scene, loads_scene
@@ -38,6 +39,8 @@ size = [1.0, 0.7]
 POSE = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.8]))
 CONTRAST = 1.01 * CONTRASTS[1]
 """A step between the contrasts that are tried."""
+EXACT_GAIN = 2e-3
+"""The same by a linear picture: points around the same place of a table interpolated between codes."""
 GAIN = 0.02
 """Relative error of a gain: 8-bit codes of ink and table."""
 
@@ -78,6 +81,31 @@ def test_a_gain_is_told_per_channel(gain):
     drift = follow([encode(picture), encode(picture * gain)])
     assert drift.gain == pytest.approx(gain, rel=GAIN)
     assert drift.contrast == 0.0
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.5])
+def test_a_dark_desk_is_followed_by_its_linear_picture(gain):
+    """Paper of code 40 and a table of code 15 to 25: rounding of 8 bits is as large as what is asked."""
+    dark = 0.04 * linear_picture(loads_scene(SCENE))
+    pictures = [dark * scale for scale in np.linspace(1.0, gain, 8)]
+    scene = loads_scene(SCENE)
+    by_codes, by_light = ExposureDrift(scene, scene.camera), ExposureDrift(scene, scene.camera)
+    for index, picture in enumerate(pictures):
+        codes = encode(picture)
+        by_codes.observe(codes, POSE, 0.1 * index)
+        by_light.observe(codes, POSE, 0.1 * index, Plate(picture.astype(np.float32)))
+    off = [float(np.abs(drift.gain / gain - 1.0).max()) for drift in (by_light, by_codes)]
+    assert off[0] < EXACT_GAIN
+    assert off[1] > 4.0 * off[0]
+
+
+def test_codes_of_8_bits_are_read_alike_from_a_plate():
+    scene, picture = loads_scene(SCENE), encode(linear_picture(loads_scene(SCENE)))
+    points = still_points(scene)[0]
+    plain = codes_around(picture, scene.camera, POSE, points)
+    deep = codes_around(picture, scene.camera, POSE, points, Plate(picture.astype(np.uint16) * 257))
+    assert np.isfinite(plain).any()
+    np.testing.assert_array_equal(plain, deep)
 
 
 def test_a_still_camera_is_left_alone():

@@ -60,9 +60,35 @@ def test_a_line_that_was_cut_off_is_cut_away(tmp_path):
 
 
 def test_a_damaged_line_is_told_by_its_number(tmp_path):
-    (tmp_path / "manifest.jsonl").write_text('{"state": "done", "job": "a"}\nnonsense\n')
+    (tmp_path / "manifest.jsonl").write_text('{"state": "done", "job": "a/survey"}\nnonsense\n')
     with pytest.raises(RunError, match=r"manifest\.jsonl: line 2 is damaged"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[" * 200_000,
+        "[1]",
+        '{"state": "done", "job": ["a/b"]}',
+        '{"job": "a/survey"}',
+        '{"state": "done", "job": "survey"}',
+        '{"state": "done", "job": "a/survey", "frames": "many"}',
+        '{"state": "done", "job": "a/survey", "bytes": Infinity}',
+        '{"state": "failed", "job": "a/survey"}',
+    ],
+)
+def test_a_line_of_no_job_is_damaged(tmp_path, line):
+    (tmp_path / "manifest.jsonl").write_text(line + "\n")
+    with pytest.raises(RunError, match=r"manifest\.jsonl: line 1 is damaged \(.+\); remove the line and resume"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[" * 200_000, "[1]", '{"version": "1", "jobs": [1]}', '{"version": "1"}', "\xff"])
+def test_a_run_that_is_none_is_one_line(tmp_path, text):
+    (tmp_path / "run.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(RunError, match=r"run\.json.* (is damaged|cannot be read|levels of nesting)"):
+        load_run(tmp_path)
 
 
 def test_a_line_that_does_not_fit_the_disk_is_taken_back(tmp_path, monkeypatch):
@@ -144,8 +170,8 @@ def test_one_driver_at_a_time(tmp_path):
 
 
 def test_a_run_begins_in_a_folder_of_its_own(tmp_path):
-    begin_run(tmp_path / "run", {"schema": 1}, "version")
-    assert load_run(tmp_path / "run") == ({"schema": 1}, "version")
+    begin_run(tmp_path / "run", {"schema": 1, "clip": []}, "version")
+    assert load_run(tmp_path / "run") == ({"schema": 1, "clip": []}, "version")
     with pytest.raises(UsageError, match="holds a run already; go on with: farm resume"):
         begin_run(tmp_path / "run", {}, "version")
     (tmp_path / "other").mkdir()

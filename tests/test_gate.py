@@ -16,9 +16,10 @@ import aiohttp
 import pytest
 
 from tests.test_viewer import PATIENCE, Page, run, served
+from warp_ar.errors import UsageError
 from warp_ar.viewer.gate import MOST_PER_ADDRESS
 from warp_ar.viewer.server import own_headers
-from warp_ar.viewer.tls import make_context
+from warp_ar.viewer.tls import load_context, make_certificate, make_context
 
 SECRET = "5ec2e7"
 HEADER_SECONDS = 0.7
@@ -92,6 +93,22 @@ async def test_silence_and_half_a_header_are_cut() -> None:
         whole = f"GET /static/icon.svg HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode()
         assert await is_cut(port, whole + b"GET / HT")
         assert await is_cut(port, whole)
+
+
+@pytest.mark.parametrize("coding", [b"gzip", b"deflate", b"br"])
+def test_a_body_that_is_not_what_it_says_is_no_line_of_the_log(caplog: pytest.LogCaptureFixture, coding: bytes) -> None:
+    async def send() -> bytes:
+        async with served() as site:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port_of(site.url))
+            host = f"Host: 127.0.0.1:{port_of(site.url)}\r\nConnection: close\r\n".encode()
+            head = b"POST / HTTP/1.1\r\n" + host + b"Content-Encoding: " + coding + b"\r\nContent-Length: 90\r\n\r\n"
+            writer.write(head + b"no such thing" + bytes(77))
+            answer = await asyncio.wait_for(reader.read(), PATIENCE)
+            writer.close()
+            return answer
+
+    assert asyncio.run(send()).startswith(b"HTTP/1.")
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
 
 
 @run
@@ -251,3 +268,28 @@ def test_the_gate_ends_without_a_trace() -> None:
             client.close()
 
     test()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as on POSIX")
+def test_a_certificate_that_is_none_is_one_line(tmp_path):
+    """Nothing waits: not for a pipe, not for a password at the terminal."""
+    serialization = pytest.importorskip("cryptography.hazmat.primitives.serialization", reason="needs the extra tls")
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    os.mkfifo(tmp_path / "pipe.pem")
+    (tmp_path / "text.pem").write_text("no certificate")
+    key = ec.generate_private_key(ec.SECP256R1()).private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.BestAvailableEncryption(b"secret"),
+    )
+    certificate = make_certificate("127.0.0.1").partition(b"-----BEGIN CERT")[1:]
+    (tmp_path / "locked.pem").write_bytes(key + b"".join(certificate))
+    for name, words in (
+        ("pipe.pem", "is a named pipe; a regular file is needed"),
+        ("none.pem", "is not there"),
+        ("text.pem", "expected a PEM file with a certificate and its key"),
+        ("locked.pem", "its key asks for a password; expected a PEM file"),
+    ):
+        with pytest.raises(UsageError, match=rf"--tls .*{name}:? .*{words}"):
+            load_context(tmp_path / name)

@@ -24,6 +24,7 @@ EYE = np.array([0.02, -0.3, 0.35])
 MAP = (16, 32)
 # Running means of equal numbers are exact; scaling by pi rounds once.
 FURNACE = 1e-6
+CLIP = 2.5  # radiance from which on a linear picture of these tests clips
 
 
 def look_at(eye, target):
@@ -47,22 +48,24 @@ def camera(eye, rotation, distortion=(0.0,) * 8):
     return records(FrameParams, **place, distortion=distortion)
 
 
-def run(frame, eye=EYE, rotation=None, level=0, scale=1.0, distortion=(0.0,) * 8, shape=MAP, rows=(None,)):
+def run(frame, eye=EYE, rotation=None, level=0, scale=1.0, distortion=(0.0,) * 8, shape=MAP, rows=(None,), light=None):
     """Texture of all levels, the latlong map of one, confidence and clipping."""
     rotation = look_at(eye, CENTER) if rotation is None else rotation
     params, probes = camera(eye, rotation, distortion), records(Probe, center=CENTER, radius=RADIUS)
     frame = wp.array(frame, dtype=wp.vec3ub)
     decode = wp.array(color.decode_table("srgb"), dtype=wp.vec3)
+    linear = None if light is None else wp.array(light, dtype=wp.vec3)
+    clip = None if light is None else wp.array(np.full((2, 3), CLIP), dtype=wp.vec3)
     texture = wp.full(sphere_map.map_texels(), wp.vec3(9.0, 9.0, 9.0), dtype=wp.vec3)
     out, confidence = wp.zeros(shape[0] * shape[1], dtype=wp.vec3), wp.zeros(shape, dtype=wp.float32)
     clipped = wp.zeros(shape, dtype=wp.vec3)
     for band in rows:
         whole = None if band is None else (band[0] * sphere_map.SIZE // shape[0], band[1] * sphere_map.SIZE // shape[0])
-        sphere_map.copy_ball(params, probes, frame, decode, texture, rows=whole)
+        sphere_map.copy_ball(params, probes, frame, decode, texture, linear=linear, rows=whole)
     sphere_map.halve_levels(texture)
     for band in rows:
         sphere_map.look_up_level(params, texture, level, shape, out, scale=scale, rows=band)
-        sphere_map.trust_ball(params, probes, frame, confidence, clipped, rows=band)
+        sphere_map.trust_ball(params, probes, frame, confidence, clipped, linear=linear, linear_clip=clip, rows=band)
     return texture.numpy(), out.numpy().reshape(*shape, 3), confidence.numpy(), clipped.numpy()
 
 
@@ -88,6 +91,25 @@ def test_matches_twin(device, level):
     assert len(levels) == sphere_map.level_count()
     check_error("sphere_map", texture, np.concatenate([one.reshape(-1, 3) for one in levels]))
     check_error("sphere_map", found, reference.look_up(levels[level], directions(*MAP), rotation))
+
+
+def test_a_linear_picture_is_read_in_the_place_of_codes(device):
+    """Light above white is there as it is, what is darker than a code too; and clipping is the picture's own."""
+    light = np.random.default_rng(3).uniform(0.0, 3.0, (H, W, 3)).astype(np.float32) ** 4 / 20.0
+    rotation = look_at(EYE, CENTER + 0.02)
+    texture, found, confidence, clipped = run(np.zeros((H, W, 3), np.uint8), rotation=rotation, level=2, light=light)
+    center, radius = reference.disc(EYE, rotation, FOCAL, PRINCIPAL, CENTER, RADIUS)
+    levels = reference.levels(reference.texture(light.astype(float), center, radius, sphere_map.SIZE))
+    assert levels[0].max() > 1.5
+    check_error("sphere_map", texture, np.concatenate([one.reshape(-1, 3) for one in levels]))
+    check_error("sphere_map", found, reference.look_up(levels[2], directions(*MAP), rotation))
+    assert confidence.all()
+    assert 0.0 < clipped.mean() < 0.5
+    # What codes say is the same to the bit by either way.
+    frame = noise(5)
+    same = color.decode_table("srgb")[frame, np.arange(3)]
+    for codes, linear in list(zip(run(frame), run(frame, light=same), strict=True))[:3]:
+        np.testing.assert_array_equal(codes, linear)
 
 
 def test_a_mirror_far_away_is_seen_right(device):

@@ -4,11 +4,14 @@ import warp as wp
 
 from tests.error_model import check_error
 from tests.reference import summed_area as reference
-from warp_ar.kernels import summed_area
+from warp_ar.kernels import color, summed_area
+from warp_ar.kernels.color import decode_codes
 from warp_ar.kernels.summed_area_strips import strip_shapes, sum_area_by_strips
 
 # float32(sum) / float32(count): two roundings of an exact integer and one of the quotient, at most 255 * 3 * 2^-24.
 MEAN_ROUNDING = 255 * 3 * 2.0**-24
+# Half a step of 1/64 code, and half as much again for places read off the straight line between two codes.
+CUT = 1.5 / 128.0
 
 
 @wp.kernel(enable_backward=False)
@@ -115,6 +118,53 @@ def test_boxes_match_brute_force(device):
     )
     expected = [reference.box_mean(values, r, c, s) for r, c, s in zip(row, col, size, strict=True)]
     np.testing.assert_allclose(means, expected, rtol=0, atol=MEAN_ROUNDING)
+
+
+@wp.kernel(enable_backward=False)
+def fine_mean_kernel(
+    table: wp.array2d[wp.uint32],
+    cut_table: wp.array2d[wp.uint32],
+    size: wp.int32,
+    means_out: wp.array2d[wp.float32],
+):
+    row, col = wp.tid()
+    means_out[row, col] = summed_area.fine_mean(table, cut_table, row, col, size)
+
+
+def fine_means(codes, light, size):
+    frame, table = wp.array(codes, dtype=wp.vec3ub), wp.array(color.decode_table("srgb"), dtype=wp.vec3)
+    cut, out = wp.zeros(codes.shape[:2], dtype=wp.vec3ub), wp.zeros(codes.shape[:2], dtype=wp.float32)
+    tables = [make_table(codes), None]
+    if light is not None:
+        summed_area.write_cut(frame, table, wp.array(light, dtype=wp.vec3), cut)
+        tables[1] = make_table(cut.numpy())
+    wp.launch(fine_mean_kernel, codes.shape[:2], [*tables, size], [out])
+    return out.numpy()
+
+
+def test_what_8_bits_cut_off_is_in_means_of_a_linear_picture(device):
+    """A dark desk of two to five codes: the mean of what the linear picture says, where codes are off by a tenth."""
+    rng = np.random.default_rng(8)
+    y, x = np.mgrid[:40, :60]
+    # Smooth, so that rounding does not average out: places of codes, in sRGB's straight part and beyond it.
+    places = (2.2 + 2.0 * (x / 60) + 0.3 * (y / 40))[..., None] * np.array([1.0, 0.93, 0.85])
+    places += rng.uniform(0.0, 0.05, places.shape)
+    light = decode_codes("srgb", places.reshape(-1) / 255.0)[:, 0].reshape(places.shape).astype(np.float32)
+    codes = np.round(places).astype(np.uint8)
+    expected = reference.box_means(places @ np.array([54.0, 183.0, 19.0]) / 256.0, 9)
+    fine, plain = fine_means(codes, light, 9), fine_means(codes, None, 9)
+    assert np.abs(fine - expected).max() < CUT
+    assert np.abs(plain - expected).max() > 0.2
+    assert np.abs(plain - expected).mean() > 10.0 * np.abs(fine - expected).mean()
+
+
+def test_what_codes_say_has_no_rest(device):
+    """A linear picture of codes gives the same means to the bit; light above white counts as white."""
+    codes = random_frame(40, 60, 2)
+    light = color.decode_table("srgb")[codes, np.arange(3)]
+    np.testing.assert_array_equal(fine_means(codes, light, 11), fine_means(codes, None, 11))
+    white = np.full((20, 30, 3), 255, np.uint8)
+    assert (fine_means(white, np.full(white.shape, 7.5, np.float32), 5) == 255.0).all()
 
 
 def test_empty_and_outside_boxes_are_zero(device):

@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import difflib
+import errno
 import gc
+import io
+import os
 import re
 import signal
 import sys
@@ -13,15 +16,19 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
-from warp_ar.errors import SinkError, UsageError, WarpArError, printable
+from warp_ar.errors import SinkError, UsageError, WarpArError, printable, reason
 from warp_ar.output.sink import close_open_sinks
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
+EXIT_PIPE = 141
+"""Nobody reads what is printed any more."""
 EXIT_TERMINATED = 143
 
+_LARGEST = 2**31 - 1
+"""Largest whole number of an argument: they count frames, samples, pixels, ports."""
 _LONGEST = 1000
 """Characters of a message that are shown: a path may have thousands."""
 
@@ -32,9 +39,26 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise the message as an error of usage."""
         unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)
-        meant = difflib.get_close_matches(unknown[1], _options(self), n=1, cutoff=0.75) if unknown else []
+        known = [option for option in _options(self) if unknown is None or option != unknown[1]]
+        meant = difflib.get_close_matches(unknown[1], known, n=1, cutoff=0.75) if unknown else []
         hint = f"; did you mean {meant[0]}?" if meant else ""
         raise UsageError(f"{message}{hint}; see {self.prog} --help")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse does it, but nothing empty (a path of no name is the current folder) and no endless number."""
+        given = list(sys.argv[1:] if args is None else args)
+        for place, word in enumerate(given):
+            if word == "" or (word is not None and re.fullmatch(r"--[a-z0-9-]+=", word)):
+                before = given[place - 1] if place and str(given[place - 1]).startswith("-") else "an argument"
+                raise UsageError(f"{word.rstrip('=') or before} is empty; give it a value, or leave it out")
+        found, rest = super().parse_known_args(given, namespace)
+        for action in self._actions:
+            value = getattr(found, action.dest, None)
+            if isinstance(value, int) and abs(value) > _LARGEST:
+                name = action.option_strings[-1] if action.option_strings else action.dest
+                digits = len(str(abs(value)))
+                raise UsageError(f"{name}: a number of {digits} digits; expected {_LARGEST:,} at most")
+        return found, rest
 
 
 def _options(parser: argparse.ArgumentParser) -> list[str]:
@@ -69,9 +93,15 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
     Returns:
         The exit code.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter gets its number
+            stream.reconfigure(errors="backslashreplace")
     try:
         with ended_by_signals():
-            return command()
+            code = command()
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            return code
     except failures as error:
         say(error)
         return EXIT_FAILED
@@ -82,6 +112,20 @@ def run_command(command: Callable[[], int], failures: type[WarpArError] | tuple[
         return EXIT_TERMINATED
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
+    except OSError as error:
+        if error.filename is not None or error.errno not in (errno.EPIPE, errno.ENOSPC):
+            raise
+        _drop_output()
+        if error.errno == errno.EPIPE:
+            return EXIT_PIPE
+        say(f"what this command prints cannot be written: {reason(error)}")
+        return EXIT_FAILED
+
+
+def _drop_output() -> None:
+    """Let what is still to be printed go nowhere: Python would try again at its end, and complain."""
+    with contextlib.suppress(AttributeError, OSError, ValueError), open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 @contextlib.contextmanager

@@ -47,6 +47,8 @@ class Limits:
     """Bytes of a mesh's file, and of each buffer that it names."""
     mesh_elements: int = 20_000_000
     """Vertices, or faces, of a mesh, by the file's header where it has one."""
+    run_bytes: int = 1 << 30
+    """Bytes of what a run of the farm keeps of itself, each file."""
     nesting: int = 64
     """Levels of brackets, tags or indentation in a file."""
 

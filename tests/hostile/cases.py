@@ -295,6 +295,43 @@ MADE_TO_HURT: dict[tuple[str, str], bytes] = {
     ("scene, TOML", "a number of 5,000 digits"): _toml("[exposure]\nscale = " + "9" * 5000),
     ("scene, TOML", "a terminal's commands"): _toml('"\\u001b[2J" = 1'),
     ("scene, TOML", "an octal of a million digits"): _toml("x = 0x" + "f" * 1_000_000),
+    ("frame of light, EXR", "60000x60000"): _exr(60000, 60000),
+    ("frame of light, EXR", "a size below 0"): _exr(-5, -5),
+    ("frame of 16 bits, PNG", "60000x60000"): png(60000, 60000),
+    ("frame of 16 bits, TIFF", "60000x60000"): _tiff(60000, 60000),
+    ("video of 10 bits, MOV", "text"): b"This is not a video. " * 100,
+    ("poses, COLMAP's binary", "2^63 images"): struct.pack("<Q", 1 << 63),
+    ("poses, COLMAP's binary", "an image of 2^60 points"): struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1)
+    + b"a\0"
+    + struct.pack("<Q", 1 << 60),
+    ("poses, OpenTrackIO", "200,000 deep"): b'{"transforms":' * 200_000,
+    ("poses, OpenTrackIO", "an angle of 5,000 digits"): b'{"transforms":[{"translation":{"x":' + b"9" * 5000 + b"}}]}",
+    **{
+        ("poses, USD", what): b"#usda 1.0\n" + text
+        for what, text in {
+            "a layer from a device": b"( subLayers = [@/dev/zero@] )\n",
+            "a layer that is itself": b"( subLayers = [@shot.usda@] )\n",
+            "a reference to itself": b'def Xform "a" ( references = @shot.usda@</a> ) { }\n',
+            "a million frames and one": b'( startTimeCode = 0 endTimeCode = 1000001 )\ndef Camera "c" { }\n',
+            "a time of 10^300": b'( startTimeCode = 0 endTimeCode = 1e300 )\ndef Camera "c" { }\n',
+            "5,000 deep": b"".join(b'def Xform "a" {\n' for _ in range(5000)) + b"}\n" * 5000,
+            "a layer on another machine": b"( subLayers = [@https://a.example/a.usda@] )\n",
+        }.items()
+    },
+    ("farm's jobs, TOML", "arrays, 200,000 deep"): b"schema = " + b"[" * 200_000,
+    ("farm's jobs, TOML", "a pattern of all files"): b'schema = 1\n[[clip]]\nscene = "desk"\npath = "/proc/*/fd/*"\n',
+    ("farm's jobs, TOML", "clips that are no tables"): b"schema = 1\nclip = [1, 2]\n",
+    ("farm's jobs, TOML", "a frame of 5,000 digits"): b'schema = 1\n[[clip]]\nscene = "desk"\nframes = [0, '
+    + b"9" * 5000
+    + b"]",
+    ("farm's run, run.json", "200,000 deep"): b"[" * 200_000,
+    ("farm's run, run.json", "jobs that are a list"): b'{"version": "1", "jobs": [1]}',
+    ("farm's run, manifest", "200,000 deep"): b"[" * 200_000 + b"\n",
+    ("farm's run, manifest", "a key that is a list"): b'{"state": "done", "job": ["a/b"]}\n',
+    ("farm's run, manifest", "frames that are text"): b'{"state": "done", "job": "a/b-1", "frames": "many"}\n',
+    ("farm's run, progress", "200,000 deep"): b"[" * 200_000,
+    ("farm's run, progress", "a list"): b"[1, 2]",
+    ("farm's run, progress", "workers that are numbers"): b'{"time": 0, "jobs_open": 1, "workers": [1]}',
     ("response", "a million numbers"): b"0.5 " * 1_000_000,
     ("response", "a line of a million digits"): b"9" * 1_000_000,
     ("response", "not a number"): b"nan nan nan\n" * 256,

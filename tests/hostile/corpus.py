@@ -5,17 +5,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
+import struct
 from collections.abc import Callable
 from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 
+from warp_ar.farm.jobs import parse_jobs, read_jobs
+from warp_ar.farm.status import read_status, status_lines
+from warp_ar.farm.status_page import status_page
 from warp_ar.input.sources import FrameFolder, Synthetic, open_source
 from warp_ar.kernels.color import decode_table
 from warp_ar.light.captured import Light, find_emitters
+from warp_ar.output.shot import Shot
 from warp_ar.output.sinks import open_sink, read_environment, write_environment
-from warp_ar.scene import load_calibration, load_scene
+from warp_ar.output.track_file import write_track
+from warp_ar.output.usd_file import write_usd
+from warp_ar.scene import Pose, load_calibration, load_scene, loads_scene
 from warp_ar.scene.exif import read_exif
 from warp_ar.scene.mesh_files import load_mesh, load_texture
 from warp_ar.scene.pose_file import load_poses
@@ -144,6 +152,68 @@ def _sidecar(path: pathlib.Path) -> None:
     path.write_text(json.dumps({"0.png": 0.01, "1.png": 0.002}))
 
 
+def _deep_frames(path: pathlib.Path) -> int:
+    with open_source(path) as source:
+        source.keeps_depth = True
+        return sum(frame.image.size for frame in source)
+
+
+def _plate(path: pathlib.Path) -> None:
+    light = picture().astype(np.float32) / 64.0
+    if path.suffix == ".exr":
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"RGB": light}).write(str(path))
+    else:
+        assert cv2.imwrite(str(path), (light * 4096.0).astype(np.uint16))
+
+
+def _deep_video(path: pathlib.Path) -> None:
+    with open_sink(path, fps=24, coding="10bit") as sink:
+        for index in range(4):
+            sink.write(np.roll(picture((32, 32)), index, axis=1).astype(np.float32) / 255.0)
+
+
+def _shot() -> Shot:
+    poses = tuple(Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5 + 0.01 * k])) for k in range(3))
+    return Shot(loads_scene(SCENE), 24.0, poses)
+
+
+def _track(path: pathlib.Path) -> None:
+    write_track(path, _shot())
+
+
+def _binary_poses(path: pathlib.Path) -> None:
+    image = struct.pack("<I7dI", 1, 0.7, 0.0, 0.0, 0.7, 0.1, 0.2, 1.0, 1)
+    path.write_bytes(struct.pack("<Q", 2) + 2 * (image + b"a.png\0" + struct.pack("<Q2dq", 1, 10.0, 20.0, -1)))
+
+
+def _jobs(path: pathlib.Path) -> None:
+    clip = '[[clip]]\nscene = "desk"\nframes = [0, 30]\n'
+    path.write_text(f'schema = 1\n[run]\nquality = "low"\nsegment_frames = 20\n{clip}')
+
+
+def _status(path: pathlib.Path) -> object:
+    """What ``farm status`` says, in words and on its page."""
+    folder = path.parent
+    status_page(folder, lambda name: None, refresh=False)
+    return status_lines(folder, read_status(folder))
+
+
+def _run(path: pathlib.Path) -> None:
+    """A run of two jobs, one of which has failed, and its driver's last word."""
+    folder = path.parent
+    (folder / "run.json").write_text(json.dumps({"version": "1", "jobs": {"clip": [{"scene": "desk"}]}}))
+    lines: list[dict[str, object]] = [
+        {"state": "done", "job": "desk/segment-0", "frames": 20, "bytes": 4096, "seconds": 1.5, "worker": 0},
+        {"state": "failed", "job": "desk/segment-1", "reason": "no frame"},
+    ]
+    (folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    worker = {"device": "cpu", "job": "desk/segment-2", "frames": 3, "fps": 2.5}
+    known = {"clips": 1, "clips_surveyed": 1, "jobs_known": 3, "jobs_open": 1, "seconds_left": 9.0}
+    told = {"program": "warp_ar", "time": 0.0, "ended": False, "workers": [worker], **known}
+    (folder / "progress.json").write_text(json.dumps(told))
+
+
 def _response(path: pathlib.Path) -> None:
     path.write_text("".join(f"{v:.6g} {v:.6g} {v:.6g}\n" for v in np.linspace(0, 1, 256)))
 
@@ -198,6 +268,10 @@ READERS = (
         Reader(f"calibration, {kind.upper()}", f"camera.{kind}", load_calibration, _calibration)
         for kind in ("yml", "json", "xml")
     ),
+    Reader("frame of light, EXR", "a.exr", _deep_frames, _plate),
+    Reader("frame of 16 bits, PNG", "a.png", _deep_frames, _plate),
+    Reader("frame of 16 bits, TIFF", "a.tif", _deep_frames, _plate),
+    Reader("video of 10 bits, MOV", "a.mov", _deep_frames, _deep_video),
     Reader("response", "response.txt", decode_table, _response),
     Reader("texture", "a.png", load_texture, _image),
     *(Reader(f"mesh, {kind.upper()}", f"a.{kind}", load_mesh, _mesh) for kind in ("ply", "obj", "stl", "off")),
@@ -213,6 +287,13 @@ READERS = (
     Reader("captured light, EXR", "light.exr", Light.load, _light),
     Reader("poses, JSON", "poses.json", load_poses, _poses),
     Reader("poses, COLMAP", "images.txt", load_poses, _poses),
+    Reader("poses, COLMAP's binary", "images.bin", load_poses, _binary_poses),
+    Reader("poses, OpenTrackIO", "track.jsonl", load_poses, _track),
+    Reader("poses, USD", "shot.usda", load_poses, lambda path: write_usd(path, _shot())),
+    Reader("farm's jobs, TOML", "jobs.toml", lambda path: parse_jobs(read_jobs(path), str(path)), _jobs),
+    Reader("farm's run, run.json", "run.json", _status, _run),
+    Reader("farm's run, manifest", "manifest.jsonl", _status, _run),
+    Reader("farm's run, progress", "progress.json", _status, _run),
 )
 
 assert Synthetic.NAMES  # the scene's source is one of them

@@ -17,3 +17,9 @@ def box_mean(values, row, col, size):
     """By brute force over the box's pixels."""
     r0, c0 = row - size // 2, col - size // 2
     return values[max(r0, 0) : r0 + size, max(c0, 0) : c0 + size].mean()
+
+
+def box_means(values, size):
+    """Means of boxes around every pixel."""
+    rows, columns = values.shape
+    return np.array([[box_mean(values, i, j, size) for j in range(columns)] for i in range(rows)])

@@ -161,7 +161,7 @@ class FrameInputs:
             return None, False
         gain, contrast = self._drift.gain, self._drift.contrast
         self._drift.saturation = self.saturation.levels
-        if not self._drift.observe(frame.image, frame.pose, frame.seconds):
+        if not self._drift.observe(frame.image, frame.pose, frame.seconds, frame.plate):
             return None, False
         self.host_scene.set_gain(self._drift.gain)
         is_bent = contrast != self._drift.contrast

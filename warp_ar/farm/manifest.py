@@ -14,6 +14,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from typing import Any
 import filelock
 
 from warp_ar.errors import UsageError, WarpArError, reason
-from warp_ar.files import kind_of, write_whole
+from warp_ar.files import kind_of, parse_json, read_bytes, write_whole
 
 MANIFEST, RUN, LOCK, RECORD, PROGRESS = "manifest.jsonl", "run.json", "lock", "record.json", "progress.json"
 ASIDE = ".aside"
@@ -68,15 +69,12 @@ class Manifest:
         self.tries: dict[str, int] = {}
         """Tries that failed of jobs that are neither."""
         self._file = -1
-        try:
-            data = self.path.read_bytes() if self.path.exists() else b""
-        except OSError as error:
-            raise RunError(f"{self.path} cannot be read: {reason(error)}") from error
+        data = _kept(self.path) or b""
         whole = data[: data.rfind(b"\n") + 1]
         for number, line in enumerate(whole.splitlines(), 1):
             try:
-                self._take(json.loads(line))
-            except (ValueError, KeyError, TypeError) as error:
+                self._take(parse_line(line))
+            except ValueError as error:
                 raise RunError(
                     f"{self.path}: line {number} is damaged ({reason(error)}); remove the line and resume"
                 ) from error
@@ -134,6 +132,44 @@ class Manifest:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def parse_line(line: bytes) -> dict[str, Any]:
+    """A line of a manifest; raises ValueError if it is none."""
+    try:
+        told = json.loads(line)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    if not isinstance(told, dict) or not isinstance(told.get("job"), str) or "/" not in told["job"]:
+        raise ValueError("no line of a job")
+    if told.get("state") not in ("done", "failed", "try", "again"):
+        raise ValueError(f"state is {told.get('state')!r}")
+    if told["state"] == "failed" and not isinstance(told.get("reason"), str):
+        raise ValueError("no reason")
+    for name in ("frames", "bytes", "length", "seconds"):
+        if not isinstance(told.get(name), int | float | None) or not math.isfinite(told.get(name) or 0):
+            raise ValueError(f"{name} is no number")
+    return told
+
+
+def _kept(path: Path) -> bytes | None:
+    """A file that a run keeps of itself; None where there is none.
+
+    Raises:
+        RunError: It is no regular file, too large, or cannot be read.
+    """
+    try:
+        return None if kind_of(path) == "nothing" else read_bytes(path, "run_bytes", RunError)
+    except OSError as error:
+        raise RunError(f"{path} cannot be read: {reason(error)}") from error
+
+
+def read_kept(path: Path) -> dict[str, Any] | None:
+    """What a run keeps as one JSON object; None where there is none, or it is damaged."""
+    with contextlib.suppress(RunError, ValueError):
+        told = parse_json((_kept(path) or b"").decode(), str(path), RunError)
+        return told if isinstance(told, dict) else None
+    return None
 
 
 @contextlib.contextmanager
@@ -201,15 +237,19 @@ def load_run(folder: Path) -> tuple[dict[str, Any], str]:
         RunError: It is damaged.
     """
     path = folder / RUN
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        return data["jobs"], str(data["version"])
-    except FileNotFoundError as error:
+    kept = _kept(path)
+    if kept is None:
         raise UsageError(
             f"{folder} holds no run ({RUN} is missing); begin one with: farm run JOBS.toml --output {folder}"
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        )
+    try:
+        data = parse_json(kept.decode(), str(path), RunError)
+    except UnicodeDecodeError as error:
         raise RunError(f"{path} cannot be read: {reason(error)}") from error
+    jobs = data.get("jobs") if isinstance(data, dict) else None
+    if not isinstance(jobs, dict) or not isinstance(jobs.get("clip"), list) or "version" not in data:
+        raise RunError(f"{path} is damaged: expected a version, and jobs with their clips")
+    return jobs, str(data["version"])
 
 
 def clear_aside(folder: Path) -> None:
@@ -279,8 +319,5 @@ def _sync_folder(path: Path) -> None:
 
 def record_at(place: Path, key: str) -> dict[str, Any] | None:
     """The record of whole outputs of a job, or None."""
-    try:
-        told = json.loads((place / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return told if isinstance(told, dict) and told.get("job") == key else None
+    told = read_kept(place / RECORD)
+    return told if told is not None and told.get("job") == key else None

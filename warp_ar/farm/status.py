@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import math
 import time
 from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import printable
-from warp_ar.farm.manifest import PROGRESS, Manifest, is_locked, load_run
+from warp_ar.farm.manifest import PROGRESS, Manifest, is_locked, load_run, read_kept
 
 STALE_SECONDS = 15.0
 """Since the last word of a driver whose lock cannot be asked for, after which it is taken to be gone."""
@@ -23,10 +23,8 @@ def read_status(folder: Path) -> dict[str, Any]:
     """
     data, version = load_run(folder)
     manifest = Manifest(folder, write=False)
-    progress: dict[str, Any] = {}
-    try:
-        progress = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    progress = read_kept(folder / PROGRESS) or {}
+    if not _is_progress(progress):
         progress = {}
     kinds: dict[str, int] = {}
     for key in manifest.done:
@@ -46,6 +44,27 @@ def read_status(folder: Path) -> dict[str, Any]:
         "progress": progress,
         "running": _is_running(folder, progress),
     }
+
+
+def _is_progress(told: dict[str, Any]) -> bool:
+    """Whether a driver's word of where things stand is whole."""
+
+    def is_number(value: object) -> bool:
+        return isinstance(value, int | float) and math.isfinite(value)
+
+    workers = told.get("workers")
+    numbers = [told.get(name) for name in ("time", "jobs_open", "jobs_known", "clips_surveyed")]
+    if not isinstance(workers, list) or not all(map(is_number, numbers)):
+        return False
+    left = told.get("seconds_left")
+    return (left is None or is_number(left)) and all(
+        isinstance(worker, dict)
+        and isinstance(worker.get("job"), str | None)
+        and is_number(worker.get("frames"))
+        and is_number(worker.get("fps"))
+        and "device" in worker
+        for worker in workers
+    )
 
 
 def _is_running(folder: Path, progress: dict[str, Any]) -> bool:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_ar.errors import SinkError, UsageError, WarpArError, printable, reason
-from warp_ar.farm.manifest import MANIFEST
+from warp_ar.farm.manifest import MANIFEST, parse_line
 from warp_ar.farm.status import read_status, words_of_seconds
 from warp_ar.files import write_whole
 
@@ -206,10 +206,10 @@ def recent_jobs(folder: Path) -> list[dict[str, Any]]:
     found = []
     for line in reversed(lines if size <= _TAIL_BYTES else lines[1:]):
         try:
-            told = json.loads(line)
+            told = parse_line(line)
         except ValueError:
             continue  # one that is being written
-        if isinstance(told, dict) and told.get("state") == "done":
+        if told.get("state") == "done":
             found.append(told)
         if len(found) == RECENT:
             break

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_ar.input.marker_pattern import printed_cells
+from warp_ar.input.plate import Plate
 from warp_ar.kernels.color import decode_table, without_contrast
 from warp_ar.scene import Camera, Scene
 from warp_ar.scene.geometry import rotation_matrix
@@ -105,11 +106,12 @@ class ExposureDrift:
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""
 
-    def observe(self, image: NDArray[np.uint8], pose: Pose, seconds: float) -> bool:
+    def observe(self, image: NDArray[np.uint8], pose: Pose, seconds: float, plate: Plate | None = None) -> bool:
         """Look at a frame.
 
         Args:
             image: uint8 RGB (height, width, 3).
+            plate: The frame at its full depth, read in the place of ``image`` where there is one.
             pose: ``camera_from_world``.
             seconds: When it was taken.
 
@@ -119,7 +121,7 @@ class ExposureDrift:
         if not self._moving and abs(seconds - self._last) < STEADY_SECONDS:
             return False
         self._last = seconds
-        codes = codes_around(image, self._camera, pose, self._points)
+        codes = codes_around(image, self._camera, pose, self._points, plate)
         before, contrast = self.gain, self.contrast
         if self._asks_contrast and not np.isfinite(self._first).any():
             self.contrast = self._print_contrast(codes)
@@ -211,7 +213,9 @@ class ExposureDrift:
         return float(CONTRASTS[-1])
 
 
-def codes_around(image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array) -> Array:
+def codes_around(
+    image: NDArray[np.uint8], camera: Camera, pose: Pose, points: Array, plate: Plate | None = None
+) -> Array:
     """Mean codes around points, NaN where they are not seen or do not tell, (n, 3).
 
     Args:
@@ -219,6 +223,7 @@ def codes_around(image: NDArray[np.uint8], camera: Camera, pose: Pose, points: A
         camera: Of the frame.
         pose: ``camera_from_world``.
         points: Metres, (n, 3).
+        plate: The frame at its full depth: its codes are then fractions of 8-bit ones.
     """
     result = np.full((len(points), 3), np.nan)
     local = points @ pose.rotation.T + pose.translation
@@ -231,9 +236,15 @@ def codes_around(image: NDArray[np.uint8], camera: Camera, pose: Pose, points: A
     inside = ((at >= 2) & (at < np.array([camera.width, camera.height]) - 2)).all(axis=1)
     ahead, at = ahead[inside], at[inside]
     around = at + _OFFSETS[:, None]
-    codes = image.reshape(-1, 3).take(around[..., 1] * image.shape[1] + around[..., 0], axis=0)
+    rows, columns = around[..., 1], around[..., 0]
+    if plate is None:
+        codes = image.reshape(-1, 3).take(rows * image.shape[1] + columns, axis=0)
+        sums = codes.sum(axis=0, dtype=np.int64)
+    else:
+        codes = plate.codes_at(rows, columns, str(camera.transfer))
+        sums = codes.sum(axis=0)
     tells = np.flatnonzero(((codes.min(axis=0) > DARK) & (codes.max(axis=0) < BRIGHT)).all(axis=1))
-    result[ahead[tells]] = codes.sum(axis=0, dtype=np.int64)[tells] / len(_OFFSETS)
+    result[ahead[tells]] = sums[tells] / len(_OFFSETS)
     return result
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
-from warp_ar.kernels.color import decode_codes
+from warp_ar.kernels.color import decode_codes, encode_codes
 from warp_ar.signals import srgb_of_light
 
 Radiance = npt.NDArray[np.float32]
@@ -46,6 +46,21 @@ class Plate:
         if self.picture.dtype == np.uint16:
             return decode_deep(self.picture, deep_table(transfer))
         return np.array(self.picture, np.float32, order="C")
+
+    def codes_at(
+        self, rows: npt.NDArray[np.int64], columns: npt.NDArray[np.int64], transfer: str
+    ) -> npt.NDArray[np.float64]:
+        """The camera's codes of some pixels in steps of 8 bits, not rounded, 0 to 255, (..., 3).
+
+        Args:
+            rows: Of the pixels, (...).
+            columns: Of the pixels, (...).
+            transfer: The camera's.
+        """
+        pixels = self.picture[rows, columns]
+        if pixels.dtype == np.uint16:
+            return np.asarray(pixels / 257.0)
+        return np.asarray(255.0 * encode_codes(transfer, pixels))
 
     def clip_levels(self, transfer: str, saturation: npt.ArrayLike = (255, 255, 255)) -> npt.NDArray[np.float32]:
         """Radiance from which on each channel counts as clipped: by itself, and beside another one that does, (2, 3).

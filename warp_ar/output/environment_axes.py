@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_ar.errors import UsageError
+from warp_ar.files import limits, too_much
 from warp_ar.light.latlong_axes import AXES, DESCRIPTIONS, from_axes, to_axes, world_from_marker
 
 __all__ = [
@@ -84,12 +85,14 @@ def to_cube(radiance: Radiance, axes: str, size: int | None = None) -> Radiance:
         (6 size, size, 3), in the order +x, -x, +y, -y, +z, -z.
 
     Raises:
-        UsageError: There are no such axes for a cube, or the size is below 1.
+        UsageError: There are no such axes for a cube, or the size is below 1 or too large.
     """
     check_axes(axes, "cube")
     size = max(radiance.shape[0] // 2, 1) if size is None else size
     if size < 1:
         raise UsageError(f"size {size}: expected 1 texel or more along an edge")
+    if 6 * size * size > limits().picture_pixels:
+        raise UsageError(too_much(f"a cube of size {size}", 6 * size * size, "texels", "picture_pixels"))
     marker_from_world = world_from_marker(axes).T
     faces = np.zeros((6, size, size, 3), np.float64)
     places = (np.arange(4) + 0.5) / 4.0

@@ -97,18 +97,25 @@ def read_usd(path: Path) -> tuple[RawPose, ...]:
         import pxr.Tf
         import pxr.Usd
         import pxr.UsdGeom
+        import pxr.UsdUtils
     except ImportError as error:
         raise SceneError(f'{path}: USD files need usd-core; install it with pip install "warp-ar[exchange]"') from error
+    quiet = pxr.UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print while it lives
     try:
         stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
     except pxr.Tf.ErrorException as error:
         raise SceneError(f"{path}: no USD file that can be read; is it whole?") from error
+    finally:
+        quiet.TakeUncoalescedDiagnostics()
+        del quiet
     cameras = [prim for prim in stage.Traverse() if prim.IsA(pxr.UsdGeom.Camera)]
     if len(cameras) != 1:
         names = ", ".join(str(prim.GetPath()) for prim in cameras[:4])
         raise SceneError(f"{path}: expected one camera, found {len(cameras)}{f' ({names})' if names else ''}")
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    step = stage.GetTimeCodesPerSecond() / (stage.GetFramesPerSecond() or stage.GetTimeCodesPerSecond())
+    # Blender says time codes alone, one for each frame: what USD takes for frames then is 24, whatever they are.
+    told = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else 0.0
+    step = stage.GetTimeCodesPerSecond() / (told or stage.GetTimeCodesPerSecond())
     finite = math.isfinite(start) and math.isfinite(end) and math.isfinite(step) and step > 0.0
     count = math.floor((end - start) / step + 1e-6) + 1 if finite and end >= start else 1
     if count > MOST_FRAMES:
@@ -155,7 +162,7 @@ def read_colmap_binary(path: Path) -> list[tuple[str, tuple[float, ...], Vec3]]:
             (points,) = struct.unpack_from("<Q", data, end + 1)
             at = end + 9 + 24 * points
             found.append((name, (w, x, y, z), (tx, ty, tz)))
-    except (struct.error, ValueError) as error:
+    except (struct.error, ValueError, OverflowError) as error:  # overflow: more points than any file holds
         raise SceneError(f"{path}: cut off after {len(data):,} bytes, or no images.bin of COLMAP") from error
     for name, quaternion, shift in found:
         if not all(map(math.isfinite, (*quaternion, *shift))) or not any(quaternion):

@@ -63,6 +63,8 @@ def load_poses(path: Path) -> tuple[RawPose, ...]:
     """
     suffix = path.suffix.lower()
     poses: tuple[RawPose, ...]
+    if suffix == ".abc":
+        raise SceneError(f"{path}: Alembic is not read; turn it into USD, as docs/formats.md shows for Blender")
     if suffix in USD_SUFFIXES:
         poses = read_usd(path)
     elif suffix == ".bin":

@@ -16,7 +16,7 @@ from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Reac
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.distant_light import distant_light_arrays, distant_light_reads, make_distant_light
 from warp_ar.stages.shared.picture import find_picture, frame_reads
-from warp_ar.stages.shared.relighting import relight_config, relight_reads
+from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.shading import mirrored_shading, shade_config
 from warp_ar.stages.shared.variants import relight_variant, shade_variant, shares_kernels, trace_variant
@@ -65,7 +65,7 @@ def _reads(features: Features, *, lit: bool) -> set[str]:
         reads |= {"lights"} if shade_config(features).lights else set()
     if lit:
         # The ball shows the receiver too small for a pixel's surroundings to mean anything.
-        reads |= set(relight_reads(features)) - {"summed_area", "environment_samples"}
+        reads |= set(relight_reads(features)) - {SUMMED, SUMMED_CUT, "environment_samples"}
     if features.shadowed:
         reads.add("shadow_ratio")
     return reads

@@ -22,7 +22,7 @@ from warp_ar.stages.request import Request
 from warp_ar.stages.shared.edge_lists import edge_arrays, make_edge_lists
 from warp_ar.stages.shared.environment_sets import SAMPLES
 from warp_ar.stages.shared.picture import find_picture
-from warp_ar.stages.shared.relighting import relight_config, relight_reads
+from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_config, relight_reads
 from warp_ar.stages.shared.rows import GrowingRows
 from warp_ar.stages.shared.variants import relight_variant
 
@@ -149,7 +149,8 @@ class Relight(Stage):
     def _receiver(self, config: RelightConfig, arrays: Arrays) -> Receiver:
         """What kernels read of the receiver."""
         names = {
-            "table": "summed_area",
+            "table": SUMMED,
+            "cut_table": SUMMED_CUT,
             "key_lights": "key_lights",
             "irradiance": self.features.irradiance,
             "emitters": "emitters",

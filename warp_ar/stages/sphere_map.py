@@ -10,6 +10,7 @@ import warp as wp
 from warp_ar.kernels import sphere_map
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import frame_reads
 
 
 class SphereMap(Stage):
@@ -29,7 +30,9 @@ class SphereMap(Stage):
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
         """Needs a mirror ball."""
-        return Wiring(("frame", "pose"), ("sphere_map",)) if features.observed else LeftOut(unobserved(features))
+        if not features.observed:
+            return LeftOut(unobserved(features))
+        return Wiring((*frame_reads(features), "pose"), ("sphere_map",))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """All levels, one after another."""
@@ -38,8 +41,8 @@ class SphereMap(Stage):
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """The ball's square, then its levels."""
         known = arrays["params"], arrays["probes"], arrays["frame"], arrays["decode"]
-        texture = arrays["sphere_map"]
+        texture, linear = arrays["sphere_map"], arrays["linear_frame"]
         return [
-            Pass(lambda rows: sphere_map.copy_ball(*known, texture, rows=rows), rows=sphere_map.SIZE),
+            Pass(lambda rows: sphere_map.copy_ball(*known, texture, linear=linear, rows=rows), rows=sphere_map.SIZE),
             Pass(lambda rows: sphere_map.halve_levels(texture)),
         ]

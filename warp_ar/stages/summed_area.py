@@ -12,6 +12,8 @@ from warp_ar.kernels import summed_area
 from warp_ar.kernels.summed_area_strips import make_sum_strips_kernel, strip_config, strip_shapes, sum_area_by_strips
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Stage, Wiring
 from warp_ar.stages.features import Features
+from warp_ar.stages.shared.picture import frame_reads
+from warp_ar.stages.shared.relighting import SUMMED, SUMMED_CUT, relight_reads
 
 
 class SummedArea(Stage):
@@ -30,8 +32,10 @@ class SummedArea(Stage):
 
     @classmethod
     def wire(cls, features: Features) -> Wiring | LeftOut:
-        """Reads the frame alone."""
-        return Wiring(("frame",), ("summed_area",))
+        """Reads the frame alone; where relighting wants it deeper than 8 bits, what these cut off has a table too."""
+        if features.lit and SUMMED_CUT in relight_reads(features):
+            return Wiring(frame_reads(features), (SUMMED, SUMMED_CUT))
+        return Wiring(("frame",), (SUMMED,))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The table, and the sums on the way to it by strips, or by slabs."""
@@ -41,12 +45,23 @@ class SummedArea(Stage):
         shapes = zip(names, strip_shapes(height, width), strict=True)
         sums = {name: ArraySpec(shape, wp.uint32) for name, shape in shapes}
         sums["summed_area_ends"] = ArraySpec(ends, wp.uint32)
-        return {"summed_area": ArraySpec((height, width), wp.uint32), **sums}
+        if SUMMED_CUT in self.wiring.writes:
+            sums["summed_area_cut_frame"] = ArraySpec((height, width), wp.vec3ub)
+        return {name: ArraySpec((height, width), wp.uint32) for name in self.wiring.writes} | sums
 
     def build(self, arrays: Arrays, device: Any) -> list[Pass]:
         """On CPU by slabs, a thread each; on CUDA by strips."""
+        frame, height = arrays["frame"], self.request.size[1]
+        passes = self._sum(frame, arrays[SUMMED], arrays, device)
+        if SUMMED_CUT not in self.wiring.writes:
+            return passes
+        cut, known = arrays["summed_area_cut_frame"], (frame, arrays["decode"], arrays["linear_frame"])
+        passes.append(Pass(lambda rows: summed_area.write_cut(*known, cut, rows=rows), rows=height))
+        return [*passes, *self._sum(cut, arrays[SUMMED_CUT], arrays, device)]
+
+    def _sum(self, frame: wp.array, table: wp.array, arrays: Arrays, device: Any) -> list[Pass]:
+        """Passes that write the table of one frame; two tables use the same scratch, one after the other."""
         width, height = self.request.size
-        frame, table = arrays["frame"], arrays["summed_area"]
         if not device.is_cpu:
             sums = [arrays[f"summed_area_{name}"] for name in ("sums", "group_sums", "state")]
             make_sum_strips_kernel(strip_config(height, width, device))

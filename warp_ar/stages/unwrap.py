@@ -12,6 +12,7 @@ from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
 from warp_ar.stages.shared.probe_maps import find_view
+from warp_ar.stages.shared.picture import frame_reads
 from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
@@ -56,9 +57,10 @@ class Unwrap(Stage):
         """Needs a mirror ball."""
         if not features.observed:
             return LeftOut(unobserved(features))
-        texture = ("sphere_map",) if cls.method_for(features) == "sphere_map" else ()
-        frame = "linear_frame" if features.request.linear and not texture else "frame"
-        return Wiring((frame, "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
+        by_texture = cls.method_for(features) == "sphere_map"
+        texture = ("sphere_map",) if by_texture else ()
+        frames = frame_reads(features) if by_texture else frame_reads(features)[-1:]
+        return Wiring((*frames, "pose", *texture), ("probe_radiance", "probe_confidence", "probe_clipped"))
 
     def arrays(self) -> Mapping[str, ArraySpec]:
         """The map, and where its texels' corners are seen."""
@@ -116,7 +118,8 @@ class Unwrap(Stage):
         shape = height, 2 * height
         params, texture, out = arrays["params"], arrays["sphere_map"], arrays["probe_radiance"].flatten()
         seen = params, arrays["probes"], arrays["frame"], arrays["probe_confidence"], arrays["probe_clipped"]
+        linear = {name: arrays[f"linear_{word}"] for name, word in (("linear", "frame"), ("linear_clip", "clip"))}
         return [
             Pass(lambda rows: sphere_map.look_up_level(params, texture, 0, shape, out, rows=rows), rows=height),
-            Pass(lambda rows: sphere_map.trust_ball(*seen, rows=rows), rows=height),
+            Pass(lambda rows: sphere_map.trust_ball(*seen, **linear, rows=rows), rows=height),
         ]

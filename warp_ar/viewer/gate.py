@@ -103,6 +103,11 @@ class _Handler(web.RequestHandler):
         answer.headers.update(self.gate.headers)
         return answer
 
+    def log_exception(self, *args: Any, **options: Any) -> None:
+        # Nor is a body that is not what its header says.
+        if not isinstance(options.get("exc_info"), web.RequestPayloadError):
+            super().log_exception(*args, **options)
+
 
 def file_limit() -> int:
     """How many files this process may open."""

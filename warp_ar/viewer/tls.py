@@ -10,19 +10,28 @@ import tempfile
 from pathlib import Path
 
 from warp_ar.errors import UsageError
+from warp_ar.files import read_bytes
 
 
 def load_context(path: Path) -> ssl.SSLContext:
     """TLS with the certificate and key of a PEM file.
 
     Raises:
-        UsageError: The file holds no certificate with its key.
+        UsageError: The file is no regular one, or holds no certificate with its key, or the key asks for a password.
     """
+    read_bytes(path, "text_bytes", UsageError, f"--tls {path}")  # a pipe in its place would be waited for
+    asked = []
+
+    def password() -> str:
+        asked.append(True)
+        return ""  # OpenSSL would ask the terminal
+
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
-        context.load_cert_chain(path)
+        context.load_cert_chain(path, password=password)
     except OSError as error:  # ssl.SSLError is one
-        raise UsageError(f"--tls {path}: {error}; expected a PEM file with a certificate and its key") from error
+        words = "its key asks for a password" if asked else str(error)
+        raise UsageError(f"--tls {path}: {words}; expected a PEM file with a certificate and its key") from error
     return context
 
 
@@ -35,6 +44,15 @@ def make_context(host: str) -> ssl.SSLContext:
     Raises:
         UsageError: The package that makes certificates is not installed.
     """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "warp_ar.pem"
+        path.touch(mode=0o600)
+        path.write_bytes(make_certificate(host))
+        return load_context(path)
+
+
+def make_certificate(host: str) -> bytes:
+    """A key and its certificate, PEM; arguments and errors as those of ``make_context``."""
     try:
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes, serialization
@@ -67,8 +85,4 @@ def make_context(host: str) -> ssl.SSLContext:
     private = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "warp_ar.pem"
-        path.touch(mode=0o600)
-        path.write_bytes(private + certificate.public_bytes(serialization.Encoding.PEM))
-        return load_context(path)
+    return bytes(private + certificate.public_bytes(serialization.Encoding.PEM))
