@@ -110,7 +110,7 @@ def flip_map(reference: Array, test: Array) -> npt.NDArray[np.float32]:
     """
     key = hashlib.blake2b(repr(reference.shape).encode())
     for picture in (reference, test):
-        key.update(memoryview(np.ascontiguousarray(picture)))
+        key.update(picture.tobytes())
     found = _kept_maps.get(key.digest())
     if found is None:
         found = _compute_flip(reference, test)
