@@ -2,8 +2,8 @@
 
 It reads ``bench/results/*_costs.jsonl``, which ``python -m bench costs`` prints, and the errors of
 ``warp_ar/accuracy/cost_table.json`` and ``bench/results/presets.json``, both of ``python -m warp_ar.tradeoff``, and
-replaces what stands between ``<!-- costs:NAME -->`` and ``<!-- /costs:NAME -->``. It prints for every preset what
-the rule of ``quality.BUDGETS`` would choose.
+replaces what stands between ``<!-- costs:NAME -->`` and ``<!-- /costs:NAME -->``, there and in ``README.md``. It prints
+for every preset what the rule of ``quality.BUDGETS`` would choose.
 """
 
 from __future__ import annotations
@@ -102,6 +102,12 @@ def preset_table(
     return table(head, rows, 2)
 
 
+def extract(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], presets: dict[str, Any]) -> str:
+    """The presets on ``desk``, for the README."""
+    lines = preset_table(cpu, cuda, presets, ["desk"]).splitlines()
+    return "\n".join("|" + line.split("|", 2)[2] for line in lines)  # without the scene's column
+
+
 def front_of(lines: list[dict[str, Any]]) -> tuple[list[Choice], float, dict[tuple[str, str], MethodCost]]:
     """Choices by what ``desk`` calls for, milliseconds relative to the base; the base's; the costs."""
     errors = load_errors()
@@ -163,6 +169,7 @@ def main() -> None:
     if not cpu:
         sys.exit("write_cost_tables: no bench/results/cpu_costs.jsonl; make it with python -m bench costs --device cpu")
     page = ROOT / "docs" / "accuracy.md"
+    replace(ROOT / "README.md", "readme", extract(cpu, cuda, presets))
     scenes = list(dict.fromkeys(line["scene"] for line in cpu if "preset" in line))
     replace(page, "presets", preset_table(cpu, cuda, presets, scenes))
     replace(page, "methods", method_table(cpu, cuda, listed))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from warp_ar.accuracy import metrics
 from warp_ar.accuracy.metrics import array_error, changed_region, clipped_region, flip_map, latlong_weights
 
 # Sums in float64.
@@ -79,3 +80,16 @@ def test_clipped_region_is_any_channel():
     camera = np.full((2, 3, 3), 253, np.uint8)
     camera[0, 1, 2] = 254
     assert clipped_region(camera).sum() == 1
+
+
+@pytest.mark.parametrize("box", [np.s_[0:5, 0:5], np.s_[40:60, 70:100], np.s_[115:120, :]])
+def test_flip_looks_only_where_pictures_differ(box):
+    """Elsewhere it is 0; the same bits as of whole pictures."""
+    rng = np.random.default_rng(5)
+    reference = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    test = reference.copy()
+    test[box] = rng.integers(0, 256, test[box].shape)
+    errors = flip_map(reference, test)
+    np.testing.assert_array_equal(errors, metrics._evaluate_flip(reference, test))
+    assert flip_map(reference, test) is errors
+    assert not flip_map(test, test).any()

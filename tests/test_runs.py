@@ -49,3 +49,18 @@ def test_irradiance_of_both_forms_agrees():
     exact = np.pi * (1.0 + 0.5 * runs._directions(32, 64))
     np.testing.assert_allclose(from_sh, np.pi * (1.0 + 0.5 * runs._directions(*runs.NORMALS)), rtol=1e-6)
     np.testing.assert_allclose(runs.resample(exact, runs.NORMALS), from_sh, rtol=MAP)
+
+
+def test_a_kept_light_changes_no_picture(case, device):
+    """What further qualities go on from is as if each had lit the frames before by itself."""
+    between = PRESETS["low"].with_methods(irradiance="sh2")
+    with runs.LightBefore() as before:
+        for method in ("sh4", "top_mip", "clusters"):
+            quality = PRESETS["low"].with_methods(irradiance=method)
+            alone = runs.run(case, quality, device, setting("recover"), between=between, timed=2)
+            kept = runs.run(case, quality, device, setting("recover"), between=between, timed=2, before=before)
+            np.testing.assert_array_equal(kept.images[3], alone.images[3])
+            np.testing.assert_array_equal(kept.output, alone.output)
+        kept_for = before.light(case, 2, between, device, time.perf_counter)
+        assert before.light(case, 2, between, device, time.perf_counter) is kept_for
+        assert before.light(case, 2, PRESETS["low"], device, time.perf_counter) is not kept_for

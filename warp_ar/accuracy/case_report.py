@@ -32,7 +32,7 @@ from warp_ar.accuracy.cost_table import (
 from warp_ar.accuracy.costs import BASE as COST_BASE
 from warp_ar.accuracy.costs import finish_steps, make_method_costs, measure_steps
 from warp_ar.accuracy.progress import Advance, ignore
-from warp_ar.accuracy.runs import Clock, run, run_in_turn
+from warp_ar.accuracy.runs import Clock, LightBefore, run, run_in_turn
 from warp_ar.accuracy.sweep import BRUTE_FORCE_UNITS, Row, picture_error, region_of, run_units, sweep
 from warp_ar.stages.quality import PRESETS, Quality
 
@@ -118,11 +118,12 @@ def measure_case(
     """
     rows: list[Row] = []
     pictures: dict[tuple[str, str], Image] = {}
-    for setting in settings:
-        methods = setting.measured if quick else setting.methods
-        own, shown = sweep(case, setting, device, methods=methods, clock=clock, advance=advance)
-        rows += own
-        pictures.update({(setting.name, method): image for method, image in shown.items()})
+    with LightBefore() as before:
+        for setting in settings:
+            methods = setting.measured if quick else setting.methods
+            own, shown = sweep(case, setting, device, methods=methods, clock=clock, advance=advance, before=before)
+            rows += own
+            pictures.update({(setting.name, method): image for method, image in shown.items()})
     if case.name.endswith(SIZED):
         last = pictures[settings[-1].name, rows[-1].method]
         region = region_of(case, case.shown[-1], last)
@@ -228,23 +229,24 @@ def _find_same_error(
     """Cheapest by the list of what is measured to err no more than the paper's preset: only the list orders."""
     units = 0
 
-    def error(quality: Quality) -> float:
+    def error(quality: Quality, before: LightBefore) -> float:
         nonlocal units
-        images = run(case, quality, device, between=light_only(quality), timed=1).images
+        images = run(case, quality, device, between=light_only(quality), timed=1, before=before).images
         advance(f"{case.name}: equal error", 1.0)
         units += 1
         return picture_error(case, reference, images)
 
-    aim = error(PRESETS["paper"])
     low, high = -1, len(front) - 1
-    for _ in range(TRIES):
-        if high - low <= 1:
-            break
-        middle = (low + high) // 2
-        if error(_chosen(front[middle])) <= aim:
-            high = middle
-        else:
-            low = middle
+    with LightBefore() as before:
+        aim = error(PRESETS["paper"], before)
+        for _ in range(TRIES):
+            if high - low <= 1:
+                break
+            middle = (low + high) // 2
+            if error(_chosen(front[middle]), before) <= aim:
+                high = middle
+            else:
+                low = middle
     advance(f"{case.name}: equal error", TRIES + 1.0 - units)
     return _chosen(front[high])
 

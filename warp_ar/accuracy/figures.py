@@ -13,7 +13,7 @@ import numpy.typing as npt
 from warp_ar.accuracy.cases import Image, load_case, open_scene, read_truth, truth_folders
 from warp_ar.accuracy.cost_table import light_only, turn
 from warp_ar.accuracy.metrics import clipped_region
-from warp_ar.accuracy.runs import BASE, Clock, run
+from warp_ar.accuracy.runs import BASE, Clock, LightBefore, run
 from warp_ar.accuracy.sweep import region_of
 from warp_ar.scene import load_scene
 
@@ -81,9 +81,11 @@ def make_figures(
             index = case.shown[-1]
             camera = case.frames[index].image
             outcomes = []
-            for method in methods:
-                turned = turn(BASE, {setting: method})
-                outcomes.append(run(case, turned, device, between=light_only(turned), timed=1, clock=clock))
+            with LightBefore() as before:
+                for method in methods:
+                    turned = turn(BASE, {setting: method})
+                    between = light_only(turned)
+                    outcomes.append(run(case, turned, device, between=between, timed=1, clock=clock, before=before))
             images = [outcome.images[index] for outcome in outcomes]
             reference = case.truth.get(index)
             labels = (f"plain ({methods[0]})", f"the paper ({methods[1]})", f"ours ({methods[2]})")

@@ -7,7 +7,7 @@ import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -64,6 +64,42 @@ class Outcome:
         return sum(self.stages.values())
 
 
+class LightBefore:
+    """A pipeline that has lit the frames before those that count, kept for further qualities with the same light.
+
+    Of a case's frames most only bring the light. Qualities whose light is found in the same way go on from one pipeline
+    that has lit them once. Close it, or use it in a ``with`` statement.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is lit yet."""
+        self._key: tuple[object, ...] | None = None
+        self._stack = contextlib.ExitStack()
+        self._pipeline: Pipeline | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let the pipeline go."""
+        self._stack.close()
+        self._key = self._pipeline = None
+
+    def light(self, case: Case, count: int, quality: Quality, device: str, clock: Clock) -> Pipeline:
+        """A pipeline that has lit the first ``count`` frames of a case; it is to be gone on from, not to be called."""
+        key = (id(case), count, dataclasses.replace(quality, name=""), device, clock)
+        if self._pipeline is None or self._key != key:
+            self.close()
+            self._pipeline = self._stack.enter_context(open_profiled(case.scene, device, quality, None, clock))
+            for frame, pose in zip(case.frames[:count], case.poses[:count], strict=True):
+                self._pipeline(frame.image, time_seconds=frame.time, pose=pose)
+            self._key = key
+        return self._pipeline
+
+
 def run(
     case: Case,
     quality: Quality,
@@ -73,6 +109,7 @@ def run(
     between: Quality | None = None,
     timed: int = TIMED,
     clock: Clock = time.perf_counter,
+    before: LightBefore | None = None,
 ) -> Outcome:
     """Run a case's frames at one quality, one after another, and time every stage.
 
@@ -84,45 +121,49 @@ def run(
         between: Frames that are neither wanted nor timed run at this, which keeps the light; None runs all alike.
         timed: Last frames that run at ``quality`` whatever is wanted; the first that does is not timed.
         clock: Seconds, on CPU.
+        before: Keeps what has lit the frames before those, for the next quality with the same ``between``.
     """
     images: dict[int, Image] = {}
     times: dict[str, list[float]] = {}
     count = len(case.frames)
     wanted = {*case.shown, *range(max(0, count - timed), count)} if between is not None else set(range(count))
     skip = 1 if len(wanted) > 1 else 0
-
-    def note(result: Result) -> None:
-        for name, timing in result.stages.items():
-            times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
-
+    first = min(wanted)
+    shared = before is not None and first > 0 and wanted == set(range(first, count))
     with open_profiled(case.scene, device, quality, None, clock) as pipeline, contextlib.ExitStack() as stack:
-        cheap = (
-            pipeline
-            if between is None
-            else stack.enter_context(open_profiled(case.scene, device, between, None, clock))
-        )
-        before = pipeline
-        for index, (frame, pose) in enumerate(zip(case.frames, case.poses, strict=True)):
+        cheap = pipeline
+        if before is not None and between is not None and shared:
+            cheap = before.light(case, first, between, device, clock)
+        elif between is not None:
+            cheap = stack.enter_context(open_profiled(case.scene, device, between, None, clock))
+        last = cheap if shared else pipeline
+        for index in range(first if shared else 0, count):
+            frame, pose = case.frames[index], case.poses[index]
             now = pipeline if index in wanted else cheap
-            if now is not before and index > 0:
-                now.continue_from(before)
-            before = now
+            if now is not last and index > 0:
+                now.continue_from(last)
+            last = now
             result = now(frame.image, time_seconds=frame.time, pose=pose)
             if index in case.shown:
                 images[index] = result.image
             if now is pipeline:
-                if skip > 0:
-                    skip -= 1
-                else:
-                    note(result)
+                if skip <= 0:
+                    _note(times, result)
+                skip -= 1
         output = None if setting is None else _read_output(pipeline, setting)
         if len(wanted) == 1 and sum(own[0] for own in times.values() if own) < REPEAT_BELOW:
             times.clear()
             pipeline.scheduler.forget()
-            note(pipeline(case.frames[-1].image, time_seconds=case.frames[-1].time + 1e-3, pose=case.poses[-1]))
+            again = case.frames[-1].time + 1e-3
+            _note(times, pipeline(case.frames[-1].image, time_seconds=again, pose=case.poses[-1]))
     times.pop(TRACK, None)
     stages = {name: statistics.median(own or [0.0]) for name, own in times.items()}
     return Outcome(quality, images, stages, output)
+
+
+def _note(times: dict[str, list[float]], result: Result) -> None:
+    for name, timing in result.stages.items():
+        times.setdefault(name, []).extend([] if timing.skipped else [timing.milliseconds])
 
 
 def run_in_turn(

@@ -21,7 +21,7 @@ from warp_ar.accuracy.cost_table import Setting, light_only, turn
 from warp_ar.accuracy.costs import NOW_AND_THEN, open_profiled, worked_ms
 from warp_ar.accuracy.metrics import ArrayError, array_error, changed_region, flip_map, latlong_weights
 from warp_ar.accuracy.progress import Advance, ignore
-from warp_ar.accuracy.runs import BASE, TIMED, WARM_UP, Clock, Outcome, run
+from warp_ar.accuracy.runs import BASE, TIMED, WARM_UP, Clock, LightBefore, Outcome, run
 from warp_ar.stages.quality import Quality
 
 BRUTE_FORCE_UNITS = 8.0
@@ -104,6 +104,7 @@ def sweep(
     methods: Sequence[str] | None = None,
     clock: Clock = time.perf_counter,
     advance: Advance = ignore,
+    before: LightBefore | None = None,
 ) -> tuple[list[Row], dict[str, Image]]:
     """Every method of one setting, or those named: its row, and its last picture.
 
@@ -115,12 +116,14 @@ def sweep(
         methods: Some of the setting's, in its order; None means all.
         clock: Seconds, on CPU.
         advance: Told of every method that has run.
+        before: As that of ``run``.
     """
     outcomes: dict[str, Outcome] = {}
     for method in methods or setting.methods:
         turned = turn(base, {**_FAIR.get(setting.name, {}), setting.name: method})
         timed = 1 if method == "brute_force" else TIMED
-        outcomes[method] = run(case, turned, device, setting, between=light_only(turned), timed=timed, clock=clock)
+        between = light_only(turned)
+        outcomes[method] = run(case, turned, device, setting, between=between, timed=timed, clock=clock, before=before)
         advance(f"{case.name}: {setting.name} {method}", run_units(method))
     if setting.name == NOW_AND_THEN and wp.get_device(device).is_cpu:
         count_work(case, outcomes, device, clock)

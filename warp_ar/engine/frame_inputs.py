@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
@@ -172,10 +173,10 @@ class FrameInputs:
     def continue_from(self, other: FrameInputs) -> None:
         """Go on with what another pipeline's frames have told of the same camera's gain and tone curve."""
         if self._cover is not None and other._cover is not None and self._cover.watches == other._cover.watches:
-            self._cover = other._cover
+            self._cover = copy.copy(other._cover)  # it replaces what it remembers, and changes nothing of it
         if self._drift is None or other._drift is None or self._drift.watches != other._drift.watches:
             return
-        self._drift = other._drift
+        self._drift = other._drift.copied()
         self.host_scene.set_gain(self._drift.gain)
         if self._drift.contrast != 0.0:
             self._write_decode()

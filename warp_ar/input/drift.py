@@ -23,6 +23,9 @@ codes agree best, where what they disagree by falls below ``BETTER`` of what it 
 
 from __future__ import annotations
 
+import copy
+from typing import Self
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +108,13 @@ class ExposureDrift:
         """Code at which each channel saturates, as far as frames have told."""
         self.contrast = 0.0
         """Of the camera's tone curve, as ``without_contrast`` takes it."""
+
+    def copied(self) -> Self:
+        """What has been seen so far, for another pipeline to go on from; what it sees changes nothing here."""
+        other = copy.copy(self)
+        other._first, other._first_gain = self._first.copy(), self._first_gain.copy()
+        other._disagreements = list(self._disagreements)
+        return other
 
     def observe(self, image: NDArray[np.uint8], pose: Pose, seconds: float, plate: Plate | None = None) -> bool:
         """Look at a frame.

@@ -77,12 +77,12 @@ class EnvironmentShadow(Stage):
     methods: ClassVar[Mapping[str, str]] = {
         "none": "none (the paper)",
         "coarse8": "32 rays per estimate, every eighth pixel, and an estimate of reflected light",
-        "coarse6": "the same, every sixth pixel",
-        "coarse": "the same, every fifth pixel",
+        "coarse6": "32 rays, every sixth pixel, and an estimate of reflected light",
+        "coarse": "32 rays, every fifth pixel, and an estimate of reflected light",
         "bounce5": "64 rays, every fifth pixel, and reflected light by a ray for half of them",
-        "bounce4": "the same, every fourth pixel",
-        "bounce3": "the same, every third pixel",
-        "bounce": "the same, every second pixel",
+        "bounce4": "64 rays, every fourth pixel, and reflected light by a ray for half of them",
+        "bounce3": "64 rays, every third pixel, and reflected light by a ray for half of them",
+        "bounce": "64 rays, every second pixel, and reflected light by a ray for half of them",
         "brute_force": "every texel of the environment at every pixel",
     }
     summary: ClassVar[str] = "shadows of virtual objects on the receiver under the environment"

@@ -1,0 +1,142 @@
+"""Every figure of the cost tables by today's code, in one command: ``python -m bench.make_cost_tables``.
+
+It runs, one after another, and says what each took:
+
+  errors    what each method errs, at half size over ten frames: ``warp_ar/accuracy/cost_table.json``
+  presets   what each preset errs, over whole clips: ``bench/results/presets.json``
+  costs     milliseconds of every method and preset: ``bench/results/cpu_costs.jsonl``
+  budget    the same of ``desk`` for the bench of budgets: ``bench/results/desk_budget_costs.json``
+  tables    all of it into ``docs/accuracy.md`` and ``README.md``
+
+Errors do not depend on what else runs: they and the costs of other devices can be made at other times (``--only``).
+Errors run in as many processes as the machine has cores; costs run alone, and want a machine with nothing else to do.
+``--processor-time`` counts the work of one thread instead, for a busy one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from warp_ar.scene import bundled_scenes
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "bench" / "results"
+ERROR_OPTIONS = ("--quick", "--shrink", "2", "--frames", "10")
+PRESET_OPTIONS = ("--presets", "--frames", "1000")
+KEYS = ("case", "setting", "method", "quality")
+"""Of a line: what it is about."""
+STEPS = ("errors", "presets", "costs", "budget", "tables")
+
+
+def tradeoff(options: Sequence[str], scene: str, folder: Path) -> dict[str, str]:
+    """Run ``warp_ar.tradeoff`` on a scene, or ``all``; texts of the files that it wrote, by name."""
+    out = folder / scene
+    command = [sys.executable, "-m", "warp_ar.tradeoff", scene, *options, "--device", "cpu", "--out", str(out)]
+    subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    print(f"  {scene}: done", flush=True)
+    return {path.name: path.read_text(encoding="utf-8") for path in out.iterdir() if path.suffix != ".html"}
+
+
+def every_scene(options: Sequence[str]) -> list[dict[str, str]]:
+    """The same for every bundled scene, as many at a time as there are cores."""
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as workers:
+        return list(workers.map(lambda scene: tradeoff(options, scene, Path(folder)), bundled_scenes()))
+
+
+def merge_errors(tables: Sequence[dict[str, Any]], lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The cost table of several scenes from those of each: means over the scenes that call for a method.
+
+    Args:
+        tables: As ``warp_ar.tradeoff`` writes them for one scene.
+        lines: Their JSON lines.
+    """
+    rows = [line for line in lines if line["kind"] == "method"]
+    merged = {key: tables[0][key] for key in ("program", "made")}
+    cases = dict.fromkeys(row["case"] for row in rows)
+    merged["made"] = {**merged["made"], "by": f"python -m warp_ar.tradeoff {' '.join(cases)}"}
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    for row in rows:
+        found.setdefault(row["setting"], {}).setdefault(row["method"], []).append(row)
+    for table in ("errors", "stage_errors", "dominated"):
+        merged[table] = {}
+    for setting, methods in found.items():
+        means = {method: statistics.fmean(row["error"] for row in own) for method, own in methods.items()}
+        best = min(means.values())
+        merged["errors"][setting] = {method: round(mean - best, 5) for method, mean in means.items()}
+        arrays = {
+            method: [row["relative_rmse"] for row in own if "relative_rmse" in row] for method, own in methods.items()
+        }
+        merged["stage_errors"][setting] = {name: round(statistics.fmean(own), 5) for name, own in arrays.items() if own}
+        beaten = [method for method, own in methods.items() if all(row["dominated"] for row in own)]
+        merged["dominated"] |= {setting: beaten} if beaten else {}
+    return merged
+
+
+def make_errors() -> None:
+    """Errors of methods."""
+    written = every_scene(ERROR_OPTIONS)
+    with tempfile.TemporaryDirectory() as folder:
+        # Lights with a size are in no bundled scene; ``all`` brings a copy of one that has them.
+        written.append(tradeoff((*ERROR_OPTIONS, "--stage", "light_shadow"), "all", Path(folder)))
+    found = [json.loads(line) for files in written for line in files["tradeoff.jsonl"].splitlines()]
+    lines = list({(line["kind"], *(line.get(key) for key in KEYS)): line for line in found}.values())
+    merged = merge_errors([json.loads(files["cost_table.json"]) for files in written], lines)
+    path = ROOT / "warp_ar" / "accuracy" / "cost_table.json"
+    path.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
+
+
+def make_presets() -> None:
+    """Errors of presets."""
+    lists = [json.loads(files["presets.json"]) for files in every_scene(PRESET_OPTIONS)]
+    errors = {scene: own for listed in lists for scene, own in listed["errors"].items()}
+    made = {**lists[0]["made"], "by": f"python -m warp_ar.tradeoff {' '.join(errors)} {' '.join(PRESET_OPTIONS)}"}
+    merged = {**lists[0], "made": made, "errors": errors}
+    (RESULTS / "presets.json").write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
+
+
+def make_costs(*, processor_time: bool) -> None:
+    """Milliseconds of methods and presets."""
+    clock = {"WARP_AR_CLOCK": "processor"} if processor_time else {}
+    command = [sys.executable, "-m", "bench", "costs", "--device", "cpu"]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | clock, check=True, stdout=subprocess.PIPE, text=True)
+    (RESULTS / "cpu_costs.jsonl").write_text(done.stdout, encoding="utf-8")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.make_cost_tables", description="All cost tables anew.")
+    steps_text = ",".join(STEPS)
+    parser.add_argument("--only", default=steps_text, help=f"steps, separated by commas (default: {steps_text})")
+    parser.add_argument("--processor-time", action="store_true", help="count the work of one thread")
+    options = parser.parse_args()
+    asked = options.only.split(",")
+    if not set(asked) <= set(STEPS):
+        parser.error(f"--only {options.only}: expected some of {', '.join(STEPS)}")
+    steps: dict[str, Callable[[], object]] = {
+        "errors": make_errors,
+        "presets": make_presets,
+        "costs": lambda: make_costs(processor_time=options.processor_time),
+        "budget": lambda: subprocess.run([sys.executable, "-m", "bench.record_costs"], cwd=ROOT, check=True),
+        "tables": lambda: subprocess.run([sys.executable, "-m", "bench.write_cost_tables"], cwd=ROOT, check=True),
+    }
+    for name in STEPS:
+        if name in asked:
+            start = time.perf_counter()
+            print(f"{name} ...", flush=True)
+            steps[name]()
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
