@@ -32,7 +32,7 @@ from warp_ar.kernels.area_lights import (
 )
 from warp_ar.kernels.edges import EdgeLists, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
-from warp_ar.kernels.materials import Surface, make_reflect_direct, make_surface, reflect, specular_occlusion
+from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.reflect import (
     DiffuseForm,
@@ -211,7 +211,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
             if glossiness > 0.0 and knows_levels(distant):
-                wi = reflect(wo, normal)
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
                 reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
                 if wp.static(config.near_field):
                     if near.known:

@@ -161,7 +161,7 @@ def test_phong_lobe_is_normalised(device, exponent):
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("roughness", [0.0, 0.3, 1.0])
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
+@pytest.mark.parametrize("metallic", [0.0, 0.3, 1.0])
 def test_white_furnace(device, model, roughness, metallic):
     """A white surface in a white environment is white, from every side."""
     record = material(model=model, roughness=roughness, metallic=metallic, shininess=10.0)

@@ -71,7 +71,7 @@ class Features:
     area_samples: int
     """Samples of objects that emit, per point that they light; 0: none does."""
     near_field: bool
-    """Objects show what surrounds them at close range."""
+    """Objects show what surrounds them at close range, and cast shadows on themselves."""
     irradiance: Literal["irradiance_sh", "irradiance_map"]
     """Resource that holds the environment's irradiance."""
     distant: DistantLightConfig
@@ -132,7 +132,7 @@ def find_features(request: Request) -> Features:
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,
-        near_field=environment and quality.method("shade") == "one_bounce",
+        near_field=environment and quality.method("shade") in ("few_rays", "one_bounce"),
         irradiance="irradiance_sh" if by_series else "irradiance_map",
         distant=_find_forms(
             scene,
