@@ -2,10 +2,11 @@
 
 Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
 
-*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
-picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
-way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
-empty receiver.
+*Irradiance*, what is to be added to that of the environment: one set of the environment's samples, each traced. Where
+something is in the way, its radiance takes the place of the sample's. A proxy shows the camera's picture of it (see
+``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object shows what the distant
+environment makes of it. So an object's underside sees the shadow that it stands in, not an empty receiver. Where nothing
+is near the sum is zero, without noise: the environment's irradiance is known.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
@@ -114,7 +115,7 @@ class ReceiverLayers:
 class NearLight:
     """What reaches the pixels of objects from near by; empty where no material asks for it."""
 
-    irradiance: wp.array2d[wp.vec3]
+    irradiance: wp.array2d[wp.vec3]  # to be added to the environment's
     reflected: wp.array2d[wp.vec4]  # premultiplied near radiance, and its share of the rays
     transmitted: wp.array2d[wp.vec4]  # the environment along rays that pass the near field, and its brightness on all
 
@@ -367,11 +368,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                 )
             if wp.static(config.distant.diffuse != "none"):
                 if n < diffuse:
-                    radiance = ray.radiance
                     if near[3] > 0.0:
-                        radiance = wp.vec3(near[0], near[1], near[2])
-                    if ray.weight > 0.0:
-                        total += ray.weight * radiance
+                        total += ray.weight * (wp.vec3(near[0], near[1], near[2]) - ray.radiance)
             if wp.static(config.distant.specular):
                 if n >= diffuse and ray.leaves:
                     leaving += 1.0

@@ -102,7 +102,7 @@ class NearPoint:
     """What ``near_field`` knows of a point of an object."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
-    irradiance: wp.vec3
+    irradiance: wp.vec3  # to be added to the environment's
     reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
@@ -204,7 +204,7 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
             irradiance = distant_irradiance(distant, hit.point, normal)
             if wp.static(config.near_field):
                 if near.known:
-                    irradiance = near.irradiance
+                    irradiance = wp.max(irradiance + near.irradiance, wp.vec3(0.0))
             if wp.static(forms.textures):
                 irradiance *= surface.occlusion
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi

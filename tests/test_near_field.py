@@ -33,8 +33,8 @@ from warp_ar.scene import load_scene
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
-# Sampling error of one set of 64 for a cosine lobe of any direction.
-FURNACE_ERROR = 0.15
+# What is met is as bright as what it hides: sums of rounded differences of 1.
+FURNACE_ERROR = 1e-5
 BALL = (0.0, 0.0, 0.06)
 RADIUS = 0.05
 LEVEL_HEIGHT = 8
@@ -123,8 +123,7 @@ def test_white_furnace(device):
     irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK])
     inside = irradiance[found >= 0]
     assert len(inside) > 50
-    np.testing.assert_allclose(inside.mean(0), np.pi, rtol=0.02)
-    np.testing.assert_allclose(inside, np.pi, rtol=FURNACE_ERROR)
+    np.testing.assert_allclose(inside, 0.0, atol=FURNACE_ERROR)
 
 
 @pytest.mark.parametrize("code", [0, 255])
@@ -153,8 +152,9 @@ def test_matches_the_twin(device, code):
 def test_dark_desk_darkens_the_flanks_not_the_top(device):
     irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0)
     up = hits["normal"][..., 2]
-    assert irradiance[(found >= 0) & (up > 0.97)].mean() > 0.95 * np.pi
-    flank = irradiance[(found >= 0) & (up < 0.4)]
+    assert (irradiance[(found >= 0) & (up > 0.999)] == 0.0).all()  # nothing is near, and nothing is noisy
+    assert irradiance[(found >= 0) & (up > 0.97)].mean() > -0.05 * np.pi
+    flank = np.pi + irradiance[(found >= 0) & (up < 0.4)]
     assert len(flank) > 5
     assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
 
@@ -326,7 +326,6 @@ def test_garbage_in_the_environment_stays_finite(device):
     environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
     irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
     assert np.isfinite(irradiance).all()
-    assert (irradiance >= 0).all()
 
 
 def test_bands_agree_with_the_whole(device):

@@ -143,7 +143,7 @@ class NearField(Stage):
     def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
         layers = self.features.layers
-        rays = RAYS[self.request.quality.method("shade")]
+        rays = RAYS[self.features.near_field]
         materials = scene_materials(self.request.scene)
         widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
