@@ -202,11 +202,15 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
             radiance = surface.emission
         if wp.static(forms.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
+            lost = wp.vec3(0.0)
+            if wp.static(forms.textures):
+                lost = (1.0 - surface.occlusion) * irradiance
             if wp.static(config.near_field):
                 if near.known:
-                    irradiance = wp.max(irradiance + near.irradiance, wp.vec3(0.0))
-            if wp.static(forms.textures):
-                irradiance *= surface.occlusion
+                    # A picture of occlusion shows what rays find as well: the darker of the two holds.
+                    lost = wp.max(lost, -near.irradiance) - wp.max(near.irradiance, wp.vec3(0.0))
+            if wp.static(config.near_field or forms.textures):
+                irradiance = wp.max(irradiance - lost, wp.vec3(0.0))
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
@@ -218,7 +222,11 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
                         added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
                         reflected = (1.0 - near.reflected[3]) * reflected + added
                 if wp.static(forms.textures):
-                    reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                    hidden = 1.0 - specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                    if wp.static(config.near_field):
+                        if near.known:
+                            hidden = 0.0  # rays know
+                    reflected *= 1.0 - hidden
                 radiance += wp.cw_mul(surface.reflectance, reflected)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):
