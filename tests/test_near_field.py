@@ -3,6 +3,7 @@ import warnings
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 from tests.error_model import check_error
@@ -29,7 +30,8 @@ from warp_ar.kernels.structs import (
 )
 from warp_ar.kernels.trace import TraceConfig
 from warp_ar.kernels.visibility import VisibleObjects, make_visible, trace_pixels
-from warp_ar.scene import load_scene
+from warp_ar.scene import Object, load_scene
+from warp_ar.stages.features import find_features
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
@@ -358,10 +360,27 @@ def _alike_kernel(visible: VisibleObjects, asked: wp.array[Hit], out: wp.array[w
 
 def test_stage_follows_the_method_of_shade():
     scene = load_scene("mirror")
-    for method, expected in (("environment", False), ("one_bounce", True)):
+    for method, expected in (("environment", False), ("few_rays", True), ("one_bounce", True)):
         quality = PRESETS["medium"].with_methods(shade=method)
         plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
         assert ("near_field" in {stage.name for stage, _ in plan.stages}) == expected
     bare = dataclasses.replace(scene, objects=())
     plan = make_plan(Request(bare, quality, (scene.camera.width, scene.camera.height)))
     assert "no virtual object" in dict(plan.left_out)["near_field"]
+
+
+def test_models_of_files_shade_themselves_where_the_environment_casts_shadows(tmp_path):
+    path = tmp_path / "cup.ply"
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 200, np.uint8)
+    mesh.export(path)
+    plain = load_scene("mirror")
+    colored = dataclasses.replace(plain, objects=(Object("mesh", file=path),))
+    for preset, scene, expected in (
+        ("medium", colored, "few_rays"),
+        ("medium", plain, ""),
+        ("low", colored, ""),
+        ("high", colored, "one_bounce"),
+    ):
+        request = Request(scene, PRESETS[preset], (scene.camera.width, scene.camera.height))
+        assert find_features(request).near_field == expected
