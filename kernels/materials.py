@@ -14,8 +14,8 @@ whether it is part of the environment or a virtual light.
 
 Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, Schlick's Fresnel with
 F0 = 0.04 for what is no metal. Two objects that glTF leaves open are settled by energy: light that scatters more than
-once between the facets is put back (``split_sum``), and the diffuse part gets what the facets let pass, 1 - (their directional
-albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
+once between the facets is put back (``split_sum``), and the diffuse part gets what the facets let pass, 1 - (their
+directional albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
 
 References:
     [LW94] Lafortune, Willems, "Using the Modified Phong Reflectance Model for Physically Based Rendering", CW 197,
@@ -240,8 +240,8 @@ def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
 #
 #     | n + (1 - steady (1 - k)) (R - n) |.
 #
-# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 % to 80
-# % less than around R.
+# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 to 80 %
+# less than around R.
 @wp.func
 def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """Direction around which the environment's level of a surface's lobe is read, as derived above; unit."""

@@ -5,8 +5,8 @@ Per pixel of an object, two objects replace what the distant environment alone w
 *Irradiance*, what is to be added to that of the environment: one set of the environment's samples, each traced. Where
 something is in the way, its radiance takes the place of the sample's. A proxy shows the camera's picture of it (see
 ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object shows what the distant
-environment makes of it. So an object's underside sees the shadow that it stands in, not an empty receiver. Where nothing
-is near the sum is zero, without noise: the environment's irradiance is known.
+environment makes of it. So an object's underside sees the shadow that it stands in, not an empty receiver. Where
+nothing is near the sum is zero, without noise: the environment's irradiance is known.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they

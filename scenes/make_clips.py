@@ -114,7 +114,15 @@ SCENES = {
     "darken": "darken",
 }
 """The clip that each bundled scene plays."""
-BUNDLED = {"desk": 24, "torus": 84, "mirror": 24, "screen": 60, "wire_coincident": 36, "wire_opposing": 36, "darken": 36}
+BUNDLED = {
+    "desk": 24,
+    "torus": 84,
+    "mirror": 24,
+    "screen": 60,
+    "wire_coincident": 36,
+    "wire_opposing": 36,
+    "darken": 36,
+}
 """Frame of each scene whose truth is bundled; the light of the last three is still."""
 
 

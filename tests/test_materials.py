@@ -248,7 +248,7 @@ def test_a_rough_lobe_leans_to_the_normal(device, metallic, roughness, cos_o):
     record = material(model=METALLIC_ROUGHNESS, roughness=roughness, metallic=metallic, base_color=(0.8, 0.8, 0.8))
     wo = np.array([np.sqrt(1 - cos_o**2), 0.0, cos_o])
     mirror = wo * [-1, -1, 1]
-    wi, solid = hemisphere(400, 128, about=mirror + [1e-9, 0, 0], width=roughness**2)
+    wi, solid = hemisphere(400, 128, about=mirror + np.array([1e-9, 0, 0]), width=roughness**2)
     direct, diffuse, _, _ = reflected(record, wi, [wo], device)
     lobe = (direct[:, 0] - diffuse[0, 0] * np.maximum(wi[:, 2], 0.0) / np.pi) * solid
     mean = (lobe[:, None] * wi).sum(axis=0)

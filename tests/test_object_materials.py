@@ -10,8 +10,8 @@ import pytest
 import trimesh
 import warp as wp
 
-from tests.reference import prefilter as reference
 from tests.gltf_files import SQUARE_UVS, Gltf
+from tests.reference import prefilter as reference
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
 from warp_ar.kernels.shapes import FAR

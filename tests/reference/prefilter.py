@@ -60,8 +60,9 @@ def energy_compensation(once, f0):
 def scatterings(cos_o, roughness, count, rng, most=40):
     """Shares of light that leave a GGX surface after 0, 1, ... scatterings between its facets: a random walk.
 
-    Heitz et al., "Multiple-Scattering Microfacet BSDFs with the Smith Model", 2016: heights are even over [-1, 1]; facets
-    are drawn as they are seen, also from below (Dupuy, Benyoub, "Sampling Visible GGX Normals with Spherical Caps").
+    Heitz et al., "Multiple-Scattering Microfacet BSDFs with the Smith Model", 2016: heights are even over [-1, 1];
+    facets are drawn as they are seen, also from below (Dupuy, Benyoub, "Sampling Visible GGX Normals with Spherical
+    Caps").
     """
     alpha = roughness**2
     direction = np.tile([-np.sqrt(1 - cos_o**2), 0.0, -cos_o], (count, 1))
