@@ -240,8 +240,8 @@ def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
 #
 #     | n + (1 - steady (1 - k)) (R - n) |.
 #
-# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 to 80 %
-# less than around R.
+# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 to 80
+# per cent less than around R.
 @wp.func
 def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """Direction around which the environment's level of a surface's lobe is read, as derived above; unit."""
