@@ -77,6 +77,8 @@ SHARP_ALPHA = 0.02
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
+NO_RAY = wp.constant(wp.float32(-1.0))
+"""Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
@@ -403,6 +405,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         if wp.static(config.distant.specular):
             near_out.reflected[i, j] = reflected / wp.max(leaving, 1.0)
             near_out.transmitted[i, j] = transmitted / wp.max(leaving, 1.0)
+            if glossy > 0 and leaving == 0.0 and alpha >= SHARP:
+                near_out.reflected[i, j] = wp.vec4(0.0, 0.0, 0.0, NO_RAY)
 
     return near_field_kernel
 
@@ -446,6 +450,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
+        lobes = float(0.0)  # weights of pixels of which a ray left the surface
         distant = wp.vec4(0.0)
         reach = wp.static(side // 2)
         for a in range(-reach, reach + 1):
@@ -458,16 +463,18 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
                         if wp.static(config.distant.diffuse != "none"):
                             light += weight * estimate.irradiance[i + a, j + b]
                         if wp.static(config.distant.specular):
-                            glossy += weight * estimate.reflected[i + a, j + b]
-                            distant += weight * estimate.transmitted[i + a, j + b]
+                            if estimate.reflected[i + a, j + b][3] != NO_RAY:
+                                lobes += weight
+                                glossy += weight * estimate.reflected[i + a, j + b]
+                                distant += weight * estimate.transmitted[i + a, j + b]
         if wp.static(config.distant.diffuse != "none"):
             near_out.irradiance[i, j] = light / weights
         if wp.static(config.distant.specular):
             if sharp:
                 near_out.reflected[i, j] = estimate.reflected[i, j]
                 return
-            near = glossy / weights
-            distant = distant / weights
+            near = glossy / wp.max(lobes, MIN_LIGHT)
+            distant = distant / wp.max(lobes, MIN_LIGHT)
             missed = brightness(wp.vec3(distant[0], distant[1], distant[2]))
             # What passes is no more than all; rounding may say otherwise.
             left = wp.where(distant[3] > MIN_LIGHT, wp.min(missed / distant[3], 1.0), 1.0)
