@@ -142,13 +142,14 @@ def main(device: str, arguments: list[str]) -> None:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--samples", type=int, default=128)
     parser.add_argument("--quality", default="medium")
+    parser.add_argument("--variant", default="scalar_rgb", help="Mitsuba's; llvm_ad_rgb is quicker for many samples")
     parser.add_argument("--only", default="", help="names, separated by commas")
     options = parser.parse_args(arguments)
     import mitsuba as mi
 
     from bench.assets_three import ThreePage
 
-    mi.set_variant("scalar_rgb")  # compiles nothing: each file has materials of its own
+    mi.set_variant(options.variant)  # scalar_rgb compiles nothing: each file has materials of its own
     options.output.mkdir(parents=True, exist_ok=True)
     radiance = make_environment()
     light = options.output / "environment.exr"

@@ -106,17 +106,24 @@ def register_glossy() -> str:
                 value = self.base * cos_i / dr.pi + self.specular * (self.shininess + 1) / (2 * dr.pi) * power
                 return dr.select(active, value, 0)
             scale, bias = self.albedo(cos_o)
-            beyond = 1 / dr.maximum(scale + bias, 1e-3) - 1
-            f0 = DIELECTRIC_F0 * (1 - self.metallic) + self.metallic * self.base
-            plastic = (DIELECTRIC_F0 * scale + bias) * (1 + DIELECTRIC_F0 * beyond)
+            once = dr.clip(scale + bias, 1e-3, 1)
+            later = dr.sqrt(once)
+
+            def gain(f: Any) -> Any:
+                return 1 + f * (1 / once - 1) * later / (1 - f * (1 - later))
+
+            plastic_gain, metal_gain = gain(DIELECTRIC_F0), gain(self.base)
+            f0 = DIELECTRIC_F0 * (1 - self.metallic) * plastic_gain + self.metallic * self.base * metal_gain
+            f90 = (1 - self.metallic) * plastic_gain + self.metallic * metal_gain
+            plastic = (DIELECTRIC_F0 * scale + bias) * plastic_gain
             half = dr.normalize(wo + si.wi)
-            fresnel = f0 + dr.power(dr.clip(1 - dr.dot(si.wi, half), 0, 1), 5) * (1 - f0)
+            fresnel = f0 + dr.power(dr.clip(1 - dr.dot(si.wi, half), 0, 1), 5) * (f90 - f0)
             square = self.alpha * self.alpha
             cos_h = mi.Frame3f.cos_theta(half)
             lobe = square / (dr.pi * dr.square(cos_h * cos_h * (square - 1) + 1))
             smith = cos_i * dr.sqrt(cos_o * cos_o * (1 - square) + square)
             smith += cos_o * dr.sqrt(cos_i * cos_i * (1 - square) + square)
-            glossy = cos_i * lobe * 0.5 / smith * fresnel * (1 + f0 * beyond)
+            glossy = cos_i * lobe * 0.5 / smith * fresnel
             diffuse = (1 - self.metallic) * self.base * (1 - plastic) * cos_i / dr.pi
             return dr.select(active, glossy + diffuse, 0)
 

@@ -424,9 +424,9 @@ def lobe_weight(surface: Surface, normal: wp.vec3, wo: wp.vec3, wi: wp.vec3) -> 
         alpha = surface.roughness * surface.roughness
         from_world = wp.transpose(frame_from_normal(normal))
         o = from_world * wo
-        fresnel = surface.f0 + schlick(wp.dot(wo, half)) * (wp.vec3(1.0) - surface.f0)
+        fresnel = surface.f0 + schlick(wp.dot(wo, half)) * (surface.f90 - surface.f0)
         shadowing = ggx_masking_shadowing(from_world * wi, o, alpha) / wp.max(ggx_masking(o, alpha), 1.0e-6)
-        return shadowing * wp.cw_mul(fresnel, surface.gain)
+        return shadowing * fresnel
     return surface.reflectance
 
 
@@ -435,7 +435,8 @@ def without_lobe(surface: Surface) -> Surface:
     """The diffuse part alone."""
     result = surface
     result.reflectance = wp.vec3(0.0)
-    result.gain = wp.vec3(0.0)
+    result.f0 = wp.vec3(0.0)
+    result.f90 = wp.vec3(0.0)
     return result
 
 

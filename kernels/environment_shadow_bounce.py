@@ -26,7 +26,7 @@ import warp as wp
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.lobes import level_from_alpha, sample_levels
-from warp_ar.kernels.materials import make_surface, reflect
+from warp_ar.kernels.materials import lobe_axis, make_surface, reflect
 from warp_ar.kernels.reflect import (
     RAY_SPREAD,
     DistantLight,
@@ -149,7 +149,7 @@ def make_estimated(config: DistantLightConfig) -> wp.Function:
             sent.distant = wp.cw_mul(surface.diffuse, irradiance - received) / wp.pi
         if wp.static(config.specular):
             if knows_levels(distant):
-                wi = reflect(wo, normal)
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
                 floor = level_from_alpha(alpha, distant.level_height)
                 reflected = reflected_radiance(
                     distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, floor

@@ -14,8 +14,8 @@ whether it is part of the environment or a virtual light.
 
 Metallic-roughness is glTF's: GGX with alpha = roughness^2, height-correlated Smith visibility, Schlick's Fresnel with
 F0 = 0.04 for what is no metal. Two objects that glTF leaves open are settled by energy: light that scatters more than
-once between the facets is put back [Tur19], and the diffuse part gets what the facets let pass, 1 - (their directional
-albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
+once between the facets is put back (``split_sum``), and the diffuse part gets what the facets let pass, 1 - (their
+directional albedo), rather than 1 - F of one facet. A white surface in a white environment is white, at any roughness.
 
 References:
     [LW94] Lafortune, Willems, "Using the Modified Phong Reflectance Model for Physically Based Rendering", CW 197,
@@ -23,8 +23,7 @@ References:
     [WMLT07] Walter et al., "Microfacet Models for Refraction through Rough Surfaces", EGSR 2007.
     [Hei14] Heitz, "Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs", JCGT 3(2), 2014.
     [glTF] Khronos, glTF 2.0 specification, appendix B.
-    [LdR14] Lagarde, de Rousiers, "Moving Frostbite to Physically Based Rendering", 2014, section 4.10.2.
-    [Tur19] Turquin, "Practical Multiple Scattering Compensation for Microfacet Models", 2019.
+    [LdR14] Lagarde, de Rousiers, "Moving Frostbite to Physically Based Rendering", 2014, sections 4.9.3 and 4.10.2.
 """
 
 from __future__ import annotations
@@ -59,10 +58,12 @@ class Surface:
     model: wp.int32
     diffuse: wp.vec3  # Lambertian reflectance of what the lobe leaves
     reflectance: wp.vec3  # of the lobe, under light from everywhere
-    f0: wp.vec3  # METALLIC_ROUGHNESS: reflectance of a facet at normal incidence
-    gain: wp.vec3  # METALLIC_ROUGHNESS: factor for light that scatters more than once
+    # METALLIC_ROUGHNESS: reflectance of a facet, with what light that scatters more than once adds
+    f0: wp.vec3  # at normal incidence
+    f90: wp.vec3  # at grazing incidence
     shininess: wp.float32  # PHONG
     roughness: wp.float32  # METALLIC_ROUGHNESS; perceptual
+    steady: wp.float32  # METALLIC_ROUGHNESS: share of the lobe that its facets reflect alike from all sides
     # Only where there are textures, else not set:
     emission: wp.vec3  # radiance that it sends out itself
     occlusion: wp.float32  # share of the environment's irradiance that reaches it
@@ -180,14 +181,19 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
                 surface.reflectance = base
         if wp.static(METALLIC_ROUGHNESS in models):
             if material.model == METALLIC_ROUGHNESS:
+                # Metal and dielectric are mixed as they reflect, not as their facets do: each has its own factor for
+                # what scatters more than once, or a mixture of two white ones would be darker than either.
                 one = wp.vec3(1.0, 1.0, 1.0)
                 scale_bias = sample_dfg(dfg, cos_o, roughness)
-                dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * energy_compensation(
-                    scale_bias, DIELECTRIC_F0 * one
-                )
-                surface.f0 = DIELECTRIC_F0 * (1.0 - metallic) * one + metallic * base
-                surface.gain = energy_compensation(scale_bias, surface.f0)
-                surface.reflectance = wp.cw_mul(scale_bias[0] * surface.f0 + scale_bias[1] * one, surface.gain)
+                plastic_gain = energy_compensation(scale_bias, DIELECTRIC_F0 * one)
+                metal_gain = energy_compensation(scale_bias, base)
+                dielectric = (DIELECTRIC_F0 * scale_bias[0] + scale_bias[1]) * plastic_gain
+                surface.f0 = DIELECTRIC_F0 * (1.0 - metallic) * plastic_gain + metallic * wp.cw_mul(base, metal_gain)
+                surface.f90 = (1.0 - metallic) * plastic_gain + metallic * metal_gain
+                surface.reflectance = scale_bias[0] * surface.f0 + scale_bias[1] * surface.f90
+                steady = scale_bias[0] * (surface.f0[0] + surface.f0[1] + surface.f0[2])
+                reflected = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
+                surface.steady = steady / wp.max(reflected, 1.0e-6)
                 surface.diffuse = (1.0 - metallic) * wp.cw_mul(base, one - dielectric)
                 surface.roughness = roughness
         if wp.static(textures):
@@ -195,7 +201,8 @@ def make_surface(models: tuple[int, ...], textures: bool) -> wp.Function:
                 surface.emission = base
                 surface.diffuse = wp.vec3(0.0)
                 surface.reflectance = wp.vec3(0.0)
-                surface.gain = wp.vec3(0.0)
+                surface.f0 = wp.vec3(0.0)
+                surface.f90 = wp.vec3(0.0)
         return surface
 
     return surface_at
@@ -221,6 +228,29 @@ def specular_occlusion(occlusion: wp.float32, cos_o: wp.float32, roughness: wp.f
 def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """Mirror direction of ``wo``."""
     return 2.0 * wp.dot(normal, wo) * normal - wo
+
+
+# A GGX lobe as rough as alpha is cut off by the surface and shadowed by its facets: its mean lies between the mirror
+# direction R and the normal n, which it reaches at alpha = 1, where the lobe is a cosine. [LdR14] has
+#
+#     n + k (R - n),  k = (1 - alpha) (sqrt(1 - alpha) + alpha).
+#
+# That is the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon:
+# that part of the lobe, 1 - steady, is taken to stay around R. So
+#
+#     | n + (1 - steady (1 - k)) (R - n) |.
+#
+# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 to 80
+# per cent less than around R.
+@wp.func
+def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
+    """Direction around which the environment's level of a surface's lobe is read, as derived above; unit."""
+    if surface.model != METALLIC_ROUGHNESS:
+        return mirror
+    alpha = surface.roughness * surface.roughness
+    smooth = wp.max(1.0 - alpha, 0.0)
+    lean = surface.steady * (1.0 - smooth * (wp.sqrt(smooth) + alpha))
+    return wp.normalize(normal + (1.0 - lean) * (mirror - normal))
 
 
 @wp.func
@@ -292,9 +322,9 @@ def make_reflect_direct(models: tuple[int, ...]) -> wp.Function:
                     # wi = -wo has no half vector; it only comes up where both graze, and nothing is reflected there.
                     if length > 1.0e-6:
                         half = half / length
-                        fresnel = surface.f0 + schlick(wp.dot(wo, half)) * (wp.vec3(1.0) - surface.f0)
+                        fresnel = surface.f0 + schlick(wp.dot(wo, half)) * (surface.f90 - surface.f0)
                         lobe = ggx_lobe(normal, half, cos_i, wp.dot(normal, wo), surface.roughness)
-                        result += cos_i * lobe * wp.cw_mul(fresnel, surface.gain)
+                        result += cos_i * lobe * fresnel
         return result
 
     return reflect_direct

@@ -2,10 +2,11 @@
 
 Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
 
-*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
-picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
-way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
-empty receiver.
+*Irradiance*, what is to be added to that of the environment: one set of the environment's samples, each traced. Where
+something is in the way, its radiance takes the place of the sample's. A proxy shows the camera's picture of it (see
+``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object shows what the distant
+environment makes of it. So an object's underside sees the shadow that it stands in, not an empty receiver. Where
+nothing is near the sum is zero, without noise: the environment's irradiance is known.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
@@ -76,6 +77,8 @@ SHARP_ALPHA = 0.02
 SHARP = wp.constant(wp.float32(SHARP_ALPHA))
 MIN_LIGHT = wp.constant(wp.float32(1.0e-6))
 """Brightness, in camera values, below which a lobe's share is 0 over 0."""
+NO_RAY = wp.constant(wp.float32(-1.0))
+"""Share of a pixel whose rays all ran into its surface: it knows nothing of its lobe."""
 RAY_WIDTH = 2.0
 """Width of one ray of many, over the width that its share of the lobe has."""
 SAME_NORMAL = wp.constant(wp.float32(math.cos(math.radians(20.0))))
@@ -114,7 +117,7 @@ class ReceiverLayers:
 class NearLight:
     """What reaches the pixels of objects from near by; empty where no material asks for it."""
 
-    irradiance: wp.array2d[wp.vec3]
+    irradiance: wp.array2d[wp.vec3]  # to be added to the environment's
     reflected: wp.array2d[wp.vec4]  # premultiplied near radiance, and its share of the rays
     transmitted: wp.array2d[wp.vec4]  # the environment along rays that pass the near field, and its brightness on all
 
@@ -367,11 +370,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                 )
             if wp.static(config.distant.diffuse != "none"):
                 if n < diffuse:
-                    radiance = ray.radiance
                     if near[3] > 0.0:
-                        radiance = wp.vec3(near[0], near[1], near[2])
-                    if ray.weight > 0.0:
-                        total += ray.weight * radiance
+                        total += ray.weight * (wp.vec3(near[0], near[1], near[2]) - ray.radiance)
             if wp.static(config.distant.specular):
                 if n >= diffuse and ray.leaves:
                     leaving += 1.0
@@ -405,6 +405,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
         if wp.static(config.distant.specular):
             near_out.reflected[i, j] = reflected / wp.max(leaving, 1.0)
             near_out.transmitted[i, j] = transmitted / wp.max(leaving, 1.0)
+            if glossy > 0 and leaving == 0.0 and alpha >= SHARP:
+                near_out.reflected[i, j] = wp.vec4(0.0, 0.0, 0.0, NO_RAY)
 
     return near_field_kernel
 
@@ -448,6 +450,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
         light = wp.vec3(0.0)
         glossy = wp.vec4(0.0)
         weights = float(0.0)
+        lobes = float(0.0)  # weights of pixels of which a ray left the surface
         distant = wp.vec4(0.0)
         reach = wp.static(side // 2)
         for a in range(-reach, reach + 1):
@@ -460,16 +463,18 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
                         if wp.static(config.distant.diffuse != "none"):
                             light += weight * estimate.irradiance[i + a, j + b]
                         if wp.static(config.distant.specular):
-                            glossy += weight * estimate.reflected[i + a, j + b]
-                            distant += weight * estimate.transmitted[i + a, j + b]
+                            if estimate.reflected[i + a, j + b][3] != NO_RAY:
+                                lobes += weight
+                                glossy += weight * estimate.reflected[i + a, j + b]
+                                distant += weight * estimate.transmitted[i + a, j + b]
         if wp.static(config.distant.diffuse != "none"):
             near_out.irradiance[i, j] = light / weights
         if wp.static(config.distant.specular):
             if sharp:
                 near_out.reflected[i, j] = estimate.reflected[i, j]
                 return
-            near = glossy / weights
-            distant = distant / weights
+            near = glossy / wp.max(lobes, MIN_LIGHT)
+            distant = distant / wp.max(lobes, MIN_LIGHT)
             missed = brightness(wp.vec3(distant[0], distant[1], distant[2]))
             # What passes is no more than all; rounding may say otherwise.
             left = wp.where(distant[3] > MIN_LIGHT, wp.min(missed / distant[3], 1.0), 1.0)

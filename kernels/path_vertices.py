@@ -194,7 +194,7 @@ def polished(scene: LocalScene, vertex: Vertex, diffuse: wp.vec3) -> Surface:
     surface.diffuse = diffuse
     surface.f0 = wp.vec3(values[0], values[1], values[2])
     surface.reflectance = surface.f0
-    surface.gain = wp.vec3(1.0, 1.0, 1.0)
+    surface.f90 = wp.vec3(1.0, 1.0, 1.0)
     surface.roughness = values[3]
     return surface
 

@@ -20,7 +20,7 @@ from warp_ar.kernels.emitters import add_emitters, correct_parallax
 from warp_ar.kernels.irradiance import sh_irradiance
 from warp_ar.kernels.latlong import sample_latlong
 from warp_ar.kernels.lobes import level_from_roughness, level_from_shininess, sample_levels
-from warp_ar.kernels.materials import make_surface, reflect, specular_occlusion
+from warp_ar.kernels.materials import lobe_axis, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.pixels import shown_radiance
 from warp_ar.kernels.structs import (
     LAMBERT,
@@ -189,7 +189,7 @@ def make_shade_unoccluded(config: DistantLightConfig) -> wp.Function:
                 radiance = surface.occlusion * radiance
         if wp.static(config.specular):
             if knows_levels(distant):
-                wi = reflect(wo, normal)
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
                 reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
                 if wp.static(config.textures):
                     reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)

@@ -32,7 +32,7 @@ from warp_ar.kernels.area_lights import (
 )
 from warp_ar.kernels.edges import EdgeList, EdgeLists, holds_all, list_edge, listed_edges, sample_listed_edges
 from warp_ar.kernels.launch import MOST_REGISTERS, Rows, launch_rows, slow_to_compile
-from warp_ar.kernels.materials import Surface, make_reflect_direct, make_surface, reflect, specular_occlusion
+from warp_ar.kernels.materials import Surface, lobe_axis, make_reflect_direct, make_surface, reflect, specular_occlusion
 from warp_ar.kernels.near_field import NearLight
 from warp_ar.kernels.reflect import (
     DiffuseForm,
@@ -104,7 +104,7 @@ class NearPoint:
     """What ``near_field`` knows of a point of an object."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
-    irradiance: wp.vec3
+    irradiance: wp.vec3  # to be added to the environment's
     reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
@@ -204,23 +204,31 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
             radiance = surface.emission
         if wp.static(forms.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
+            lost = wp.vec3(0.0)
+            if wp.static(forms.textures):
+                lost = (1.0 - surface.occlusion) * irradiance
             if wp.static(config.near_field):
                 if near.known:
-                    irradiance = near.irradiance
-            if wp.static(forms.textures):
-                irradiance *= surface.occlusion
+                    # A picture of occlusion shows what rays find as well: the darker of the two holds.
+                    lost = wp.max(lost, -near.irradiance) - wp.max(near.irradiance, wp.vec3(0.0))
+            if wp.static(config.near_field or forms.textures):
+                irradiance = wp.max(irradiance - lost, wp.vec3(0.0))
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]
             if glossiness > 0.0 and knows_levels(distant):
-                wi = reflect(wo, normal)
+                wi = lobe_axis(surface, reflect(wo, normal), normal)
                 reflected = glossy(distant, surface.model, surface.roughness, surface.shininess, hit.point, wi, 0.0)
                 if wp.static(config.near_field):
                     if near.known:
                         added = wp.vec3(near.reflected[0], near.reflected[1], near.reflected[2])
                         reflected = (1.0 - near.reflected[3]) * reflected + added
                 if wp.static(forms.textures):
-                    reflected *= specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                    hidden = 1.0 - specular_occlusion(surface.occlusion, cos_o, surface.roughness)
+                    if wp.static(config.near_field):
+                        if near.known:
+                            hidden = 0.0  # rays know
+                    reflected *= 1.0 - hidden
                 radiance += wp.cw_mul(surface.reflectance, reflected)
         if wp.static(len(config.lights) > 0):
             for index in range(lights.shape[0]):

@@ -108,13 +108,22 @@ SCENES = {
     "desk": "desk",
     "torus": "desk",
     "mirror": "desk",
+    "screen": "desk",
     "wire_coincident": "wire",
     "wire_opposing": "wire",
     "darken": "darken",
 }
 """The clip that each bundled scene plays."""
-BUNDLED = {"desk": 24, "torus": 84, "mirror": 24, "wire_coincident": 36, "wire_opposing": 36, "darken": 36}
-"""Frame of each scene whose truth is bundled: daylight, ceiling lamp, daylight; the light of the others is still."""
+BUNDLED = {
+    "desk": 24,
+    "torus": 84,
+    "mirror": 24,
+    "screen": 60,
+    "wire_coincident": 36,
+    "wire_opposing": 36,
+    "darken": 36,
+}
+"""Frame of each scene whose truth is bundled; the light of the last three is still."""
 
 
 class Renderer:

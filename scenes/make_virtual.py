@@ -107,16 +107,21 @@ def virtual_material(material: Dict) -> Dict:
     return mirror(material["base_color"]) if model == "mirror" else matte(material["base_color"])
 
 
-def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
+def placed(item: Dict) -> Any:
+    """Where an object or a light stands, and how it is turned."""
     t = mi.ScalarTransform4f()
     rx, ry, rz = item.get("rotate", (0, 0, 0))
-    place = (
+    return (
         t.translate(item.get("at", [0, 0, 0]))
         @ t.rotate([0, 0, 1], rz)
         @ t.rotate([0, 1, 0], ry)
         @ t.rotate([1, 0, 0], rx)
     )
-    place = place @ t.scale(item.get("scale", 1.0))
+
+
+def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
+    t = mi.ScalarTransform4f()
+    place = placed(item) @ t.scale(item.get("scale", 1.0))
     bsdf = virtual_material(item["material"])
     if item["shape"] == "mesh":
         return {
@@ -142,7 +147,29 @@ def virtual_object(item: Dict, folder: pathlib.Path) -> Dict:
     )
 
 
+def virtual_rect(light: Dict) -> Dict:
+    """A rectangle that shines where its +z points; its picture, if it has one, stands upright with +y."""
+    factor = np.array(light.get("color", (1.0, 1.0, 1.0))) * light["intensity"]
+    radiance: Dict = rgb(factor)
+    if "image" in light:
+        codes = np.array(mi.Bitmap(str(HERE / light["image"])))[::-1, :, :3] / 255.0
+        linear = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+        bitmap = mi.Bitmap(np.ascontiguousarray(linear * factor, np.float32))
+        radiance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "clamp"}
+    width, height = light["size"]
+    place = placed(light) @ mi.ScalarTransform4f().scale([0.5 * width, 0.5 * height, 1.0])
+    black = {"type": "diffuse", "reflectance": rgb(np.zeros(3))}
+    return {
+        "type": "rectangle",
+        "to_world": place,
+        "bsdf": black,
+        "emitter": {"type": "area", "radiance": radiance},
+    }
+
+
 def virtual_light(light: Dict) -> Dict:
+    if light["kind"] == "rect":
+        return virtual_rect(light)
     power = rgb(np.array(light["color"]) * light["intensity"])
     if light["kind"] == "point":
         return {"type": "point", "position": light["at"], "intensity": power}

@@ -310,7 +310,7 @@ def even_costs(settings: tuple[Setting, ...], base: float = 1.0, step: float = 1
 
 def light(pipeline: AutoPipeline, image: np.ndarray, count: int = 0) -> None:
     """Show frames until the first choice is made, else so many; what is being built is waited for."""
-    for shown in range(count or 100):
+    for shown in range(count or 200):
         # As in ``show_again``: stages rest where nothing changes, and their times with them.
         pipeline(image - (shown % 2) * (image // 8), time_seconds=shown / FPS)
         if pipeline._switcher.busy:

@@ -3,6 +3,7 @@ import warnings
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 
 from tests.error_model import check_error
@@ -29,12 +30,13 @@ from warp_ar.kernels.structs import (
 )
 from warp_ar.kernels.trace import TraceConfig
 from warp_ar.kernels.visibility import VisibleObjects, make_visible, trace_pixels
-from warp_ar.scene import load_scene
+from warp_ar.scene import Object, load_scene
+from warp_ar.stages.features import find_features
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
-# Sampling error of one set of 64 for a cosine lobe of any direction.
-FURNACE_ERROR = 0.15
+# What is met is as bright as what it hides: sums of rounded differences of 1.
+FURNACE_ERROR = 1e-5
 BALL = (0.0, 0.0, 0.06)
 RADIUS = 0.05
 LEVEL_HEIGHT = 8
@@ -123,8 +125,7 @@ def test_white_furnace(device):
     irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK])
     inside = irradiance[found >= 0]
     assert len(inside) > 50
-    np.testing.assert_allclose(inside.mean(0), np.pi, rtol=0.02)
-    np.testing.assert_allclose(inside, np.pi, rtol=FURNACE_ERROR)
+    np.testing.assert_allclose(inside, 0.0, atol=FURNACE_ERROR)
 
 
 @pytest.mark.parametrize("code", [0, 255])
@@ -153,8 +154,9 @@ def test_matches_the_twin(device, code):
 def test_dark_desk_darkens_the_flanks_not_the_top(device):
     irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0)
     up = hits["normal"][..., 2]
-    assert irradiance[(found >= 0) & (up > 0.97)].mean() > 0.95 * np.pi
-    flank = irradiance[(found >= 0) & (up < 0.4)]
+    assert (irradiance[(found >= 0) & (up > 0.999)] == 0.0).all()  # nothing is near, and nothing is noisy
+    assert irradiance[(found >= 0) & (up > 0.97)].mean() > -0.05 * np.pi
+    flank = np.pi + irradiance[(found >= 0) & (up < 0.4)]
     assert len(flank) > 5
     assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
 
@@ -326,7 +328,6 @@ def test_garbage_in_the_environment_stays_finite(device):
     environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
     irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
     assert np.isfinite(irradiance).all()
-    assert (irradiance >= 0).all()
 
 
 def test_bands_agree_with_the_whole(device):
@@ -359,10 +360,27 @@ def _alike_kernel(visible: VisibleObjects, asked: wp.array[Hit], out: wp.array[w
 
 def test_stage_follows_the_method_of_shade():
     scene = load_scene("mirror")
-    for method, expected in (("environment", False), ("one_bounce", True)):
+    for method, expected in (("environment", False), ("few_rays", True), ("one_bounce", True)):
         quality = PRESETS["medium"].with_methods(shade=method)
         plan = make_plan(Request(scene, quality, (scene.camera.width, scene.camera.height)))
         assert ("near_field" in {stage.name for stage, _ in plan.stages}) == expected
     bare = dataclasses.replace(scene, objects=())
     plan = make_plan(Request(bare, quality, (scene.camera.width, scene.camera.height)))
     assert "no virtual object" in dict(plan.left_out)["near_field"]
+
+
+def test_models_of_files_shade_themselves_where_the_environment_casts_shadows(tmp_path):
+    path = tmp_path / "cup.ply"
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 200, np.uint8)
+    mesh.export(path)
+    plain = load_scene("mirror")
+    colored = dataclasses.replace(plain, objects=(Object("mesh", file=path),))
+    for preset, scene, expected in (
+        ("medium", colored, "few_rays"),
+        ("medium", plain, ""),
+        ("low", colored, ""),
+        ("high", colored, "one_bounce"),
+    ):
+        request = Request(scene, PRESETS[preset], (scene.camera.width, scene.camera.height))
+        assert find_features(request).near_field == expected

@@ -11,6 +11,7 @@ import trimesh
 import warp as wp
 
 from tests.gltf_files import SQUARE_UVS, Gltf
+from tests.reference import prefilter as reference
 from warp_ar.errors import SceneError
 from warp_ar.kernels.materials import make_surface
 from warp_ar.kernels.shapes import FAR
@@ -94,6 +95,13 @@ def look(objects, origins, direction, device):
     return seen.numpy()
 
 
+def directional_albedo(roughness, device):
+    """What a facet that reflects all gives at normal incidence after one scattering, by roughness, (n, 1)."""
+    table = wp.zeros((32, 32), dtype=wp.vec2, device=device)
+    integrate_dfg(table)
+    return np.interp(roughness, np.linspace(0.0, 1.0, 32), table.numpy()[:, -1].sum(axis=-1))[:, None]
+
+
 def square(tmp_path: pathlib.Path, *, uvs=None, **material) -> pathlib.Path:
     """An upright square around the origin, seen along +y."""
     made = Gltf()
@@ -143,7 +151,10 @@ def test_every_texture_reaches_the_surface(device, tmp_path):
 
     metallic = factors.reshape(-1, 3)[:, 2:] / 255.0
     color = srgb(base) * [0.5, 0.6, 0.7]
-    np.testing.assert_allclose(seen["f0"], 0.04 * (1 - metallic) + metallic * color, atol=FLOAT_TOLERANCE)
+    facets = np.stack([np.full_like(color, 0.04), color])
+    gains = reference.energy_compensation(directional_albedo(seen["roughness"], device), facets)
+    mixed = 0.04 * (1 - metallic) * gains[0] + metallic * color * gains[1]
+    np.testing.assert_allclose(seen["f0"], mixed, atol=FLOAT_TOLERANCE)
     np.testing.assert_allclose(seen["roughness"], 0.5 * factors.reshape(-1, 3)[:, 1] / 255.0, atol=FLOAT_TOLERANCE)
     np.testing.assert_allclose(
         seen["occlusion"], 0.5 + 0.5 * occlusion.reshape(-1, 3)[:, 0] / 255, atol=FLOAT_TOLERANCE

@@ -279,6 +279,30 @@ def test_samples_of_a_lobe_have_its_mean_cosine(device):
             assert cosine[level] == pytest.approx((weight * np.cos(theta)).sum() / weight.sum(), abs=1e-3)
 
 
+@pytest.mark.parametrize(("roughness", "bound"), [(0.5, 0.005), (0.7, 0.01), (1.0, 0.04)])
+def test_compensation_is_what_a_random_walk_between_facets_finds(device, roughness, bound):
+    """Light that scatters often, of every F0: seen from ahead, where most of it is lost, to grazing."""
+    rng, f0 = np.random.default_rng(7), np.array([0.3, 0.6, 0.95])
+    for cos_o in (0.2, 0.5, 0.9):
+        shares = reference.scatterings(cos_o, roughness, 60_000, rng)
+        assert shares[0] == 0.0
+        assert shares.sum() == pytest.approx(1.0, abs=1e-3)
+        walked = (shares[:, None] * f0 ** np.arange(len(shares))[:, None]).sum(axis=0)
+        found = f0 * shares[1] * reference.energy_compensation(shares[1], f0)
+        np.testing.assert_allclose(found, walked, rtol=bound)
+
+
+def test_compensation_matches_the_twin(device):
+    at = wp.array(np.random.default_rng(2).random((500, 2)).astype(np.float32), dtype=wp.vec2)
+    table = wp.zeros((32, 32), dtype=wp.vec2)
+    integrate_dfg(table)
+    out, factor = wp.zeros(500, dtype=wp.vec2), wp.zeros(500, dtype=wp.vec3)
+    wp.launch(dfg_kernel, 500, [table, at], [out, factor])
+    once = np.minimum(out.numpy().astype(np.float64).sum(axis=1), 1.0)[:, None]
+    expected = reference.energy_compensation(once, np.array([1.0, 0.5, 0.0]))
+    np.testing.assert_allclose(factor.numpy(), expected, rtol=2e-6)
+
+
 # --- Energy, seam, poles, hard cases ----------------------------------------------------------------------------------
 
 

@@ -105,6 +105,7 @@ BETWEEN: Mapping[str, Mapping[str, tuple[str, str, float]]] = {
         "bounce4": ("none", "bounce", 4 / 16),
         "bounce3": ("none", "bounce", 4 / 9),
     },
+    "shade": {"few_rays": ("environment", "one_bounce", 1 / 2)},
 }
 """Methods that do the same work as another one more or less often: by setting and method two others, and the share of
 the way from the first to the second at which the method's work lies."""

@@ -17,12 +17,14 @@ from warp_ar.kernels.reflect import DiffuseForm, DistantLightConfig
 from warp_ar.scene import Scene
 from warp_ar.scene.area_lights import emits_light
 from warp_ar.scene.kinds import has_sized_lights, material_model, proxies_face, trace_config
-from warp_ar.scene.object_materials import is_detailed, reflects_diffusely, reflects_glossily, scene_materials
+from warp_ar.scene.object_materials import is_detailed, look_of, reflects_diffusely, reflects_glossily, scene_materials
 from warp_ar.stages.quality import Quality
 from warp_ar.stages.request import Request
 
 FLAT = "flat"
 """Method of ``relight`` that needs nothing of the environment."""
+NEAR = ("few_rays", "one_bounce")
+"""Methods of ``shade`` that know what surrounds objects at close range."""
 LOCAL = ("bounce", "brute_force")
 """Methods of ``relight`` that know which part of the environment reaches a point, and what lit surfaces send on."""
 
@@ -70,8 +72,12 @@ class Features:
     """Virtual lights with a size cast soft shadows."""
     area_samples: int
     """Samples of objects that emit, per point that they light; 0: none does."""
-    near_field: bool
-    """Objects show what surrounds them at close range."""
+    near_field: str
+    """Method of ``shade`` by which objects show what surrounds them at close range, themselves included; empty: none.
+
+    Models with materials of their files have parts that shade each other: wherever the environment casts shadows they
+    do so by few rays at least.
+    """
     irradiance: Literal["irradiance_sh", "irradiance_map"]
     """Resource that holds the environment's irradiance."""
     distant: DistantLightConfig
@@ -132,7 +138,7 @@ def find_features(request: Request) -> Features:
         bounced=relight_method in LOCAL and proxies_face(scene),
         soft_lights=quality.method("light_shadow") == "soft" and has_sized_lights(scene),
         area_samples=area_samples,
-        near_field=environment and quality.method("shade") == "one_bounce",
+        near_field=_near_method(scene, quality) if environment else "",
         irradiance="irradiance_sh" if by_series else "irradiance_map",
         distant=_find_forms(
             scene,
@@ -142,6 +148,15 @@ def find_features(request: Request) -> Features:
             mirrors="reflected" in layers,
         ),
     )
+
+
+def _near_method(scene: Scene, quality: Quality) -> str:
+    method = quality.method("shade")
+    shadows = quality.method("environment_shadow") not in ("default", "none")
+    models = any(item.shape == "mesh" and look_of(item).detailed for item in scene.objects)
+    if method not in NEAR and shadows and models:
+        return NEAR[0]
+    return method if method in NEAR else ""
 
 
 def has_environment(scene: Scene) -> bool:

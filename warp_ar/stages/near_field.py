@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import warp as wp
@@ -34,12 +35,22 @@ from warp_ar.stages.shared.variants import distant_variant
 
 SIDE = 4
 """Pixels along a tile."""
-COUNT = 32
-"""Samples of the environment per pixel."""
-LOBE_COUNT = 4
-"""Rays per pixel into a glossy lobe."""
-MIRROR_SAMPLES = 4
-"""Rays per pixel of a mirror."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RayCounts:
+    """Rays of a pixel."""
+
+    samples: int
+    """To the environment."""
+    lobe: int
+    """Into a glossy lobe."""
+    mirror: int
+    """Of a mirror, a square number."""
+
+
+RAYS: Mapping[str, RayCounts] = MappingProxyType({"few_rays": RayCounts(8, 1, 1), "one_bounce": RayCounts(32, 4, 4)})
+"""By method of ``shade``."""
 
 
 def lobe_widths(material: MeshMaterial) -> tuple[float, float]:
@@ -132,6 +143,7 @@ class NearField(Stage):
     def _config(self, device: Any) -> near_field.NearFieldConfig:
         """What the kernels are compiled for."""
         layers = self.features.layers
+        rays = RAYS[self.features.near_field]
         materials = scene_materials(self.request.scene)
         widths = [width for item in materials if reflects_glossily(item) for width in lobe_widths(item)]
         sharp = [width < near_field.SHARP_ALPHA for width in widths]
@@ -139,9 +151,9 @@ class NearField(Stage):
         forms, variant = self.features.distant, distant_variant(self.features, device)
         return near_field.NearFieldConfig(
             dataclasses.replace(variant, diffuse=forms.diffuse, specular=forms.specular),
-            COUNT,
-            0 if all(sharp) else LOBE_COUNT,
-            MIRROR_SAMPLES if any(sharp) else 0,
+            rays.samples,
+            0 if all(sharp) else rays.lobe,
+            rays.mirror if any(sharp) else 0,
             SIDE,
             "shadow_ratio" in layers,
             "added_light" in layers,

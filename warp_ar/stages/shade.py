@@ -37,6 +37,7 @@ class Shade(Stage):
     name: ClassVar[str] = "shade"
     methods: ClassVar[Mapping[str, str]] = {
         "environment": "the environment (the paper)",
+        "few_rays": "the environment, the receiver, themselves and each other, by few rays",
         "one_bounce": "the environment, the receiver and each other",
     }
     summary: ClassVar[str] = "shades virtual objects by the environment and virtual lights, shadowed and anti-aliased"

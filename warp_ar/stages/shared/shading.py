@@ -16,7 +16,7 @@ def shade_config(features: Features) -> ShadeConfig:
         lights=tuple(sorted({light_kind(light) for light in features.request.scene.lights})),
         edge_samples=features.request.quality.edge_samples,
         soft=features.soft_lights,
-        near_field=features.near_field,
+        near_field=bool(features.near_field),
         area_samples=features.area_samples,
     )
 
