@@ -11,8 +11,8 @@ from warp_ar.kernels import sphere_map, unwrap
 from warp_ar.kernels.structs import BOX, MESH, PLANE
 from warp_ar.stages.base import Arrays, ArraySpec, LeftOut, Numerics, Pass, Rows, Stage, Wiring, unobserved
 from warp_ar.stages.features import Features
-from warp_ar.stages.shared.probe_maps import find_view
 from warp_ar.stages.shared.picture import frame_reads
+from warp_ar.stages.shared.probe_maps import find_view
 from warp_ar.stages.shared.variants import shares_kernels
 
 _KINDS = {"plane": PLANE, "box": BOX, "mesh": MESH}
