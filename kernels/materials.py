@@ -230,27 +230,22 @@ def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
     return 2.0 * wp.dot(normal, wo) * normal - wo
 
 
-# A GGX lobe as rough as alpha is cut off by the surface and shadowed by its facets: its mean lies between the mirror
-# direction R and the normal n, which it reaches at alpha = 1, where the lobe is a cosine. [LdR14] has
+# A GGX lobe is cut off by the surface and shadowed by its facets: the rougher, the further its mean lies from the mirror
+# direction R toward the normal n, which it reaches at roughness 1, where the lobe is a cosine ([LdR14] 4.9.3). That is
+# the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon: that part
+# of the lobe, 1 - steady, is taken to stay around R. So
 #
-#     n + k (R - n),  k = (1 - alpha) (sqrt(1 - alpha) + alpha).
+#     | R + steady roughness^3 (n - R) |.
 #
-# That is the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon:
-# that part of the lobe, 1 - steady, is taken to stay around R. So
-#
-#     | n + (1 - steady (1 - k)) (R - n) |.
-#
-# Against integrals over eight rooms, F0 0.04, 0.5 and 1, roughness 0.5 to 1, the error of what is reflected is 7 to 80
-# per cent less than around R.
+# The cube is what integrals over eight rooms say: the best share of the way is 0.01, 0.04, 0.14, 0.45, 0.8 at roughness
+# 0.25, 0.35, 0.5, 0.7, 0.9. Around R alone the error of what is reflected is twice as large at 0.7, five times at 1.
 @wp.func
 def lobe_axis(surface: Surface, mirror: wp.vec3, normal: wp.vec3) -> wp.vec3:
     """Direction around which the environment's level of a surface's lobe is read, as derived above; unit."""
     if surface.model != METALLIC_ROUGHNESS:
         return mirror
-    alpha = surface.roughness * surface.roughness
-    smooth = wp.max(1.0 - alpha, 0.0)
-    lean = surface.steady * (1.0 - smooth * (wp.sqrt(smooth) + alpha))
-    return wp.normalize(normal + (1.0 - lean) * (mirror - normal))
+    roughness = surface.roughness
+    return wp.normalize(mirror + surface.steady * roughness * roughness * roughness * (normal - mirror))
 
 
 @wp.func

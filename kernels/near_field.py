@@ -2,11 +2,11 @@
 
 Per pixel of an object, two objects replace what the distant environment alone would give ``shade``:
 
-*Irradiance*, what is to be added to that of the environment: one set of the environment's samples, each traced. Where
-something is in the way, its radiance takes the place of the sample's. A proxy shows the camera's picture of it (see
-``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object shows what the distant
-environment makes of it. So an object's underside sees the shadow that it stands in, not an empty receiver. Where
-nothing is near the sum is zero, without noise: the environment's irradiance is known.
+*Irradiance*, the sum over one set of the environment's samples, each traced: a proxy in the way shows the camera's
+picture of it (see ``reflect``), darkened by the objects' own shadows and brightened by virtual light; an object in the
+way shows what the distant environment makes of it. So an object's underside sees the shadow that it stands in, not an
+empty receiver. Few samples are a bad sum: there it is the environment's irradiance, which is known, and of the samples
+only what those change that meet something. Where nothing is near that has no noise.
 
 *Mirrored*, radiance of what is near and a share; ``shade`` adds (1 - share) of the prefiltered environment. A mirror
 sends rays from places all over the pixel, for what a curved one shows in neighbouring pixels may lie far apart; they
@@ -55,6 +55,7 @@ from warp_ar.kernels.reflect import (
     DistantLight,
     DistantLightConfig,
     look_up,
+    make_distant_irradiance,
     make_find_in_frame,
     make_reflected_radiance,
     make_shade_unoccluded,
@@ -103,6 +104,9 @@ class NearFieldConfig:
     """Whether objects shade the receiver."""
     added: bool
     """Whether virtual lights light the receiver."""
+    known: bool = False
+    """Whether irradiance is that of the environment, as it is known, and what the samples that meet something change;
+    else the sum of all samples."""
 
 
 @wp.struct
@@ -117,7 +121,7 @@ class ReceiverLayers:
 class NearLight:
     """What reaches the pixels of objects from near by; empty where no material asks for it."""
 
-    irradiance: wp.array2d[wp.vec3]  # to be added to the environment's
+    irradiance: wp.array2d[wp.vec3]
     reflected: wp.array2d[wp.vec4]  # premultiplied near radiance, and its share of the rays
     transmitted: wp.array2d[wp.vec4]  # the environment along rays that pass the near field, and its brightness on all
 
@@ -290,6 +294,7 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
     look_near = make_look_near(config)
     surface_at = make_surface(config.distant.models, config.distant.textures)
     reflected_radiance = make_reflected_radiance(config.distant) if config.mirror_samples > 0 else None
+    distant_irradiance = make_distant_irradiance(config.distant)
     mirror_ray = make_mirror_ray(config) if config.mirror_samples > 0 else None
     side = config.side
     lobes = config.lobe_count
@@ -370,8 +375,13 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                 )
             if wp.static(config.distant.diffuse != "none"):
                 if n < diffuse:
+                    radiance = ray.radiance
                     if near[3] > 0.0:
-                        total += ray.weight * (wp.vec3(near[0], near[1], near[2]) - ray.radiance)
+                        radiance = wp.vec3(near[0], near[1], near[2])
+                    if wp.static(config.known):
+                        radiance -= ray.radiance
+                    if ray.weight > 0.0:
+                        total += ray.weight * radiance
             if wp.static(config.distant.specular):
                 if n >= diffuse and ray.leaves:
                     leaving += 1.0
@@ -401,6 +411,8 @@ def make_near_field_kernel(config: NearFieldConfig) -> wp.Kernel:
                             missed = (1.0 - near[3]) * beyond
                             transmitted += wp.vec4(missed[0], missed[1], missed[2], brightness(beyond))
         if wp.static(config.distant.diffuse != "none"):
+            if wp.static(config.known):
+                total += distant_irradiance(distant, hit.point, normal)
             near_out.irradiance[i, j] = total
         if wp.static(config.distant.specular):
             near_out.reflected[i, j] = reflected / wp.max(leaving, 1.0)
@@ -468,7 +480,7 @@ def make_filter_kernel(config: NearFieldConfig) -> wp.Kernel:
                                 glossy += weight * estimate.reflected[i + a, j + b]
                                 distant += weight * estimate.transmitted[i + a, j + b]
         if wp.static(config.distant.diffuse != "none"):
-            near_out.irradiance[i, j] = light / weights
+            near_out.irradiance[i, j] = wp.max(light / weights, wp.vec3(0.0))
         if wp.static(config.distant.specular):
             if sharp:
                 near_out.reflected[i, j] = estimate.reflected[i, j]

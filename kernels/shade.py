@@ -104,7 +104,7 @@ class NearPoint:
     """What ``near_field`` knows of a point of an object."""
 
     known: wp.bool  # False: the distant environment is all that the point receives
-    irradiance: wp.vec3  # to be added to the environment's
+    irradiance: wp.vec3
     reflected: wp.vec4  # radiance that adds to the prefiltered environment, and the share of that which it replaces
 
 
@@ -204,15 +204,19 @@ def make_shade_hit(config: ShadeConfig) -> wp.Function:
             radiance = surface.emission
         if wp.static(forms.diffuse != "none"):
             irradiance = distant_irradiance(distant, hit.point, normal)
-            lost = wp.vec3(0.0)
+            share = float(1.0)
             if wp.static(forms.textures):
-                lost = (1.0 - surface.occlusion) * irradiance
+                share = surface.occlusion
             if wp.static(config.near_field):
                 if near.known:
                     # A picture of occlusion shows what rays find as well: the darker of the two holds.
-                    lost = wp.max(lost, -near.irradiance) - wp.max(near.irradiance, wp.vec3(0.0))
-            if wp.static(config.near_field or forms.textures):
-                irradiance = wp.max(irradiance - lost, wp.vec3(0.0))
+                    if share < 1.0:
+                        more = wp.max(near.irradiance - irradiance, wp.vec3(0.0))
+                        irradiance = wp.min(share * irradiance, near.irradiance) + more
+                    else:
+                        irradiance = near.irradiance
+                    share = 1.0
+            irradiance *= share
             radiance += wp.cw_mul(surface.diffuse, irradiance) / wp.pi
         if wp.static(forms.specular):
             glossiness = surface.reflectance[0] + surface.reflectance[1] + surface.reflectance[2]

@@ -35,8 +35,8 @@ from warp_ar.stages.features import find_features
 from warp_ar.stages.quality import PRESETS
 from warp_ar.stages.request import Request
 
-# What is met is as bright as what it hides: sums of rounded differences of 1.
-FURNACE_ERROR = 1e-5
+# Sampling error of one set of 64 for a cosine lobe of any direction.
+FURNACE_ERROR = 0.15
 BALL = (0.0, 0.0, 0.06)
 RADIUS = 0.05
 LEVEL_HEIGHT = 8
@@ -60,6 +60,7 @@ def run(
     environment=None,
     samples=1,
     environment_shows=1.0,
+    known=False,
 ):
     models = tuple(sorted({m["model"] for m in materials}))
     forms = DistantLightConfig(
@@ -72,7 +73,8 @@ def run(
     )
     # As the stage has it: what no material needs is not compiled.
     lobes, samples = 4 if PHONG in models else 0, samples if MIRROR in models else 0
-    config = near_field.NearFieldConfig(forms, COUNT, lobes, samples, SIDE, ratio is not None, added is not None)
+    layers = ratio is not None, added is not None
+    config = near_field.NearFieldConfig(forms, COUNT, lobes, samples, SIDE, *layers, known)
     params = records(
         FrameParams,
         {
@@ -125,7 +127,22 @@ def test_white_furnace(device):
     irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK])
     inside = irradiance[found >= 0]
     assert len(inside) > 50
-    np.testing.assert_allclose(inside, 0.0, atol=FURNACE_ERROR)
+    np.testing.assert_allclose(inside.mean(0), np.pi, rtol=0.02)
+    np.testing.assert_allclose(inside, np.pi, rtol=FURNACE_ERROR)
+
+
+def test_a_white_furnace_of_few_rays_has_no_noise(device):
+    """What is met is as bright as what it hides, and the environment's irradiance is known."""
+    irradiance, _, found, _, _ = run([sphere(BALL, RADIUS)], [CHALK], known=True)
+    np.testing.assert_allclose(irradiance[found >= 0], np.pi, rtol=1e-5)
+
+
+def test_few_rays_have_no_noise_where_nothing_is_near(device):
+    irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0, known=True, filtered=False)
+    up = hits["normal"][..., 2]
+    np.testing.assert_allclose(irradiance[(found >= 0) & (up > 0.999)], np.pi, rtol=1e-6)
+    flank = irradiance[(found >= 0) & (up < 0.4)]
+    assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
 
 
 @pytest.mark.parametrize("code", [0, 255])
@@ -154,9 +171,8 @@ def test_matches_the_twin(device, code):
 def test_dark_desk_darkens_the_flanks_not_the_top(device):
     irradiance, _, found, hits, _ = run([sphere(BALL, RADIUS)], [CHALK], code=0)
     up = hits["normal"][..., 2]
-    assert (irradiance[(found >= 0) & (up > 0.999)] == 0.0).all()  # nothing is near, and nothing is noisy
-    assert irradiance[(found >= 0) & (up > 0.97)].mean() > -0.05 * np.pi
-    flank = np.pi + irradiance[(found >= 0) & (up < 0.4)]
+    assert irradiance[(found >= 0) & (up > 0.97)].mean() > 0.95 * np.pi
+    flank = irradiance[(found >= 0) & (up < 0.4)]
     assert len(flank) > 5
     assert 0.4 * np.pi < flank.mean() < 0.9 * np.pi
 
@@ -328,6 +344,7 @@ def test_garbage_in_the_environment_stays_finite(device):
     environment[3, 4], environment[20, 7], environment[9, 9] = np.nan, np.inf, -50.0
     irradiance, _, _, _, _ = run([sphere(BALL, RADIUS)], [CHALK], environment=environment)
     assert np.isfinite(irradiance).all()
+    assert (irradiance >= 0).all()
 
 
 def test_bands_agree_with_the_whole(device):

@@ -32,17 +32,7 @@ MAPS = ("probe_radiance", "environment_radiance", "filled_radiance", "environmen
 # What is documented to take any number; everything behind ``fill`` reads a map that is finite and not negative.
 GUARDED = ("accumulate", "fill", "irradiance", "prefilter", "environment_samples")
 # Signed by nature; of structures, only what is named radiance or irradiance is light.
-SIGNED = (
-    "irradiance_sh",
-    "mirror_ball",
-    "layer_mirror_ball",
-    "near_irradiance",
-    "near_field_irradiance",
-    "normals",
-    "position",
-    "motion",
-    "coverage",
-)
+SIGNED = ("irradiance_sh", "mirror_ball", "layer_mirror_ball", "normals", "position", "motion", "coverage")
 FRAME_READERS = ("unwrap", "sphere_map", "summed_area", "visibility", "surfaces", "coverage", "motion")
 MAP_READERS = [
     (stage, method) for stage, method in STAGE_METHODS if stage not in FRAME_READERS and method != "sphere_mip"

@@ -1,10 +1,10 @@
-"""Float64 twin of what surrounds a convex object over the plane z = 0 that a camera sees from straight above."""
+"""Float64 twin of the irradiance of a convex object over the plane z = 0 that a camera sees from straight above."""
 
 import numpy as np
 
 
 def irradiance_over_plane(point, normal, directions, flux, seen, desk):
-    """What the plane adds to the environment's irradiance: samples that run into it show ``desk`` where ``seen(x, y)``.
+    """Irradiance of ``normal`` at ``point``: samples that run into the plane show ``desk`` where ``seen(x, y)``.
 
     Args:
         point: (3,) above the plane.
@@ -18,4 +18,4 @@ def irradiance_over_plane(point, normal, directions, flux, seen, desk):
     down = directions[:, 2] < 0
     t = np.where(down, -point[2] / np.where(down, directions[:, 2], -1), 0)
     at = point + t[:, None] * directions
-    return float((weight * np.where(down & seen(at[:, 0], at[:, 1]), desk - 1.0, 0.0)).sum())
+    return float((weight * np.where(down & seen(at[:, 0], at[:, 1]), desk, 1)).sum())

@@ -32,7 +32,7 @@ RADIUS: Final = 0.03
 PLACE: Final = 0.15
 """Share of the radius by which the centre may be off where the outline shows it."""
 SEEN: Final = 0.55
-"""Share of the outline that must be seen where nothing is in front of the ball."""
+"""Share of the outline that at least one view must show where nothing is in front of the ball."""
 LOST: Final = 0.35
 """Share of the outline below which there is none."""
 
@@ -84,7 +84,9 @@ def _check_ball(
     if contrast < DULL:
         text = f"{label}: the ball mirrors nothing ({contrast:.0%} contrast inside it): painted, dusty or dull"
         found.append(Finding("ball.dull", text, "wipe it, or use a polished ball"))
-    support = float(np.median([outline.support for outline, _ in outlines]))
+    # Single views of a ball in the open show as little as 0.5 of its outline, where its rim and what is behind it look
+    # alike; what stands in front of it hides it from all.
+    support = max(outline.support for outline, _ in outlines)
     if support < SEEN:
         text = f"{label}: only {support:.0%} of the ball's outline is seen"
         found.append(Finding("ball.hidden", text, "take away what is in front of the ball"))

@@ -47,9 +47,13 @@ class RayCounts:
     """Into a glossy lobe."""
     mirror: int
     """Of a mirror, a square number."""
+    known: bool
+    """Whether samples only say what differs from the environment's irradiance, as it is known."""
 
 
-RAYS: Mapping[str, RayCounts] = MappingProxyType({"few_rays": RayCounts(8, 1, 1), "one_bounce": RayCounts(32, 4, 4)})
+RAYS: Mapping[str, RayCounts] = MappingProxyType(
+    {"few_rays": RayCounts(8, 1, 1, known=True), "one_bounce": RayCounts(32, 4, 4, known=False)}
+)
 """By method of ``shade``."""
 
 
@@ -157,4 +161,5 @@ class NearField(Stage):
             SIDE,
             "shadow_ratio" in layers,
             "added_light" in layers,
+            rays.known,
         )
