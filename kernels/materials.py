@@ -230,10 +230,10 @@ def reflect(wo: wp.vec3, normal: wp.vec3) -> wp.vec3:
     return 2.0 * wp.dot(normal, wo) * normal - wo
 
 
-# A GGX lobe is cut off by the surface and shadowed by its facets: the rougher, the further its mean lies from the mirror
-# direction R toward the normal n, which it reaches at roughness 1, where the lobe is a cosine ([LdR14] 4.9.3). That is
-# the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon: that part
-# of the lobe, 1 - steady, is taken to stay around R. So
+# A GGX lobe is cut off by the surface and shadowed by its facets: the rougher, the further its mean lies from the
+# mirror direction R toward the normal n, which it reaches at roughness 1, where the lobe is a cosine ([LdR14] 4.9.3).
+# That is the part that F0 weighs. The other, of facets that are met at grazing angles, pulls back toward the horizon:
+# that part of the lobe, 1 - steady, is taken to stay around R. So
 #
 #     | R + steady roughness^3 (n - R) |.
 #
