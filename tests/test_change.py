@@ -93,6 +93,8 @@ def test_stages_wire_up(device):
     kinds = (Unwrap, Accumulate, Fill, KeyLights)
     available = {"frame", "pose", "clock"}
     arrays = Arrays()
+    for name, value in blind_camera().items():
+        arrays.add(name, value)
     for kind in kinds:
         wiring = kind.wire(features())
         assert isinstance(wiring, Wiring)

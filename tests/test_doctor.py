@@ -15,6 +15,7 @@ from tests.rendered_room import look_at
 from warp_ar import doctor, live_start
 from warp_ar.errors import SceneError
 from warp_ar.input import checkup
+from warp_ar.input.ball_solve import rough_circle
 from warp_ar.input.card import draw_card
 from warp_ar.input.check_ball import check_balls
 from warp_ar.input.check_pictures import Look, board_instead, check_pictures, take_look
@@ -205,6 +206,27 @@ def test_painted_and_hidden_balls_are_seen(looks):
     look = dataclasses.replace(looks["desk"], views=looks["desk"].views[:1])
     found = check_balls(scene, spoiled(look, painted(90)), 1)
     assert {finding.name for finding in found} & {"ball.unfound", "ball.dull"}
+
+
+def test_a_ball_that_is_half_hidden_is_seen(looks):
+    scene, look = load_scene("desk"), dataclasses.replace(looks["desk"], views=looks["desk"].views[:4])
+
+    def hidden(share: float) -> list[str]:
+        """Findings where a hand covers the balls from above, down to ``share`` of the radius below the centre."""
+        views = []
+        for image, pose in look.views:
+            circle = rough_circle(look.camera, pose, scene.probes[0])
+            assert circle is not None
+            x, y, radius = circle
+            top, bottom = (max(round(y + part * radius), 0) for part in (-2.5, share))
+            covered = image.copy()
+            covered[top:bottom, max(round(x - 1.6 * radius), 0) : round(x + 1.6 * radius)] = (170, 120, 100)
+            views.append((covered, pose))
+        return [finding.name for finding in check_balls(scene, dataclasses.replace(look, views=tuple(views)))]
+
+    assert hidden(-1.1) == []
+    assert hidden(0.0) == ["ball.hidden"]
+    assert hidden(0.6) == ["ball.unfound"]
 
 
 def test_pictures_without_the_marker_say_why(looks):

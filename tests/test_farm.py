@@ -235,7 +235,7 @@ def test_wrong_usage_is_told_in_one_line(folder, monkeypatch, capsys, arguments,
 def test_a_run_of_another_program_is_not_gone_on_with(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
-    (run / "run.json").write_text(json.dumps({"version": "warp_ar 0.0", "jobs": {}}))
+    (run / "run.json").write_text(json.dumps({"version": "warp_ar 0.0", "jobs": {"clip": []}}))
     assert main(["resume", str(run)]) == 2
     assert "was begun by warp_ar 0.0; this is warp_ar" in capsys.readouterr().err
 

@@ -231,7 +231,9 @@ def test_a_kernel_that_runs_while_a_pipeline_is_built_parses_no_headers(monkeypa
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     modules.parse_headers_ahead()
     modules.load_at_once(early_kernel, resolve_device("cpu"))
-    assert found == {"headers.cpp": False, "wp_early": True}
+    # Another test of this process may have had them parsed before.
+    assert not found.pop("headers.cpp", False)
+    assert found == {"wp_early": True}
     assert early_kernel.module.options["cpu_compiler_flags"] is None
     values = wp.zeros(1, dtype=wp.int32, device="cpu")
     wp.launch(early_kernel, 1, [], [values], device="cpu")

@@ -363,6 +363,7 @@ def blind_camera() -> dict[str, Any]:
         "frame": wp.zeros((1, 1), dtype=wp.vec3ub),
         "linear_frame": wp.zeros((0, 0), dtype=wp.vec3),
         "decode": wp.zeros(257, dtype=wp.vec3),
+        "rays": wp.zeros((1, 1), dtype=wp.vec2),
         "params": wp.zeros(1, dtype=FrameParams),
         "probes": wp.zeros(0, dtype=BallRecord),
         "ray_scene": RayScene(),
