@@ -34,7 +34,8 @@ PLACE: Final = 0.15
 SEEN: Final = 0.46
 """Share of the outline that must be seen where nothing is in front of the ball.
 
-A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows 0.44.
+A ball in the open, whose rim here and there looks like what is behind it, shows 0.50 to 0.97; half hidden it shows
+0.44.
 """
 LOST: Final = 0.35
 """Share of the outline below which there is none."""
