@@ -70,6 +70,8 @@ def method_table(cpu: list[dict[str, Any]], cuda: list[dict[str, Any]], listed: 
         rows.append([f"**{setting.name.replace('_', ' ')}**", what, "", "", "", ""])
         for method in setting.methods:
             known = method in listed["errors"][setting.name]
+            if not known and not any((setting.name, method) in found for found in (ours, theirs)):
+                continue  # between two others; never measured
             apart = arrays.get(setting.name, {}).get(method)
             rows.append(
                 [

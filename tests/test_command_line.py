@@ -9,7 +9,7 @@ import weakref
 
 import pytest
 
-from warp_ar.command_line import Parser, loading
+from warp_ar.command_line import EXIT_INTERRUPTED, EXIT_TERMINATED, Parser, loading
 from warp_ar.errors import UsageError
 
 
@@ -101,3 +101,22 @@ def test_letters_that_a_terminal_does_not_know_are_numbers():
     plain = {**os.environ, "PYTHONIOENCODING": "ascii:strict", "PYTHONUTF8": "0", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, "-c", script], env=plain, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "\\u2026\\u4e2d\n", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows ends a process that is sent SIGTERM")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", EXIT_TERMINATED), ("SIGINT", EXIT_INTERRUPTED)])
+def test_a_signal_that_arrives_as_native_code_calls_back_ends_the_command(name, code):
+    """Python drops what is raised there."""
+    text = f"""
+import ctypes, signal, sys, time
+from warp_ar.command_line import run_command
+
+def command():
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.{name}))()
+    time.sleep(20.0)
+    return 0
+
+sys.exit(run_command(command))
+"""
+    ended = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (code, "")

@@ -161,17 +161,33 @@ def leave(code: int) -> NoReturn:
 def ended_by_signals() -> Iterator[None]:
     """Have SIGTERM and SIGHUP unwind the stack as Ctrl-C does, so that files are closed and folders removed.
 
-    Once: who is ending already is not interrupted by the next of them.
+    Once: who is ending already is not interrupted by the next of them. One that arrives where Python drops what is
+    raised, in a finaliser or as native code calls back, is sent again, Ctrl-C too.
     """
-    ending = False
+    ending, hook = False, sys.unraisablehook
+    numbers: list[int] = []
 
-    def handle(*_: Any) -> None:
+    def handle(number: int, _: object) -> None:
         nonlocal ending
         if not ending:
             ending = True
+            numbers.append(number)
             raise Terminated
 
+    def send_again(dropped: Any) -> None:
+        nonlocal ending
+        if not isinstance(dropped.exc_value, (Terminated, KeyboardInterrupt)):
+            hook(dropped)
+            return
+        ending = False
+        number = numbers[-1] if isinstance(dropped.exc_value, Terminated) else signal.SIGINT
+        # Not at once: that would be dropped as well.
+        timer = threading.Timer(0.01, signal.raise_signal, (number,))
+        timer.daemon = True
+        timer.start()
+
     with handling(handle, "SIGTERM", "SIGHUP"):
+        sys.unraisablehook = send_again
         try:
             yield
         except BaseException:
@@ -179,6 +195,8 @@ def ended_by_signals() -> Iterator[None]:
             with contextlib.suppress(SinkError):  # what came first is told
                 close_open_sinks()
             raise
+        finally:
+            sys.unraisablehook = hook
         ending = True
 
 
